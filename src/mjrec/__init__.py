@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""mjrec: a headless MuJoCo recorder.
+
+Importing this package imports no simulator, no OpenGL and no ffmpeg, and changes no
+environment variable; each name below is loaded when it is first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from .errors import (
+    ArchiveError,
+    ClosedError,
+    DifferentEnvironment,
+    DirectoryInUse,
+    DirectoryNotWritable,
+    EncoderError,
+    Error,
+    ExistingRecordings,
+    FrameCountError,
+    GLError,
+    InvalidArgument,
+    InvalidFrame,
+    MissingDependency,
+    NoPictures,
+    PolicyError,
+    ResetNeeded,
+    ResetNotAllowed,
+    UnknownName,
+    UnreadableFile,
+)
+
+if TYPE_CHECKING:
+    from .formats.archive import write_archive as write_archive
+    from .formats.video_writer import VideoWriter as VideoWriter
+    from .formats.video_writer import save_video as save_video
+    from .gl import use_gl as use_gl
+    from .monitors import Monitor as Monitor
+    from .monitors.dm_env_monitor import DmEnvMonitor as DmEnvMonitor
+    from .monitors.gymnasium_monitor import GymnasiumMonitor as GymnasiumMonitor
+    from .recorder.stats_recorder import StatsRecorder as StatsRecorder
+    from .recorder.video_recorder import VideoRecorder as VideoRecorder
+    from .results import Episode as Episode
+    from .results import clear_monitor_files as clear_monitor_files
+    from .results import detect_monitor_files as detect_monitor_files
+    from .results import detect_training_manifests as detect_training_manifests
+    from .results import iter_episodes as iter_episodes
+    from .results import load_results as load_results
+    from .results import merge_stats_files as merge_stats_files
+    from .schedules import capped_cubic_video_schedule as capped_cubic_video_schedule
+    from .schedules import disable_videos as disable_videos
+
+_LAZY = {
+    "DmEnvMonitor": "monitors.dm_env_monitor",
+    "Episode": "results",
+    "GymnasiumMonitor": "monitors.gymnasium_monitor",
+    "Monitor": "monitors",
+    "StatsRecorder": "recorder.stats_recorder",
+    "VideoRecorder": "recorder.video_recorder",
+    "VideoWriter": "formats.video_writer",
+    "capped_cubic_video_schedule": "schedules",
+    "clear_monitor_files": "results",
+    "detect_monitor_files": "results",
+    "detect_training_manifests": "results",
+    "disable_videos": "schedules",
+    "iter_episodes": "results",
+    "load_results": "results",
+    "merge_stats_files": "results",
+    "save_video": "formats.video_writer",
+    "use_gl": "gl",
+    "write_archive": "formats.archive",
+}
+
+__all__ = [
+    "ArchiveError",
+    "ClosedError",
+    "DifferentEnvironment",
+    "DirectoryInUse",
+    "DirectoryNotWritable",
+    "DmEnvMonitor",
+    "EncoderError",
+    "Episode",
+    "Error",
+    "ExistingRecordings",
+    "FrameCountError",
+    "GLError",
+    "GymnasiumMonitor",
+    "InvalidArgument",
+    "InvalidFrame",
+    "MissingDependency",
+    "Monitor",
+    "NoPictures",
+    "PolicyError",
+    "ResetNeeded",
+    "ResetNotAllowed",
+    "StatsRecorder",
+    "UnknownName",
+    "UnreadableFile",
+    "VideoRecorder",
+    "VideoWriter",
+    "capped_cubic_video_schedule",
+    "clear_monitor_files",
+    "detect_monitor_files",
+    "detect_training_manifests",
+    "disable_videos",
+    "iter_episodes",
+    "load_results",
+    "merge_stats_files",
+    "save_video",
+    "use_gl",
+    "write_archive",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return importlib.import_module("importlib.metadata").version("mjrec")
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f".{_LAZY[name]}", __name__), name)
+    # Kept, so that later uses cost nothing.
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, "__version__"})

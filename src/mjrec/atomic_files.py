@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that appear whole or not at all.
+
+A file is written under a temporary name in its own directory and then renamed, so
+that nobody ever sees half of it under its final name. The temporary name begins with
+a dot and ends in `.part`: `.<name>.<8 hex digits>.part`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+
+__all__ = ["is_temporary", "replacing", "temporary_path", "write_text"]
+
+_SUFFIX = ".part"
+
+
+def temporary_path(path: Path) -> Path:
+    """Return a new name for an unfinished `path`, in the same directory."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}{_SUFFIX}")
+
+
+def is_temporary(path: Path) -> bool:
+    """Tell whether `path` has the name of an unfinished file of ours."""
+    return path.name.startswith(".") and path.name.endswith(_SUFFIX)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path; rename it to `path` at the end of the block.
+
+    If the block raises, the temporary file is removed and `path` stays as it was.
+    """
+    temporary = temporary_path(path)
+    try:
+        yield temporary
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write `text`, in UTF-8, as the whole content of `path`."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

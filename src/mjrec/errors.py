@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can go wrong, as one tree.
+
+::
+
+    Error
+    ├── InvalidArgument (also ValueError)   a value that cannot be
+    │   ├── UnknownName                     no such environment, camera, policy ...
+    │   └── InvalidFrame                    not a (height, width, 3) uint8 picture
+    ├── ExistingRecordings                  neither force nor resume was asked for
+    ├── DirectoryInUse                      another live monitor writes there
+    ├── DirectoryNotWritable                (also OSError)
+    ├── DifferentEnvironment                resume over another environment
+    ├── NoPictures                          the environment cannot be drawn
+    ├── ResetNeeded                         step before reset or after the end
+    ├── ResetNotAllowed                     reset in mid-episode
+    ├── ClosedError                         used after close()
+    ├── EncoderError                        ffmpeg failed or died
+    │   └── FrameCountError                 the finished file lacks or doubles frames
+    ├── GLError                             no backend renders, or the wrong one
+    ├── PolicyError                         a policy raised or gave a bad action
+    ├── ArchiveError                        write_archive's checks
+    ├── UnreadableFile                      a damaged or foreign file
+    └── MissingDependency (also ImportError)  an extra is not installed
+
+Every message says what was asked, what is there, and what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+__all__ = [
+    "ArchiveError",
+    "ClosedError",
+    "DifferentEnvironment",
+    "DirectoryInUse",
+    "DirectoryNotWritable",
+    "EncoderError",
+    "Error",
+    "ExistingRecordings",
+    "FrameCountError",
+    "GLError",
+    "InvalidArgument",
+    "InvalidFrame",
+    "MissingDependency",
+    "NoPictures",
+    "PolicyError",
+    "ResetNeeded",
+    "ResetNotAllowed",
+    "UnknownName",
+    "UnreadableFile",
+]
+
+
+class Error(Exception):
+    """Base of every error that mjrec raises on purpose."""
+
+
+class InvalidArgument(Error, ValueError):
+    """An argument has a value that cannot be."""
+
+
+class UnknownName(InvalidArgument):
+    """A name that stands for nothing.
+
+    Attributes:
+        kind: what was looked for, for example `"camera"`.
+        name: the name asked for.
+        available: the names there are.
+    """
+
+    _SHOWN = 20
+
+    def __init__(
+        self, kind: str, name: object, available: Iterable[str], *, hint: str = ""
+    ) -> None:
+        self.kind = kind
+        self.name = name
+        self.available = list(available)
+        super().__init__(" ".join(filter(None, [self._what_is_there(), hint])))
+
+    def _what_is_there(self) -> str:
+        near = difflib.get_close_matches(str(self.name), self.available, self._SHOWN)
+        shown = self.available if len(self.available) <= self._SHOWN else near
+        text = f"There is no {self.kind} {self.name!r}."
+        if not self.available:
+            return f"{text} There are none."
+        if not shown:
+            return f"{text} There are {len(self.available)}, none with a like name."
+        label = "There are" if shown is self.available else "Names like it"
+        return f"{text} {label}: {', '.join(shown)}."
+
+
+class InvalidFrame(InvalidArgument):
+    """A picture that is not a `(height, width, 3) uint8` array."""
+
+
+class ExistingRecordings(Error):
+    """The directory holds recordings and neither `force` nor `resume` was given.
+
+    Attributes:
+        directory: the directory asked for.
+        names: the base names of the monitor files in it.
+    """
+
+    _SHOWN = 5
+
+    def __init__(self, directory: Path, names: Sequence[str]) -> None:
+        self.directory = directory
+        self.names = list(names)
+        shown = ", ".join(self.names[: self._SHOWN])
+        more = len(self.names) - self._SHOWN
+        rest = f" and {more} more" if more > 0 else ""
+        super().__init__(
+            f"{directory} holds recordings already: {shown}{rest}. Use a directory of "
+            "its own for each run, resume=True to add to these recordings, or "
+            "force=True to delete them."
+        )
+
+
+class DirectoryInUse(Error):
+    """Another monitor, which is still open, writes into the directory."""
+
+
+class DirectoryNotWritable(Error, OSError):
+    """The directory cannot be made or written to."""
+
+    def __init__(self, directory: Path, reason: object) -> None:
+        self.directory = directory
+        super().__init__(
+            f"Cannot write into {directory}: {reason}. Choose a directory that this "
+            "user may write to."
+        )
+
+
+class DifferentEnvironment(Error):
+    """`resume=True` over recordings of another environment."""
+
+    def __init__(self, directory: Path, recorded: str, asked: str) -> None:
+        self.recorded = recorded
+        self.asked = asked
+        super().__init__(
+            f"{directory} holds recordings of {recorded}, and this monitor is around "
+            f"{asked}. Results of two environments in one directory cannot be told "
+            "apart: use another directory."
+        )
+
+
+class NoPictures(Error):
+    """Videos were asked for of an environment that gives no pictures."""
+
+
+class ResetNeeded(Error):
+    """`step` before the first `reset`, or after the end of an episode."""
+
+
+class ResetNotAllowed(Error):
+    """`reset` in mid-episode, without `allow_early_reset=True`."""
+
+
+class ClosedError(Error):
+    """A writer or recorder was used after it was closed."""
+
+
+class EncoderError(Error):
+    """ffmpeg failed or died.
+
+    Attributes:
+        command: the argument list it was started with.
+        returncode: its exit status; negative is the signal that killed it.
+        stderr: the end of what it said.
+    """
+
+    def __init__(
+        self, what: str, *, command: Sequence[str], returncode: int | None, stderr: str
+    ) -> None:
+        self.command = list(command)
+        self.returncode = returncode
+        self.stderr = stderr
+        said = stderr.strip() or "(nothing)"
+        super().__init__(
+            f"{what} ffmpeg's exit status: {returncode}. It was started as: "
+            f"{' '.join(self.command)}. The end of what it said: {said}"
+        )
+
+
+class FrameCountError(EncoderError):
+    """The finished video does not hold exactly the frames that were written."""
+
+
+class GLError(Error):
+    """No OpenGL backend renders here, or another one is in use already."""
+
+
+class PolicyError(Error):
+    """A policy cannot be built, raised, or gave something that is no action."""
+
+
+class ArchiveError(Error):
+    """A check of `write_archive` failed; nothing was written."""
+
+
+class UnreadableFile(Error):
+    """A file that is damaged, or not what its name says.
+
+    Attributes:
+        path: the file.
+        reason: what is wrong with it.
+    """
+
+    def __init__(self, path: Path, reason: object) -> None:
+        self.path = path
+        self.reason = str(reason)
+        super().__init__(f"Cannot read {path}: {reason}.")
+
+
+class MissingDependency(Error, ImportError):
+    """Something optional is needed and not installed."""
+
+    def __init__(self, package: str, *, purpose: str, install: str) -> None:
+        self.package = package
+        super().__init__(
+            f"{purpose} needs {package}, which is not installed. Run: {install}"
+        )

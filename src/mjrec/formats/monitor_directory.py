@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The names of the files in a monitor directory.
+
+::
+
+    directory/
+    ├── openaigym.manifest.<infix>.manifest.json        the index, written last
+    ├── openaigym.episode_batch.<infix>.stats.json      gym's statistics
+    ├── openaigym.episodes.<infix>.jsonl                journal, a line an episode
+    ├── openaigym.video.<infix>.video000027.mp4         a video ...
+    ├── openaigym.video.<infix>.video000027.meta.json   ... and all about it
+    ├── openaigym.video.<infix>.video000027.framehash   ... and its pictures' hashes
+    ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
+    └── .openaigym.<infix>.lock                         while its monitor is open
+
+`<infix>` is `<monitor id>.<uid or process id>`. It stands for one monitor: no two
+monitors ever share one in a directory. Names that start with a dot and end in
+`.part` are files that are being written.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import InvalidArgument
+
+__all__ = [
+    "FILE_PREFIX",
+    "MANIFEST_PREFIX",
+    "Infix",
+    "episode_of",
+    "infix_of",
+    "is_manifest",
+    "iter_monitor_files",
+    "journal_name",
+    "lock_name",
+    "manifest_name",
+    "stats_prefix",
+    "video_prefix",
+]
+
+FILE_PREFIX = "openaigym"
+MANIFEST_PREFIX = f"{FILE_PREFIX}.manifest"
+
+_UID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}", re.ASCII)
+
+# What this package and every gym wrote; nothing else in a directory is ours. A `~`
+# is gym's temporary name.
+_MANIFEST = re.compile(r"openaigym\.manifest\.(?P<infix>.+)\.manifest\.json")
+_PATTERNS = (
+    re.compile(r"openaigym\.manifest\.(?P<infix>.+)\.manifest\.json~*"),
+    re.compile(r"openaigym\.episode_batch\.(?P<infix>.+)\.stats\.json~*"),
+    re.compile(r"openaigym\.episodes\.(?P<infix>.+)\.jsonl"),
+    re.compile(
+        r"openaigym\.video\.(?P<infix>.+)\.video(?P<episode>\d{6,})\.[^/]*"
+        r"(mp4|avi|json|framehash)"
+    ),
+    re.compile(
+        r"openaigym\.trajectory\.(?P<infix>.+)\.episode(?P<episode>\d{6,})\.(log|h5)"
+    ),
+    re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
+)
+_HIDDEN = (
+    re.compile(r"\.openaigym\.(?P<infix>.+)\.lock"),
+    re.compile(r"\.openaigym\..+\.part"),
+)
+
+
+@dataclass(frozen=True)
+class Infix:
+    """What tells the files of one monitor from those of another.
+
+    Attributes:
+        monitor_id: counts the monitors, from 0.
+        uid: the user's name for the run, or the process id.
+    """
+
+    monitor_id: int
+    uid: str
+
+    def __str__(self) -> str:
+        return f"{self.monitor_id}.{self.uid}"
+
+    @classmethod
+    def parse(cls, text: str) -> Infix | None:
+        """Return the infix written as `text`; None for one of another making."""
+        number, dot, uid = text.partition(".")
+        if not (dot and uid and number.isascii() and number.isdigit()):
+            return None
+        return cls(int(number), uid)
+
+
+def check_uid(uid: object) -> str:
+    """Return `uid` as the text that goes into file names.
+
+    Raises:
+        InvalidArgument: it would not make a portable file name.
+    """
+    text = str(uid)
+    if not _UID.fullmatch(text):
+        raise InvalidArgument(
+            "uid becomes part of file names: it must be 1 to 100 letters, digits, "
+            f"'_', '-' and '.', not starting with '.', got {uid!r}."
+        )
+    return text
+
+
+def manifest_name(infix: Infix) -> str:
+    """Return the manifest's name."""
+    return f"{MANIFEST_PREFIX}.{infix}.manifest.json"
+
+
+def stats_prefix(infix: Infix) -> str:
+    """Return the statistics file's name without `.stats.json`."""
+    return f"{FILE_PREFIX}.episode_batch.{infix}"
+
+
+def journal_name(infix: Infix) -> str:
+    """Return the journal's name."""
+    return f"{FILE_PREFIX}.episodes.{infix}.jsonl"
+
+
+def video_prefix(infix: Infix, episode_id: int) -> str:
+    """Return the name of an episode's video without its extensions."""
+    return f"{FILE_PREFIX}.video.{infix}.video{episode_id:06d}"
+
+
+def lock_name(infix: Infix) -> str:
+    """Return the name of the file that an open monitor holds locked."""
+    return f".{FILE_PREFIX}.{infix}.lock"
+
+
+def is_manifest(name: str) -> bool:
+    """Tell whether `name` is a manifest's, finished."""
+    return _MANIFEST.fullmatch(name) is not None
+
+
+def infix_of(name: str) -> str | None:
+    """Return the infix in the name of a monitor file; None where there is none."""
+    for pattern in (*_PATTERNS, *_HIDDEN):
+        match = pattern.fullmatch(name)
+        if match:
+            return match.groupdict().get("infix")
+    return None
+
+
+def episode_of(name: str) -> int | None:
+    """Return the episode's number in a file's name; None where there is none."""
+    for pattern in _PATTERNS:
+        match = pattern.fullmatch(name)
+        if match and match.groupdict().get("episode"):
+            return int(match["episode"])
+    return None
+
+
+def iter_monitor_files(
+    directory: Path, *, hidden: bool = False
+) -> Iterator[Path]:
+    """Yield the monitor files of `directory`, sorted by name.
+
+    Only regular files (and links to them) with a name that a monitor gives; other
+    files that start with `openaigym.`, and directories, are somebody else's.
+
+    Args:
+        directory: where to look; not below it. A directory that is not there holds
+            nothing.
+        hidden: also locks and unfinished files.
+    """
+    patterns = _PATTERNS + (_HIDDEN if hidden else ())
+    if not directory.is_dir():
+        return
+    for path in sorted(directory.iterdir()):
+        if any(p.fullmatch(path.name) for p in patterns) and path.is_file():
+            yield path

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a frame is: a `(height, width, 3) uint8` array of red, green and blue."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InvalidArgument, InvalidFrame
+
+__all__ = ["Frame", "check_frame", "check_size", "pad_to_even"]
+
+Frame: TypeAlias = NDArray[np.uint8]
+
+# H.264 level 6.2 ends here.
+_MAX_SIDE = 16384
+
+
+def check_frame(frame: object, *, size: tuple[int, int] | None = None) -> Frame:
+    """Return `frame` if it is a picture.
+
+    Args:
+        frame: what an environment gave.
+        size: the `(height, width)` that it must have; any, if None.
+
+    Raises:
+        InvalidFrame: it is not a `(height, width, 3) uint8` array of that size.
+    """
+    if not isinstance(frame, np.ndarray):
+        raise InvalidFrame(
+            "A frame must be a (height, width, 3) uint8 array, got "
+            f"{type(frame).__name__}."
+        )
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise InvalidFrame(
+            "A frame must be a (height, width, 3) uint8 array, got shape "
+            f"{frame.shape} and dtype {frame.dtype}."
+        )
+    if 0 in frame.shape:
+        raise InvalidFrame(f"A frame must not be empty, got shape {frame.shape}.")
+    if size is not None and frame.shape[:2] != size:
+        raise InvalidFrame(
+            f"All frames of a video have one size: the first was (height, width) "
+            f"{size}, this one is {frame.shape[:2]}."
+        )
+    return frame
+
+
+def check_size(height: int, width: int) -> tuple[int, int]:
+    """Return `(height, width)` if a picture can have that size, in pixels.
+
+    Raises:
+        InvalidArgument: one is not a whole number from 1 to 16384.
+    """
+    for name, value in (("height", height), ("width", width)):
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not whole or not 1 <= value <= _MAX_SIDE:
+            raise InvalidArgument(
+                f"{name} must be a whole number of pixels from 1 to {_MAX_SIDE}, "
+                f"got {value!r}."
+            )
+    return int(height), int(width)
+
+
+def pad_to_even(frame: Frame) -> Frame:
+    """Return `frame` with its last row and column doubled where a side is odd.
+
+    yuv420p has one colour sample for two by two pixels, so the sides of a video are
+    even. One repeated edge pixel keeps every other pixel where and as it is.
+    """
+    height, width = frame.shape[:2]
+    if height % 2 == 0 and width % 2 == 0:
+        return frame
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frame rates, as exact fractions."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from fractions import Fraction
+
+from .errors import InvalidArgument
+
+__all__ = ["MAX_DENOMINATOR", "rate_from_timestep", "to_rate"]
+
+# A timestep is a decimal number of at most microseconds: 0.0333333 means 1/30.
+MAX_DENOMINATOR = 10**6
+
+
+def to_rate(fps: float | Fraction) -> Fraction:
+    """Return `fps` frames per second as an exact fraction.
+
+    A `Fraction` and an integer are taken as they are. A float is taken as the simplest
+    fraction that has the same float value to within a millionth: 29.97 is 2997/100 and
+    30000/1001 given as a float is 30000/1001.
+
+    Raises:
+        InvalidArgument: `fps` is not a number, is a bool, NaN, infinite, zero or
+            negative, or is outside what a video file can say (1/1000 to 1000000).
+    """
+    if isinstance(fps, bool) or not isinstance(fps, numbers.Real):
+        raise InvalidArgument(
+            f"fps must be a positive number of frames per second, got {fps!r}."
+        )
+    if not math.isfinite(fps) or fps <= 0:
+        raise InvalidArgument(
+            f"fps must be a positive, finite number of frames per second, got {fps}."
+        )
+    rate = (
+        Fraction(fps)
+        if isinstance(fps, numbers.Rational)
+        else Fraction(float(fps)).limit_denominator(MAX_DENOMINATOR)
+    )
+    if not Fraction(1, 1000) <= rate <= MAX_DENOMINATOR:
+        raise InvalidArgument(
+            f"fps must be from 0.001 to {MAX_DENOMINATOR}, got {fps}."
+        )
+    return rate
+
+
+def rate_from_timestep(timestep: float) -> Fraction:
+    """Return the rate of one frame every `timestep` seconds.
+
+    Raises:
+        InvalidArgument: `timestep` is not a positive, finite number.
+    """
+    if not math.isfinite(timestep) or timestep <= 0:
+        raise InvalidArgument(
+            f"A timestep must be a positive number of seconds, got {timestep}."
+        )
+    return to_rate(1 / Fraction(timestep).limit_denominator(MAX_DENOMINATOR))

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Schedules: which episodes get a video. A schedule is a function `(int) -> bool`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from .errors import InvalidArgument
+
+__all__ = [
+    "Schedule",
+    "capped_cubic_video_schedule",
+    "disable_videos",
+    "schedule_from_text",
+    "schedule_name",
+    "to_schedule",
+]
+
+Schedule: TypeAlias = Callable[[int], Any]
+
+_CAP = 1000
+
+
+def capped_cubic_video_schedule(episode_id: int) -> bool:
+    """Tell whether an episode is a perfect cube below 1000 or a multiple of 1000.
+
+    >>> [n for n in range(3001) if capped_cubic_video_schedule(n)]
+    [0, 1, 8, 27, 64, 125, 216, 343, 512, 729, 1000, 2000, 3000]
+
+    A negative number is never recorded.
+    """
+    if episode_id < 0:
+        return False
+    if episode_id >= _CAP:
+        return bool(episode_id % _CAP == 0)
+    return bool(round(episode_id ** (1 / 3)) ** 3 == episode_id)
+
+
+def disable_videos(episode_id: int) -> bool:
+    """Return False: no episode gets a video."""
+    return False
+
+
+def to_schedule(video_callable: object) -> Schedule:
+    """Return the schedule that gym's `video_callable` argument means.
+
+    None is the capped cubic schedule; False, and whatever equals it, records nothing;
+    a function decides itself, by the truth of what it returns.
+
+    Raises:
+        InvalidArgument: it is something else, True for example.
+    """
+    if video_callable is None:
+        return capped_cubic_video_schedule
+    if callable(video_callable):
+        return video_callable
+    if video_callable == False:  # noqa: E712  gym takes 0 and numpy's False too
+        return disable_videos
+    raise InvalidArgument(
+        "video_callable must be a function from an episode's number to a bool, None "
+        "(the cubes 0, 1, 8, 27 ... and every 1000th) or False (no videos), got "
+        f"{type(video_callable).__name__}: {video_callable!r}. For a video of every "
+        "episode use video_callable=lambda episode_id: True."
+    )
+
+
+def schedule_name(schedule: Schedule) -> str:
+    """Return the name under which a schedule is written into the manifest."""
+    name = getattr(schedule, "__qualname__", None) or type(schedule).__qualname__
+    return str(name)
+
+
+class EveryNth:
+    """The schedule of episodes 0, n, 2n ..."""
+
+    def __init__(self, n: int) -> None:
+        if n < 1:
+            raise InvalidArgument(f"every:N needs a positive whole number, got {n}.")
+        self.n = n
+        self.__qualname__ = f"every:{n}"
+
+    def __call__(self, episode_id: int) -> bool:
+        return episode_id % self.n == 0
+
+
+class At:
+    """The schedule of just the given episodes."""
+
+    def __init__(self, episode_ids: frozenset[int]) -> None:
+        if any(number < 0 for number in episode_ids):
+            raise InvalidArgument(
+                f"Episodes are numbered from 0, got at:{min(episode_ids)}."
+            )
+        self.episode_ids = episode_ids
+        self.__qualname__ = "at:" + ",".join(map(str, sorted(episode_ids)))
+
+    def __call__(self, episode_id: int) -> bool:
+        return episode_id in self.episode_ids
+
+
+def record_all(episode_id: int) -> bool:
+    """Return True: every episode gets a video."""
+    return True
+
+
+def schedule_from_text(text: str) -> Schedule:
+    """Return the schedule that a command line names.
+
+    Args:
+        text: `cubic`, `all`, `none`, `every:N` or `at:0,5,9`.
+
+    Raises:
+        InvalidArgument: it is none of these.
+    """
+    named: dict[str, Schedule] = {
+        "cubic": capped_cubic_video_schedule,
+        "all": record_all,
+        "none": disable_videos,
+    }
+    if text in named:
+        return named[text]
+    kind, _, numbers = text.partition(":")
+    try:
+        if kind == "every":
+            return EveryNth(int(numbers))
+        if kind == "at":
+            return At(frozenset(map(int, numbers.split(","))))
+    except InvalidArgument:
+        raise
+    except ValueError:
+        pass
+    raise InvalidArgument(
+        f"There is no schedule {text!r}. Use cubic, all, none, every:N (every:10) or "
+        "at:NUMBERS (at:0,5,9)."
+    )
