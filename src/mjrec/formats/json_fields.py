@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values taken out of JSON that somebody else may have written.
+
+Every function here raises `ValueError` with a reason that can follow "Cannot read
+FILE:"; the readers of the file formats turn it into `UnreadableFile`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ..errors import UnreadableFile
+from ..json_text import float_from_json, loads
+
+__all__ = [
+    "boolean",
+    "field",
+    "integer",
+    "json_object",
+    "list_of",
+    "mapping",
+    "number",
+    "optional",
+    "read_object",
+    "text",
+    "unreadable",
+]
+
+T = TypeVar("T")
+
+_KINDS = {
+    bool: "true or false",
+    dict: "an object",
+    float: "a number",
+    int: "a number",
+    list: "a list",
+    str: "a text",
+    type(None): "null",
+}
+
+
+@contextlib.contextmanager
+def unreadable(path: Path) -> Iterator[None]:
+    """Turn the `ValueError` or `OSError` of the block into `UnreadableFile`."""
+    try:
+        yield
+    except OSError as error:
+        raise UnreadableFile(path, error.strerror or error) from error
+    except ValueError as error:
+        raise UnreadableFile(path, error) from error
+
+
+def read_object(path: Path) -> Mapping[str, Any]:
+    """Return the object that the whole file holds.
+
+    Raises:
+        OSError: there is no such file.
+        ValueError: it is no regular file, or does not hold a JSON object.
+    """
+    # Opening a pipe would wait for ever.
+    if path.exists() and not path.is_file():
+        raise ValueError("it is not a regular file")
+    return json_object(path.read_bytes())
+
+
+def json_object(data: bytes) -> Mapping[str, Any]:
+    """Return the JSON object that `data` is the text of."""
+    try:
+        value = loads(data)
+    except UnicodeDecodeError as error:
+        raise ValueError("it is not UTF-8 text") from error
+    except RecursionError as error:
+        raise ValueError("its JSON is nested too deeply") from error
+    except ValueError as error:
+        raise ValueError(f"it is not whole JSON ({error})") from error
+    return mapping(value)
+
+
+def field(
+    values: Mapping[str, Any], key: str, convert: Callable[[Any], T], **default: T
+) -> T:
+    """Return `values[key]`, converted; `default=` stands in for a missing key."""
+    if key not in values:
+        if default:
+            return default["default"]
+        raise ValueError(f"it has no {key!r}")
+    try:
+        return convert(values[key])
+    except ValueError as error:
+        raise ValueError(f"its {key!r} is wrong: {error}") from error
+
+
+def optional(convert: Callable[[Any], T]) -> Callable[[Any], T | None]:
+    """Return a conversion that leaves null alone."""
+    return lambda value: None if value is None else convert(value)
+
+
+def list_of(convert: Callable[[Any], T]) -> Callable[[Any], tuple[T, ...]]:
+    """Return a conversion of each item of a list."""
+
+    def convert_items(value: Any) -> tuple[T, ...]:
+        return tuple(convert(item) for item in _checked(value, list))
+
+    return convert_items
+
+
+def mapping(value: Any) -> Mapping[str, Any]:
+    """Return an object as it is."""
+    return _checked(value, dict)
+
+
+def text(value: Any) -> str:
+    """Return a text as it is."""
+    return _checked(value, str)
+
+
+def boolean(value: Any) -> bool:
+    """Return true or false as it is."""
+    return _checked(value, bool)
+
+
+def integer(value: Any) -> int:
+    """Return a whole number, also one written with a fraction of zero."""
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return _checked(value, int)
+
+
+def number(value: Any) -> float:
+    """Return a number; null is NaN, as `json_text` writes it."""
+    if not isinstance(value, float | None):
+        _checked(value, int)
+    try:
+        return float_from_json(value)
+    except OverflowError as error:
+        raise ValueError("a number is larger than a float can be") from error
+
+
+def _checked(value: Any, kind: type[T]) -> T:
+    # bool is a subclass of int, but true is no number in JSON.
+    if type(value) is not kind:
+        found = _KINDS.get(type(value), type(value).__name__)
+        raise ValueError(f"{_KINDS[kind]} belongs there, not {found}")
+    return value

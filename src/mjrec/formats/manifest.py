@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The manifest: which files belong to one monitor.
+
+`openaigym.manifest.<infix>.manifest.json` is written last, so that whatever it lists
+is there and whole. Names in it are base names: the directory can be moved, and a
+manifest from elsewhere cannot point outside its own directory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..atomic_files import write_text
+from ..json_text import dumps
+from .json_fields import (
+    field,
+    list_of,
+    mapping,
+    optional,
+    read_object,
+    text,
+    unreadable,
+)
+
+__all__ = ["Manifest", "read_manifest", "write_manifest"]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What one manifest says.
+
+    Attributes:
+        stats: base name of the statistics file.
+        videos: base names of each finished video and its metadata, in the order of
+            recording.
+        env_info: `gym_version` and `env_id`; some gyms left one or both out.
+        mjrec: what gym did not write; None in gym's own manifests.
+    """
+
+    stats: str
+    videos: tuple[tuple[str, str], ...]
+    env_info: Mapping[str, Any]
+    mjrec: Mapping[str, Any] | None = None
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Return what the manifest says. Keys that nobody knows are ignored.
+
+    Raises:
+        UnreadableFile: it is missing or damaged, or names a file elsewhere.
+    """
+    with unreadable(path):
+        values = read_object(path)
+        mjrec = field(values, "mjrec", optional(mapping), default=None)
+        return Manifest(
+            stats=field(values, "stats", _base_name),
+            videos=field(values, "videos", list_of(_pair)),
+            env_info=field(values, "env_info", mapping),
+            mjrec=mjrec,
+        )
+
+
+def write_manifest(path: Path, manifest: Manifest) -> None:
+    """Write the manifest, whole or not at all.
+
+    Raises:
+        ValueError: a name in it is not a base name.
+    """
+    content = {
+        "stats": _base_name(manifest.stats),
+        "videos": [[_base_name(v), _base_name(m)] for v, m in manifest.videos],
+        "env_info": dict(manifest.env_info),
+    }
+    if manifest.mjrec is not None:
+        content["mjrec"] = dict(manifest.mjrec)
+    write_text(path, dumps(content))
+
+
+def _pair(value: Any) -> tuple[str, str]:
+    names = list_of(_base_name)(value)
+    if len(names) != 2:
+        raise ValueError(
+            f"a video and its metadata belong together, not {len(names)} names"
+        )
+    return names[0], names[1]
+
+
+def _base_name(value: Any) -> str:
+    name = text(value)
+    if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
+        raise ValueError(f"{name!r} is not the name of a file in the same directory")
+    return name
