@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Videos packed for somebody else: gym's upload archive.
+
+A gzipped tar file, flat::
+
+    <video>, <its metadata>      for each pair, in the order given
+    manifest.json                {"version": 0, "videos": [[video, metadata], ...]}
+
+It depends on the names and contents of the files alone: their times, owners and
+permissions are left out, so the same videos give the same bytes.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import re
+import shutil
+import stat
+import tarfile
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import IO
+
+from ..errors import ArchiveError
+from ..json_text import dumps
+
+__all__ = ["MAX_VIDEOS", "write_archive"]
+
+MAX_VIDEOS = 100
+
+_MANIFEST = "manifest.json"
+_VIDEO_NAME = re.compile(r"[\w.-]+\.(mp4|avi|json)", re.ASCII)
+_METADATA_NAME = re.compile(r"[\w.-]+\.meta\.json", re.ASCII)
+
+_Pair = tuple[Path, Path]
+
+
+def write_archive(
+    videos: Iterable[tuple[str | os.PathLike[str], str | os.PathLike[str]]],
+    archive_file: IO[bytes],
+    env_id: str | None = None,
+) -> None:
+    """Write an archive of videos with their metadata.
+
+    Everything is checked and read before the first byte goes into `archive_file`.
+
+    Args:
+        videos: pairs of a video's path and its metadata's path, as in
+            `load_results(...)["videos"]`; at most 100, in names that all differ.
+        archive_file: a file open for writing bytes. It is not closed.
+        env_id: what the videos show; the messages begin with it.
+
+    Raises:
+        ArchiveError: a file is missing, no regular file, has a name that does not
+            belong into an archive, or cannot be read. Nothing was written.
+    """
+    pairs = [(Path(video), Path(metadata)) for video, metadata in videos]
+    try:
+        _check(pairs)
+        with tempfile.TemporaryFile() as whole:
+            _pack(pairs, whole)
+            whole.seek(0)
+            shutil.copyfileobj(whole, archive_file)
+    except _Refused as reason:
+        raise ArchiveError(f"[{env_id}] {reason}") from reason.__cause__
+
+
+class _Refused(Exception):
+    """Why there will be no archive."""
+
+
+def _check(pairs: Sequence[_Pair]) -> None:
+    if len(pairs) > MAX_VIDEOS:
+        raise _Refused(
+            f"{len(pairs)} videos were given, and an archive holds at most "
+            f"{MAX_VIDEOS}. Write several archives."
+        )
+    taken: set[str] = set()
+    for video, metadata in pairs:
+        _check_files(video, metadata)
+        _check_names(video, metadata, taken)
+        taken.update((video.name, metadata.name))
+
+
+def _check_files(video: Path, metadata: Path) -> None:
+    if not os.path.lexists(video):
+        raise _Refused(
+            f"There is no video {video}. Its recording may have failed: see the "
+            "recorder's `functional`."
+        )
+    if not os.path.lexists(metadata):
+        raise _Refused(
+            f"There is no metadata {metadata} for the video {video}. A video recorder "
+            "writes it beside each video."
+        )
+    for path in (video, metadata):
+        if not stat.S_ISREG(path.lstat().st_mode):
+            raise _Refused(
+                f"{path} is a link, a directory or a device. Give the file itself."
+            )
+
+
+def _check_names(video: Path, metadata: Path, taken: set[str]) -> None:
+    if video.name in taken:
+        raise _Refused(_twice(video))
+    if metadata.name in taken or metadata.name == video.name:
+        raise _Refused(_twice(metadata))
+    if not _VIDEO_NAME.fullmatch(video.name):
+        raise _Refused(
+            f"{video.name!r} is no name for a video: it must be letters, digits, '_', "
+            "'-' and '.', ending in .mp4, .avi or .json."
+        )
+    if video.name.endswith(".meta.json"):
+        raise _Refused(f"{video.name!r} is the name of metadata, not of a video.")
+    if video.name.lower() == _MANIFEST:
+        raise _Refused(
+            f"A video cannot be called {video.name!r}: that is the archive's own list."
+        )
+    if not _METADATA_NAME.fullmatch(metadata.name):
+        raise _Refused(
+            f"{metadata.name!r} is no name for metadata: it must be letters, digits, "
+            "'_', '-' and '.', ending in .meta.json."
+        )
+
+
+def _twice(path: Path) -> str:
+    return (
+        f"The name {path.name!r} is there twice (the second time as {path}). An "
+        "archive has no directories: every file needs a name of its own."
+    )
+
+
+def _pack(pairs: Sequence[_Pair], whole: IO[bytes]) -> None:
+    names = [[video.name, metadata.name] for video, metadata in pairs]
+    manifest = dumps({"version": 0, "videos": names}).encode()
+    # Through a stream of our own, because tarfile puts time and name into gzip's
+    # header.
+    with (
+        gzip.GzipFile(filename="", mode="wb", fileobj=whole, mtime=0) as stream,
+        tarfile.open(fileobj=stream, mode="w", format=tarfile.PAX_FORMAT) as tar,
+    ):
+        for pair in pairs:
+            for path in pair:
+                _add_file(tar, path)
+        _add(tar, _MANIFEST, len(manifest), io.BytesIO(manifest))
+
+
+def _add_file(tar: tarfile.TarFile, path: Path) -> None:
+    try:
+        # Whatever was put there since the checks is not followed or waited for.
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+        with os.fdopen(os.open(path, flags), "rb") as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise OSError("it is no regular file any more")
+            _add(tar, path.name, status.st_size, file)
+    except OSError as error:
+        raise _Refused(f"Cannot read {path}: {error.strerror or error}.") from error
+
+
+def _add(tar: tarfile.TarFile, name: str, size: int, content: IO[bytes]) -> None:
+    # A new TarInfo has mtime 0, uid and gid 0, no names and mode 0644.
+    member = tarfile.TarInfo(name)
+    member.size = size
+    tar.addfile(member, content)

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lock files: who is alive is asked of the kernel, never of a process number.
+
+An open monitor holds `.openaigym.<infix>.lock` locked (`flock`). The kernel drops
+that when the process ends, however it ends, so a lock file that nobody holds is what
+a dead monitor left. Process numbers come round again, in containers all the time.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import weakref
+from pathlib import Path
+
+__all__ = ["Lock", "is_locked"]
+
+# A forked child shares the lock, which would outlive a killed parent in it.
+_held: weakref.WeakSet[Lock] = weakref.WeakSet()
+
+
+class Lock:
+    """A new file at `path`, locked until `release` or the end of the process.
+
+    Args:
+        path: the file to make; it must not exist.
+        content: for people who look into it. Nothing reads it back.
+
+    Raises:
+        FileExistsError: the file is there, held or left behind.
+        OSError: it cannot be made there.
+    """
+
+    def __init__(self, path: Path, content: str) -> None:
+        self._path = path
+        self._descriptor: int | None = None
+        # Python opens every descriptor close-on-exec: an encoder that outlives this
+        # process does not keep the lock.
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+        self._descriptor = descriptor
+        _held.add(self)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            os.write(descriptor, content.encode())
+            if not _is_at(descriptor, path):
+                # Before it was locked it looked like a dead monitor's.
+                raise FileExistsError(f"{path} was removed while it was being locked")
+        except BaseException:
+            self.release()
+            raise
+
+    def release(self) -> None:
+        """Remove the file and let it go; further calls do nothing.
+
+        A file that somebody has put in its place stays.
+        """
+        descriptor, self._descriptor = self._descriptor, None
+        if descriptor is None:
+            return
+        try:
+            # Removed while it is still held: nobody ever sees it unlocked.
+            if _is_at(descriptor, self._path):
+                self._path.unlink(missing_ok=True)
+        finally:
+            os.close(descriptor)
+
+
+def is_locked(path: Path) -> bool:
+    """Tell whether a living process holds the lock file at `path`.
+
+    Raises:
+        OSError: the file is there and cannot be opened.
+    """
+    try:
+        # Not blocking, should somebody have put a pipe there.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _forget_locks_of_the_parent() -> None:
+    for lock in list(_held):
+        descriptor, lock._descriptor = lock._descriptor, None
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+os.register_at_fork(after_in_child=_forget_locks_of_the_parent)
