@@ -11,6 +11,7 @@
     ├── DirectoryInUse                      another live monitor writes there
     ├── DirectoryNotWritable                (also OSError)
     ├── DifferentEnvironment                resume over another environment
+    ├── EnvironmentNotMade                  it is known, and making it failed
     ├── NoPictures                          the environment cannot be drawn
     ├── ResetNeeded                         step before reset or after the end
     ├── ResetNotAllowed                     reset in mid-episode
@@ -39,6 +40,7 @@ __all__ = [
     "DirectoryInUse",
     "DirectoryNotWritable",
     "EncoderError",
+    "EnvironmentNotMade",
     "Error",
     "ExistingRecordings",
     "FrameCountError",
@@ -147,6 +149,19 @@ class DifferentEnvironment(Error):
             f"{asked}. Results of two environments in one directory cannot be told "
             "apart: use another directory."
         )
+
+
+class EnvironmentNotMade(Error):
+    """An environment that is known could not be made; the cause is kept.
+
+    Attributes:
+        name: the environment asked for.
+    """
+
+    def __init__(self, name: str, reason: object, *, hint: str = "") -> None:
+        self.name = name
+        text = f"Making {name} failed: {reason}"
+        super().__init__(f"{text.rstrip('. ')}. {hint}".rstrip())
 
 
 class NoPictures(Error):
