@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which camera is meant: a name, a number or an `MjvCamera`, and what a model has.
+
+Every function takes MuJoCo's own objects or a wrapper that holds one as `.ptr`, as
+dm_control's do.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import mujoco
+import numpy as np
+
+from ..errors import InvalidArgument, UnknownName
+
+__all__ = [
+    "FREE_CAMERA",
+    "Camera",
+    "camera_names",
+    "raw_data",
+    "raw_model",
+    "resolve_camera",
+    "tracking_camera",
+]
+
+Camera: TypeAlias = "str | int | mujoco.MjvCamera"
+
+FREE_CAMERA = -1
+
+# In this order, see `tracking_camera`. Plain integers, because since mujoco 3.12 a
+# member of a MuJoCo enumeration is not equal to the NumPy integer of its value.
+_TRACKING_MODES = (
+    int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM),
+    int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK),
+)
+
+
+def raw_model(model: Any) -> mujoco.MjModel:
+    """Return the `mujoco.MjModel` that `model` is or holds as `.ptr`.
+
+    Raises:
+        InvalidArgument: there is none.
+    """
+    return _unwrapped(model, mujoco.MjModel)
+
+
+def raw_data(data: Any) -> mujoco.MjData:
+    """Return the `mujoco.MjData` that `data` is or holds as `.ptr`.
+
+    Raises:
+        InvalidArgument: there is none.
+    """
+    return _unwrapped(data, mujoco.MjData)
+
+
+def camera_names(model: Any) -> list[str]:
+    """Return the names of the model's cameras in its order, without the nameless."""
+    model = raw_model(model)
+    names = (model.camera(index).name for index in range(model.ncam))
+    return [name for name in names if name]
+
+
+def resolve_camera(model: Any, camera: Camera) -> mujoco.MjvCamera:
+    """Return the camera that is meant, ready for `mjv_updateScene`.
+
+    Args:
+        model: the model that the camera belongs to.
+        camera: the name or number of one of the model's cameras, -1 for the free
+            camera in the place that the model gives it, or an `MjvCamera`, which is
+            given back as it is.
+
+    Raises:
+        UnknownName: the model has no camera of that name.
+        InvalidArgument: it has no camera of that number, or `camera` is none of these.
+    """
+    model = raw_model(model)
+    if isinstance(camera, mujoco.MjvCamera):
+        return camera
+    index = _camera_index(model, camera)
+    resolved = mujoco.MjvCamera()
+    if index == FREE_CAMERA:
+        mujoco.mjv_defaultFreeCamera(model, resolved)
+    else:
+        resolved.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        resolved.fixedcamid = index
+    return resolved
+
+
+def tracking_camera(model: Any) -> str | int | None:
+    """Return the camera of the model that follows its robot, if it has one.
+
+    Cameras that follow the centre of mass of a body's subtree (`mode="trackcom"`) come
+    before those that follow one body (`mode="track"`), because the former show the
+    whole robot and the latter often one hand of it; among equals the model's own order
+    decides.
+
+    Returns:
+        Its name, or its number if it has none; None if no camera follows anything.
+    """
+    model = raw_model(model)
+    for mode in _TRACKING_MODES:
+        followers = np.flatnonzero(model.cam_mode == mode)
+        if followers.size:
+            index = int(followers[0])
+            return model.camera(index).name or index
+    return None
+
+
+def _unwrapped(holder: object, kind: type) -> Any:
+    for candidate in (holder, getattr(holder, "ptr", None)):
+        if isinstance(candidate, kind):
+            return candidate
+    raise InvalidArgument(
+        f"A mujoco.{kind.__name__}, or dm_control's wrapper of one, is needed, got "
+        f"{type(holder).__module__}.{type(holder).__qualname__}."
+    )
+
+
+def _camera_index(model: mujoco.MjModel, camera: object) -> int:
+    if isinstance(camera, str):
+        return _index_of_name(model, camera)
+    if isinstance(camera, bool) or not isinstance(camera, int | np.integer):
+        raise InvalidArgument(
+            "A camera is a name, a number or a mujoco.MjvCamera, got "
+            f"{camera!r} of type {type(camera).__name__}."
+        )
+    if not FREE_CAMERA <= camera < model.ncam:
+        raise InvalidArgument(
+            f"There is no camera number {camera}: this model has {model.ncam} cameras. "
+            f"Give a number from -1 (the free camera) to {model.ncam - 1}."
+        )
+    return int(camera)
+
+
+def _index_of_name(model: mujoco.MjModel, name: str) -> int:
+    # An empty name would find the first nameless camera.
+    index = (
+        mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_CAMERA), name) if name else -1
+    )
+    if index < 0:
+        raise UnknownName(
+            "camera", name, camera_names(model), hint="Or give -1, the free camera."
+        )
+    return int(index)

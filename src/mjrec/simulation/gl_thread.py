@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A thread that owns one OpenGL context.
+
+A context belongs to the thread on which it is current, and each thread has one current
+context. An environment that draws keeps its own context current on the thread that
+steps it and does not always make it current again (Gymnasium's viewer does not), so a
+second renderer on that thread would turn the environment's pictures black. A context
+with a thread of its own disturbs nobody.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import importlib
+import logging
+import os
+import queue
+import sys
+import threading
+import weakref
+from collections.abc import Callable
+from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+import mujoco
+
+from ..errors import ClosedError, Error, GLError
+
+__all__ = ["GLStrings", "GLThread", "gl_error"]
+
+_logger = logging.getLogger(__name__)
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+# No picture takes this long, not even one of 16384x16384 pixels on a busy machine
+# without a GPU; a driver that hangs does.
+_PATIENCE_S = 300.0
+_PATIENCE_AT_EXIT_S = 10.0
+
+# What mujoco allocates for the window, which is never drawn into: everything goes to
+# the offscreen buffer of the `MjrContext`.
+_WINDOW_SIDE = 16
+
+# Making the first context of a backend initialises a display that all of them share.
+_making_context = threading.Lock()
+
+
+class GLStrings(NamedTuple):
+    """Who drew: OpenGL's vendor, renderer and version."""
+
+    vendor: str
+    renderer: str
+    version: str
+
+
+class _Outcome(NamedTuple):
+    value: Any = None
+    error: BaseException | None = None
+
+
+class _Request(NamedTuple):
+    function: Callable[[], Any]
+    reply: queue.SimpleQueue[_Outcome]
+
+
+class GLThread:
+    """Runs functions on one thread, on which a GL context of its own is current.
+
+    Its methods may be called from any thread, one call at a time. The thread ends at
+    `close`, when this object is garbage collected, and at interpreter exit.
+
+    Args:
+        finish: called on the thread before the context is freed. It must hold no
+            reference to this object, or that would never be garbage collected.
+
+    Raises:
+        GLError: no context can be made here, or this process was forked from one that
+            has made contexts.
+    """
+
+    def __init__(self, *, finish: Callable[[], None]) -> None:
+        _refuse_fork_of_gl()
+        self._requests: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
+        self._unanswered: queue.SimpleQueue[_Outcome] | None = None
+        self._closed = False
+        self._hangs = False
+        self._process_id = os.getpid()
+        made: queue.SimpleQueue[_Outcome] = queue.SimpleQueue()
+        # A daemon, because the interpreter waits for other threads before it calls
+        # what atexit knows, and this one ends only when it is told to.
+        self._thread = threading.Thread(
+            target=_serve,
+            args=(self._requests, made, finish),
+            name="mjrec-gl",
+            daemon=True,
+        )
+        self._thread.start()
+        self._release = weakref.finalize(
+            self, _tell_to_end, self._requests, self._process_id
+        )
+        # Its own atexit hook may run after EGL was shut down, ours may not.
+        self._release.atexit = False
+        self._answer(made)
+        # Hooks run in reverse order, and mujoco's, which shuts EGL down, was registered
+        # when the first context was made.
+        self._exit_hook = functools.partial(_close_at_exit, weakref.ref(self))
+        atexit.register(self._exit_hook)
+        weakref.finalize(self, atexit.unregister, self._exit_hook).atexit = False
+
+    def call(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Return `function(*args, **kwargs)`, called on the thread.
+
+        What it raises is raised here, the same object.
+
+        Raises:
+            ClosedError: after `close`.
+            GLError: in a forked child, which has no copy of the thread; or the driver
+                hangs.
+        """
+        self.settle()
+        reply: queue.SimpleQueue[_Outcome] = queue.SimpleQueue()
+        self._requests.put(_Request(lambda: function(*args, **kwargs), reply))
+        value: T = self._answer(reply)
+        return value
+
+    def settle(self) -> None:
+        """Return when the thread is idle.
+
+        It is busy only after Ctrl-C in the midst of an earlier call; what that one
+        was using must be left alone until then.
+
+        Raises:
+            ClosedError, GLError: as `call`.
+        """
+        self.check_usable()
+        if self._unanswered is not None:
+            self._wait_for(self._unanswered)
+            self._unanswered = None
+
+    def close(self, patience_s: float = _PATIENCE_S) -> None:
+        """Call `finish`, free the context and end the thread. Idempotent.
+
+        Does nothing in a forked child.
+        """
+        self._closed = True
+        if os.getpid() != self._process_id:
+            return
+        self._release()
+        atexit.unregister(self._exit_hook)
+        if not self._hangs:
+            self._thread.join(patience_s)
+
+    def check_usable(self) -> None:
+        """Raise ClosedError or GLError if a call would, without waiting."""
+        if self._closed:
+            raise ClosedError("The renderer is closed.")
+        if os.getpid() != self._process_id:
+            raise GLError(
+                f"This renderer lives in process {self._process_id} and cannot draw "
+                "after a fork: make it in the process that draws. Start that process "
+                'with multiprocessing\'s "spawn" method.'
+            )
+        if self._hangs:
+            raise GLError(
+                "The OpenGL driver hangs since an earlier call: end this process."
+            )
+
+    def _answer(self, reply: queue.SimpleQueue[_Outcome]) -> Any:
+        try:
+            outcome = self._wait_for(reply)
+        except KeyboardInterrupt:
+            self._unanswered = reply
+            raise
+        if outcome.error is None:
+            return outcome.value
+        try:
+            raise outcome.error
+        finally:
+            # The traceback holds this frame, which must not hold the error.
+            del outcome
+
+    def _wait_for(self, reply: queue.SimpleQueue[_Outcome]) -> _Outcome:
+        try:
+            return reply.get(timeout=_PATIENCE_S)
+        except queue.Empty:
+            self._hangs = True
+            raise GLError(
+                f"The OpenGL driver gave no answer within {_PATIENCE_S:.0f} seconds. "
+                "Run `mjrec doctor` to see which backend works; end this process."
+            ) from None
+
+
+def gl_error(what: str, reason: object) -> GLError:
+    """Return the error for something that OpenGL cannot do here."""
+    backend = os.environ.get("MUJOCO_GL")
+    setting = "unset" if backend is None else repr(backend)
+    return GLError(
+        f"{what}, with MUJOCO_GL {setting}: {reason or 'no reason given'}. Run `mjrec "
+        "doctor` to see which backend renders here and what the others lack."
+    )
+
+
+def _serve(
+    requests: queue.SimpleQueue[_Request | None],
+    made: queue.SimpleQueue[_Outcome],
+    finish: Callable[[], None],
+) -> None:
+    try:
+        context = _make_context()
+    except BaseException as error:
+        made.put(_Outcome(error=error))
+        return
+    made.put(_Outcome())
+    while (request := requests.get()) is not None:
+        _serve_one(request, context)
+        # Nothing of the caller's is kept alive while waiting for the next request.
+        del request
+    _end(context, finish)
+
+
+def _serve_one(request: _Request, context: Any) -> None:
+    try:
+        # Each time, because a garbage collection on this thread may have freed some
+        # other context, and mujoco's EGL then lets go of whatever is current.
+        context.make_current()
+        request.reply.put(_Outcome(request.function()))
+    except BaseException as error:
+        request.reply.put(_Outcome(error=error))
+
+
+def _end(context: Any, finish: Callable[[], None]) -> None:
+    # At interpreter exit somebody else may have shut EGL down already; everything is
+    # gone then, and there is nobody to tell.
+    for step in (context.make_current, finish, context.free):
+        try:
+            step()
+        except Exception:
+            _logger.debug("Could not free an OpenGL context", exc_info=True)
+
+
+def _tell_to_end(requests: queue.SimpleQueue[_Request | None], process_id: int) -> None:
+    # `put` may be called from a finaliser; the thread does the rest in its own time.
+    if os.getpid() == process_id:
+        requests.put(None)
+
+
+def _close_at_exit(reference: weakref.ref[GLThread]) -> None:
+    if (thread := reference()) is not None:
+        thread.close(_PATIENCE_AT_EXIT_S)
+
+
+def _make_context() -> Any:
+    """Return a new context, current on this thread."""
+    global _has_made_context
+    try:
+        with _making_context:
+            context: Any = _owned(_context_class())(_WINDOW_SIDE, _WINDOW_SIDE)
+            _has_made_context = True
+        context.make_current()
+    except Error:
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise gl_error("No OpenGL context can be made", reason) from error
+    return context
+
+
+def _context_class() -> Any:
+    """Return the class for the backend that mujoco chose when it was imported."""
+    if hasattr(mujoco, "GLContext"):
+        return mujoco.GLContext
+    # mujoco swallows the reason when it is imported; importing the part that failed
+    # once more tells it.
+    for module in ("mujoco.rendering.classic.gl_context", "mujoco.gl_context"):
+        try:
+            return importlib.import_module(module).GLContext
+        except (ModuleNotFoundError, AttributeError):
+            continue
+    raise gl_error("mujoco was imported without rendering", "it has no GLContext")
+
+
+def _owned(context_class: type[Any]) -> type[Any]:
+    """Return a subclass that only its owner frees.
+
+    mujoco's classes free the context in `__del__`, on whichever thread drops it.
+    """
+    return type("OwnedGLContext", (context_class,), {"__del__": _leave_to_the_owner})
+
+
+def _leave_to_the_owner(context: object) -> None:
+    del context
+
+
+# Mesa's rasteriser has threads of its own, which a forked child lacks: the first frame
+# that it draws waits for them for ever, even if every context was freed before.
+_has_made_context = False
+_forked_from_gl = False
+
+
+def _note_fork() -> None:
+    global _forked_from_gl
+    _forked_from_gl = _forked_from_gl or _has_made_context or _egl_is_initialised()
+
+
+def _egl_is_initialised() -> bool:
+    """Return whether anybody has made a context through mujoco's EGL."""
+    return getattr(sys.modules.get("mujoco.egl"), "EGL_DISPLAY", None) is not None
+
+
+os.register_at_fork(after_in_child=_note_fork)
+
+
+def _refuse_fork_of_gl() -> None:
+    if _forked_from_gl:
+        raise GLError(
+            "This process was forked from one that had used OpenGL, and drawing here "
+            'would wait for ever. Start it with multiprocessing\'s "spawn" method (for '
+            'Gymnasium: AsyncVectorEnv(..., context="spawn")), or fork before anything '
+            "is drawn."
+        )

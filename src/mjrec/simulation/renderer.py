@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a simulation from a renderer of our own, beside the environment's."""
+
+from __future__ import annotations
+
+import copy
+import threading
+from types import TracebackType
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ..errors import InvalidArgument
+from ..frames import Frame, check_size
+from .baked_fields import BakedFields
+from .cameras import FREE_CAMERA, Camera, raw_data, raw_model, resolve_camera
+from .gl_thread import GLStrings, GLThread, gl_error
+
+__all__ = ["SceneRenderer"]
+
+
+class SceneRenderer:
+    """Draws a simulation: the pictures of `mujoco.Renderer`, byte for byte.
+
+    It has a GL context on a thread of its own, so that whatever draws on the caller's
+    thread is left alone; it may be used from any thread, and several at once may
+    exist. The scene is put together on the caller's thread from the model and data as
+    they are at that moment, and only the drawing is handed over. Neither the model nor
+    the data is written to; a picture larger than the model's offscreen buffer gets a
+    larger buffer on a copy.
+
+    Most changes to the model show in the next picture. Those to height fields,
+    textures, meshes, sizes of planes, textures of materials, fog and rendering quality
+    show after `model_changed`, and so does another model: call it at each reset.
+
+    ::
+
+        with SceneRenderer(model, height=480, width=640, camera="track") as renderer:
+            frame = renderer.render(data)
+
+    Args:
+        model: a `mujoco.MjModel`, or dm_control's wrapper of one.
+        height: in pixels.
+        width: in pixels.
+        camera: the name or number of a camera of the model, -1 for the free camera, or
+            an `MjvCamera`, which is read anew for every picture.
+        scene_option: a `mujoco.MjvOption`, read anew for every picture; MuJoCo's
+            default, if None. dm_control's default differs from it: it draws no range
+            finders.
+        max_geom: how many geoms a scene may have; the rest is not drawn. Environments'
+            own renderers have other limits (Gymnasium's 1000).
+
+    Raises:
+        UnknownName: the model has no such camera.
+        InvalidArgument: a camera number or a size that cannot be, also a size that the
+            driver cannot draw.
+        GLError: no OpenGL backend works here, or this process was forked from one that
+            had used OpenGL.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        *,
+        height: int,
+        width: int,
+        camera: Camera = FREE_CAMERA,
+        scene_option: mujoco.MjvOption | None = None,
+        max_geom: int = 10000,
+    ) -> None:
+        self._height, self._width = check_size(height, width)
+        self._model = raw_model(model)
+        self._camera = camera
+        self._scene_option = scene_option or mujoco.MjvOption()
+        self._max_geom = _check_max_geom(max_geom)
+        resolve_camera(self._model, camera)
+        self._scene = mujoco.MjvScene(self._model, maxgeom=self._max_geom)
+        # Nothing of what the caller sees is shared with the thread, except while a call
+        # lasts: dropping the renderer ends the thread.
+        self._canvas = _Canvas(self._height, self._width)
+        self._one_at_a_time = threading.Lock()
+        self._thread = GLThread(finish=self._canvas.free)
+        try:
+            self._baked = BakedFields.of(self._model)
+            self._thread.call(self._canvas.prepare, self._model)
+            self._gl_strings = self._thread.call(_read_gl_strings)
+        except BaseException:
+            self._thread.close()
+            raise
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """`(height, width)` of the pictures."""
+        return self._height, self._width
+
+    @property
+    def gl_strings(self) -> GLStrings:
+        """Who draws: OpenGL's vendor, renderer and version."""
+        return self._gl_strings
+
+    def render(self, data: Any) -> Frame:
+        """Return the picture of `data`, a new `(height, width, 3) uint8` array.
+
+        The first row is the top one.
+
+        Args:
+            data: the `mujoco.MjData` of the model, or dm_control's wrapper of it. Its
+                derived quantities are drawn as they are: after `mj_step` they belong to
+                the state before the last substep, see `mj_forward`.
+
+        Raises:
+            InvalidArgument: the data belongs to a model of another structure.
+            ClosedError: after `close`.
+            GLError: in a forked child, or the driver hangs.
+        """
+        data = raw_data(data)
+        # Before the lock, which another thread may have held at the time of a fork.
+        self._thread.check_usable()
+        with self._one_at_a_time:
+            # Memory beyond the arrays of smaller data would be read.
+            _check_belongs(data, self._model)
+            # The thread may still be drawing the last scene, after Ctrl-C.
+            self._thread.settle()
+            self._update_scene(data)
+            return self._thread.call(self._canvas.draw, self._scene)
+
+    def model_changed(self, model: Any = None) -> None:
+        """Bring the renderer up to date with its model, or go over to another one.
+
+        Afterwards it draws what a new renderer would draw. Compares what a GL context
+        keeps of a model (milliseconds where there are large textures) and uploads what
+        differs; a context is made anew only where that is not enough.
+
+        Args:
+            model: the model from now on; None is the same object as before. A name or
+                number given as camera is looked up in it.
+
+        Raises:
+            UnknownName, InvalidArgument: another model lacks the camera; the renderer
+                goes on with the model it had.
+            ClosedError: after `close`.
+            GLError: as `render`.
+        """
+        self._thread.check_usable()
+        with self._one_at_a_time:
+            self._thread.settle()
+            if model is None or raw_model(model) is self._model:
+                self._upload_changes()
+            else:
+                self._go_over_to(raw_model(model))
+
+    def close(self) -> None:
+        """Free the context and end its thread. Idempotent."""
+        self._thread.close()
+
+    def __enter__(self) -> SceneRenderer:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc_value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return (
+            f"SceneRenderer(height={self._height}, width={self._width}, "
+            f"camera={self._camera!r}, gl={self._gl_strings.renderer!r})"
+        )
+
+    def _update_scene(self, data: mujoco.MjData) -> None:
+        mujoco.mjv_updateScene(
+            self._model,
+            data,
+            self._scene_option,
+            None,
+            # The model's free camera and the number of a name may have changed.
+            resolve_camera(self._model, self._camera),
+            int(mujoco.mjtCatBit.mjCAT_ALL),
+            self._scene,
+        )
+
+    def _upload_changes(self) -> None:
+        baked = BakedFields.of(self._model)
+        if changed := baked.changed_since(self._baked):
+            self._thread.call(self._canvas.upload, self._model, changed)
+            self._baked = baked
+
+    def _go_over_to(self, model: mujoco.MjModel) -> None:
+        resolve_camera(model, self._camera)
+        scene = mujoco.MjvScene(model, maxgeom=self._max_geom)
+        baked = BakedFields.of(model)
+        self._thread.call(self._canvas.prepare, model)
+        self._model, self._scene, self._baked = model, scene, baked
+
+
+# What to upload for which attribute of `BakedFields`, and how many there are.
+_UPLOADS = {
+    "hfields": ("nhfield", mujoco.mjr_uploadHField),
+    "textures": ("ntex", mujoco.mjr_uploadTexture),
+    "meshes": ("nmesh", mujoco.mjr_uploadMesh),
+}
+
+
+class _Canvas:
+    """What lives on the GL thread; every method is called there."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self._context: mujoco.MjrContext | None = None
+        self._rectangle = mujoco.MjrRect(0, 0, width, height)
+        self._bottom_up = np.empty((height, width, 3), np.uint8)
+
+    def prepare(self, model: mujoco.MjModel) -> None:
+        """Make the context for `model`, in place of an earlier one."""
+        rectangle = self._rectangle
+        _check_driver_can_draw(rectangle.height, rectangle.width)
+        # Only the context needs the larger buffer, and it keeps no reference.
+        with_buffer = _with_buffer(model, rectangle.height, rectangle.width)
+        self.free()
+        try:
+            context = mujoco.MjrContext(
+                with_buffer, int(mujoco.mjtFontScale.mjFONTSCALE_150)
+            )
+        except mujoco.FatalError as error:
+            what = f"A {rectangle.width}x{rectangle.height} picture cannot be drawn"
+            raise gl_error(what, error) from error
+        self._context = context
+        mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), context)
+
+    def upload(self, model: mujoco.MjModel, changed: set[str]) -> None:
+        """Bring the context up to date with what `BakedFields` says has changed."""
+        if not changed <= _UPLOADS.keys():
+            self.prepare(model)
+            return
+        for name in changed:
+            count, upload = _UPLOADS[name]
+            for index in range(getattr(model, count)):
+                upload(model, self._context, index)
+
+    def draw(self, scene: mujoco.MjvScene) -> Frame:
+        """Return the picture of `scene`."""
+        mujoco.mjr_render(self._rectangle, scene, self._context)
+        mujoco.mjr_readPixels(self._bottom_up, None, self._rectangle, self._context)
+        return self._bottom_up[::-1].copy()
+
+    def free(self) -> None:
+        """Free the context. Idempotent."""
+        if self._context is not None:
+            self._context.free()
+        self._context = None
+
+
+def _check_max_geom(max_geom: int) -> int:
+    whole = isinstance(max_geom, int | np.integer) and not isinstance(max_geom, bool)
+    if not whole or max_geom < 1:
+        raise InvalidArgument(
+            f"max_geom must be a whole number of at least 1, got {max_geom!r}."
+        )
+    return int(max_geom)
+
+
+# They settle the lengths of the arrays that a scene is made of.
+_SIZES = (
+    *("nbody", "ngeom", "nsite", "ncam", "nlight"),
+    *("nflexvert", "nskin", "ntendon", "nwrap", "nsensordata"),
+)
+
+
+def _check_belongs(data: mujoco.MjData, model: mujoco.MjModel) -> None:
+    """Raise InvalidArgument if the arrays of `data` have other sizes than `model` says.
+
+    A copy of the data's model is as good as the model itself.
+    """
+    origin = data.model
+    if origin is model:
+        return
+    differing = [
+        f"{name} {getattr(origin, name)}, not {getattr(model, name)}"
+        for name in _SIZES
+        if getattr(origin, name) != getattr(model, name)
+    ]
+    if differing:
+        raise InvalidArgument(
+            f"The data belongs to another model ({'; '.join(differing)}). If the "
+            "environment has compiled a new one, call model_changed with it first."
+        )
+
+
+def _with_buffer(model: mujoco.MjModel, height: int, width: int) -> mujoco.MjModel:
+    """Return `model`, or a copy with an offscreen buffer of at least that size."""
+    buffer = model.vis.global_
+    if height <= buffer.offheight and width <= buffer.offwidth:
+        return model
+    enlarged = copy.copy(model)
+    enlarged.vis.global_.offheight = max(height, buffer.offheight)
+    enlarged.vis.global_.offwidth = max(width, buffer.offwidth)
+    return enlarged
+
+
+def _check_driver_can_draw(height: int, width: int) -> None:
+    gl = _opengl()
+    limit = int(gl.glGetIntegerv(gl.GL_MAX_RENDERBUFFER_SIZE))
+    if max(height, width) > limit:
+        raise InvalidArgument(
+            f"A picture of {width}x{height} pixels is larger than this OpenGL driver "
+            f"({_read_gl_strings().renderer}) can draw: {limit}x{limit}."
+        )
+
+
+def _read_gl_strings() -> GLStrings:
+    gl = _opengl()
+    names = (gl.GL_VENDOR, gl.GL_RENDERER, gl.GL_VERSION)
+    return GLStrings(
+        *((gl.glGetString(name) or b"").decode(errors="replace") for name in names)
+    )
+
+
+def _opengl() -> Any:
+    # PyOpenGL chooses its platform when it is imported, and mujoco sets which one when
+    # it makes its context class: not before there is a context.
+    from OpenGL import GL
+
+    return GL
