@@ -3,7 +3,7 @@
 
 ::
 
-    Error
+    Error (Exception)
     ├── InvalidArgument (also ValueError)   a value that cannot be
     │   ├── UnknownName                     no such environment, camera, policy ...
     │   └── InvalidFrame                    not a (height, width, 3) uint8 picture

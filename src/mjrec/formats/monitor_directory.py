@@ -156,9 +156,7 @@ def episode_of(name: str) -> int | None:
     return None
 
 
-def iter_monitor_files(
-    directory: Path, *, hidden: bool = False
-) -> Iterator[Path]:
+def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Path]:
     """Yield the monitor files of `directory`, sorted by name.
 
     Only regular files (and links to them) with a name that a monitor gives; other

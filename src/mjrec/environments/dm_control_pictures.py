@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the pictures of a dm_control environment come from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..frames import check_size
+from ..simulation.cameras import raw_model, resolve_camera
+from ..simulation.gl_strings import current_gl_strings
+from ..simulation.scene_pictures import (
+    Look,
+    ScenePictures,
+    camera_label,
+    option_without_rangefinder,
+)
+
+__all__ = ["PhysicsPictures", "dm_control_pictures"]
+
+# The size of `physics.render()` where none is asked for.
+_HEIGHT, _WIDTH = 240, 320
+
+
+def dm_control_pictures(
+    env: Any,
+    *,
+    camera: Any = None,
+    height: int | None = None,
+    width: int | None = None,
+) -> PhysicsPictures | ScenePictures:
+    """Return the source of a dm_control environment's pictures.
+
+    Args:
+        env: an environment with dm_control's `physics`.
+        camera: a name or number; None is dm_control's default, the free camera.
+        height: in pixels; None is 240, dm_control's default.
+        width: in pixels; None is 320, likewise.
+
+    The pictures are those of `physics.render()`. A picture larger than the model's
+    offscreen buffer, which `physics.render()` refuses, and one from an `MjvCamera`,
+    which it does not know, is drawn by a renderer of our own.
+
+    Raises:
+        UnknownName: the model has no such camera.
+        InvalidArgument: a number or a size that cannot be.
+    """
+    height, width = check_size(
+        _HEIGHT if height is None else height, _WIDTH if width is None else width
+    )
+    named = camera is None or isinstance(camera, str | int)
+    if not named or not _fits(env.physics, height, width):
+        return ScenePictures(
+            lambda: (env.physics.model, env.physics.data),
+            look=lambda: Look(scene_option=option_without_rangefinder()),
+            camera=camera,
+            height=height,
+            width=width,
+        )
+    if camera is not None:
+        resolve_camera(raw_model(env.physics.model), camera)
+    return PhysicsPictures(env, camera=camera, height=height, width=width)
+
+
+class PhysicsPictures:
+    """The pictures that `physics.render()` gives.
+
+    Args:
+        env: the environment; its physics may be another one at each call.
+        camera: a name or number; None is the free camera.
+        height: in pixels.
+        width: in pixels.
+    """
+
+    render_mode = "rgb_array"
+
+    def __init__(self, env: Any, *, camera: Any, height: int, width: int) -> None:
+        self._env = env
+        self._camera = -1 if camera is None else camera
+        self._height = height
+        self._width = width
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment."""
+        return self._env
+
+    def render(self) -> Any:
+        """Return the picture of this moment, `(height, width, 3) uint8`."""
+        return self._env.physics.render(
+            height=self._height, width=self._width, camera_id=self._camera
+        )
+
+    def control_timestep(self) -> float:
+        """Return the seconds of simulated time in a step."""
+        return float(self._env.control_timestep())
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the metadata of a video says about its pictures."""
+        physics = self._env.physics
+        facts: dict[str, Any] = {
+            "pictures": "env.render",
+            "quality": "full",
+            "camera": camera_label(raw_model(physics.model), self._camera),
+        }
+        with physics.contexts.gl.make_current() as context:
+            facts.update(context.call(current_gl_strings))
+        return facts
+
+    def close(self) -> None:
+        """Do nothing: the environment closes what it draws with."""
+
+
+def _fits(physics: Any, height: int, width: int) -> bool:
+    buffer = physics.model.vis.global_
+    return bool(height <= buffer.offheight and width <= buffer.offwidth)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of text environments, as asciicast version 1.
+
+The format is asciinema's (https://docs.asciinema.org/manual/asciicast/v1/): one JSON
+object with `version`, `width`, `height`, `duration`, `command`, `title`, `env` and
+`stdout`, a list of pairs of a delay in seconds and the text that is then printed.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import shutil
+from fractions import Fraction
+from pathlib import Path
+from typing import IO
+
+from .. import atomic_files
+from ..errors import ClosedError, InvalidFrame
+
+__all__ = ["AsciicastWriter", "text_of_frame"]
+
+_CLEAR_AND_HOME = "\x1b[2J\x1b[1;1H"
+# Control sequences (colours, cursor) take no room on the screen. ECMA-48, 5.4.
+_CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
+
+
+def text_of_frame(frame: object) -> str:
+    r"""Return the text of what `render()` gave in the mode `ansi`.
+
+    Raises:
+        InvalidFrame: it is neither text nor a `StringIO`.
+    """
+    if isinstance(frame, io.StringIO):
+        frame = frame.getvalue()
+    if not isinstance(frame, str):
+        raise InvalidFrame(
+            f"A text frame must be a str or a StringIO, got {type(frame).__name__}."
+        )
+    return frame
+
+
+class AsciicastWriter:
+    """Writes text frames, each shown for the same time, into one file.
+
+    Frames go to the disk as they come; the file gets its name in `close`.
+
+    Args:
+        path: the finished file.
+        rate: frames per second.
+        title: the recording's title.
+    """
+
+    def __init__(
+        self, path: Path, *, rate: Fraction, title: str = "mjrec recording"
+    ) -> None:
+        self.path = path
+        self.frame_count = 0
+        self._delay = float(1 / rate)
+        self._rate = rate
+        self._title = title
+        self._width = 0
+        self._height = 0
+        self._body_path = atomic_files.temporary_path(path)
+        self._body: IO[str] | None = None
+        self._closed = False
+
+    def write(self, text: str) -> None:
+        """Append a frame.
+
+        Raises:
+            ClosedError: the writer is closed.
+        """
+        if self._closed:
+            raise ClosedError(f"The text recording {self.path} is closed.")
+        if self._body is None:
+            self._body = self._body_path.open("w", encoding="utf-8")
+        lines = text.replace("\r\n", "\n").split("\n")
+        self._width = max(self._width, *(_columns(line) for line in lines))
+        self._height = max(self._height, len(lines))
+        event = [self._delay, _CLEAR_AND_HOME + "\r\n".join(lines)]
+        separator = ", " if self.frame_count else ""
+        self._body.write(separator + json.dumps(event))
+        self.frame_count += 1
+
+    def close(self) -> None:
+        """Finish the file; without a frame there is none. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._body is None:
+            return
+        self._body.close()
+        try:
+            with atomic_files.replacing(self.path) as temporary:
+                self._assemble(temporary)
+        finally:
+            self._body_path.unlink()
+
+    def abort(self) -> None:
+        """End without a file."""
+        self._closed = True
+        if self._body is not None:
+            self._body.close()
+            self._body_path.unlink(missing_ok=True)
+
+    def _assemble(self, target: Path) -> None:
+        header = {
+            "version": 1,
+            "width": self._width + 2,
+            "height": self._height,
+            "duration": float(self.frame_count / self._rate),
+            "command": "-",
+            "title": self._title,
+            "env": {},
+        }
+        with (
+            target.open("w", encoding="utf-8") as whole,
+            self._body_path.open(encoding="utf-8") as body,
+        ):
+            whole.write(json.dumps(header)[:-1] + ', "stdout": [')
+            shutil.copyfileobj(body, whole)
+            whole.write("]}\n")
+
+
+def _columns(line: str) -> int:
+    return len(_CONTROL_SEQUENCE.sub("", line))

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec.Monitor`: the monitor that fits an environment."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InvalidArgument
+from ..recorder.recorder import RecorderOptions
+
+if TYPE_CHECKING:
+    from .dm_env_monitor import DmEnvMonitor
+    from .gymnasium_monitor import GymnasiumMonitor
+
+__all__ = ["Monitor"]
+
+
+# The positional arguments are gym's, in gym's order.
+def Monitor(  # noqa: N802  named as the class that it was in gym
+    env: Any,
+    directory: str | os.PathLike[str],
+    video_callable: Callable[[int], Any] | bool | None = None,
+    force: bool = False,
+    resume: bool = False,
+    write_upon_reset: bool = False,
+    uid: str | None = None,
+    mode: str | None = None,
+    *,
+    fps: float | Fraction | None = None,
+    camera: Any = None,
+    width: int | None = None,
+    height: int | None = None,
+    allow_early_reset: bool | None = None,
+    env_id: str | None = None,
+) -> GymnasiumMonitor | DmEnvMonitor:
+    """Record what happens to an environment into a monitor directory.
+
+    Use what this returns instead of `env`, and close it, best with `with`::
+
+        with mjrec.Monitor(env, "recordings/run1") as env:
+            observation, info = env.reset(seed=0)
+
+    Args:
+        env: a Gymnasium environment, made with `render_mode="rgb_array"` (or
+            `"rgb_array_list"`, `"ansi"`), or a dm_env environment such as
+            `dm_control.suite.load(...)`.
+        directory: where the recordings go. It is made where it is missing.
+        video_callable: which episodes get a video: a function from the episode's
+            number, from 0, to a bool; None for `capped_cubic_video_schedule`; False
+            for none.
+        force: delete the monitor files that are in the directory. It wins over
+            `resume`.
+        resume: add to the recordings that are there; episodes are numbered on from
+            the highest number of the monitors that closed or died (with `uid`: of
+            those with this `uid`). Monitors that share a directory at the same time
+            each need it; they number independently.
+        write_upon_reset: write statistics and manifest at every reset, not only at
+            the end. The journal, with a line for each completed episode, is written
+            as the episodes end in any case.
+        uid: stands in the file names instead of the process id.
+        mode: "training" or "evaluation": the type of the episodes.
+        fps: the rate written into the videos. None is real time: one frame for each
+            step, as long as the simulated time of the step.
+        camera: a name or number, or an `mujoco.MjvCamera`, of a MuJoCo environment;
+            None is what the environment itself shows.
+        width: of the videos, in pixels; None is the environment's own.
+        height: likewise.
+        allow_early_reset: whether a reset in mid-episode is allowed; the episode is
+            then no part of the statistics, and its video is marked incomplete. None
+            is what the framework has: no for Gymnasium, yes for dm_env.
+        env_id: the environment's name in the recordings. None is the name in its
+            spec; dm_env environments have none, so theirs is worth giving, as
+            `dm_control/<domain>-<task>`.
+
+    Returns:
+        A `GymnasiumMonitor` or a `DmEnvMonitor`.
+
+    Raises:
+        InvalidArgument: `env` is neither, or an argument cannot be.
+        NoPictures: videos were asked for of an environment that gives no pictures.
+        ExistingRecordings: the directory holds recordings, and neither `force` nor
+            `resume` was given.
+        DirectoryInUse: `force`, and another monitor is recording there.
+        DifferentEnvironment: `resume` over recordings of another environment.
+        DirectoryNotWritable: the directory cannot be made or written to.
+
+    When it raises, `env` is as it was, and no file is left.
+    """
+    monitor = _monitor_class(env)
+    defaults_to_early_reset = monitor.__name__ == "DmEnvMonitor"
+    return monitor(
+        env,
+        directory,
+        RecorderOptions(
+            video_callable=video_callable,
+            force=force,
+            resume=resume,
+            write_upon_reset=write_upon_reset,
+            uid=uid,
+            mode=mode,
+            fps=fps,
+            allow_early_reset=(
+                defaults_to_early_reset
+                if allow_early_reset is None
+                else allow_early_reset
+            ),
+        ),
+        camera=camera,
+        height=height,
+        width=width,
+        env_id=env_id,
+    )
+
+
+def _monitor_class(env: Any) -> Callable[..., GymnasiumMonitor | DmEnvMonitor]:
+    # An instance of a framework's class exists only where the framework is loaded.
+    gymnasium = sys.modules.get("gymnasium")
+    if gymnasium is not None and isinstance(env, gymnasium.vector.VectorEnv):
+        raise InvalidArgument(
+            f"{type(env).__name__} is a vector environment, and Monitor records one "
+            "environment: put Monitor around each of them, inside the functions that "
+            "make them, with resume=True for all."
+        )
+    if gymnasium is not None and isinstance(env, gymnasium.Env):
+        from .gymnasium_monitor import GymnasiumMonitor
+
+        return GymnasiumMonitor
+    dm_env = sys.modules.get("dm_env")
+    if dm_env is not None and isinstance(env, dm_env.Environment):
+        from .dm_env_monitor import DmEnvMonitor
+
+        return DmEnvMonitor
+    raise InvalidArgument(
+        "Monitor goes around a Gymnasium environment (gymnasium.Env) or a dm_env one "
+        f"(dm_env.Environment), got {type(env).__module__}.{type(env).__qualname__}."
+    )

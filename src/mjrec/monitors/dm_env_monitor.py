@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The monitor of dm_env environments."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+from typing import Any
+
+import dm_env
+
+from ..environments.no_pictures import NoPictureSource
+from ..errors import InvalidArgument
+from ..recorder.clock import simulation_time
+from ..recorder.exit_guard import ExitGuard
+from ..recorder.recorder import Recorder, RecorderOptions
+from .controls import MonitorControls
+
+__all__ = ["DmEnvMonitor"]
+
+logger = logging.getLogger(__name__)
+
+_NO_PHYSICS = (
+    "it has no physics that could be rendered, as dm_control's environments have. "
+    "Record a dm_control environment"
+)
+
+
+class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  # untyped
+    """Records a dm_env environment; `mjrec.Monitor` makes one and says how.
+
+    It keeps dm_env's contract: `reset` at any time; `step` before the first reset, or
+    after the last time step of an episode, ignores its action and begins an episode,
+    and is recorded as its reset. What else the environment has (`physics`, `task`,
+    `control_timestep` ...) is here too.
+
+    After `close` nothing is recorded: calls go straight to the environment, which is
+    closed.
+
+    Attributes:
+        seed: what the journal and the metadata say of the next episode's seed.
+            dm_env's `reset` takes none, so whoever seeds the environment says so here.
+    """
+
+    def __init__(
+        self,
+        env: dm_env.Environment,
+        directory: str | os.PathLike[str],
+        options: RecorderOptions,
+        *,
+        camera: Any = None,
+        height: int | None = None,
+        width: int | None = None,
+        env_id: str | None = None,
+    ) -> None:
+        self._env = env
+        self.seed: Any = None
+        pictures = _pictures(env, camera=camera, height=height, width=width)
+        self._recorder = Recorder(
+            directory,
+            env_id=env_id or _env_id(env),
+            pictures=pictures,
+            options=options,
+            clock=functools.partial(simulation_time, env),
+            facts=pictures.facts,
+        )
+        self._guard = ExitGuard(
+            self, functools.partial(_close, self._recorder, pictures, env)
+        )
+
+    def reset(self) -> dm_env.TimeStep:
+        """Reset the environment and begin an episode.
+
+        Raises:
+            ResetNotAllowed: in mid-episode, with `allow_early_reset=False`.
+        """
+        if self._recorder.closed:
+            return self._env.reset()
+        self._recorder.before_reset()
+        timestep = self._env.reset()
+        self._begin()
+        return timestep
+
+    def step(self, action: Any) -> dm_env.TimeStep:
+        """Step the environment and record what happened."""
+        if self._recorder.closed:
+            return self._env.step(action)
+        if self._recorder.done is not False:
+            return self.reset()
+        timestep = self._env.step(action)
+        if timestep.first():
+            # The environment was reset behind the monitor's back.
+            self._recorder.before_reset()
+            self._begin()
+        else:
+            self._record(timestep)
+        return timestep
+
+    def observation_spec(self) -> Any:
+        """Return the environment's."""
+        return self._env.observation_spec()
+
+    def action_spec(self) -> Any:
+        """Return the environment's."""
+        return self._env.action_spec()
+
+    def reward_spec(self) -> Any:
+        """Return the environment's."""
+        return self._env.reward_spec()
+
+    def discount_spec(self) -> Any:
+        """Return the environment's."""
+        return self._env.discount_spec()
+
+    def close(self) -> None:
+        """Finish the recordings, then close the environment. Idempotent."""
+        self._guard.close()
+
+    def __getattr__(self, name: str) -> Any:
+        # Called only for what is not found here. `_env` itself is missing where the
+        # constructor failed, or while an object is copied.
+        if name.startswith("_"):
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self._env, name)
+
+    def _record(self, timestep: dm_env.TimeStep) -> None:
+        last = timestep.last()
+        # dm_env's own convention: a discount of 0 is the end of the task; another one
+        # is a limit from outside.
+        terminated = last and not timestep.discount
+        self._recorder.step(
+            0.0 if timestep.reward is None else timestep.reward,
+            terminated=terminated,
+            truncated=last and not terminated,
+        )
+
+    def _begin(self) -> None:
+        self._recorder.reset(seed=self.seed)
+        # Drawing has loaded OpenGL by now, which tears itself down at exit.
+        self._guard.run_first_at_exit()
+
+
+def _pictures(
+    env: dm_env.Environment, *, camera: Any, height: int | None, width: int | None
+) -> Any:
+    if getattr(env, "physics", None) is not None:
+        from ..environments.dm_control_pictures import dm_control_pictures
+
+        return dm_control_pictures(env, camera=camera, height=height, width=width)
+    if (camera, height, width) != (None, None, None):
+        raise InvalidArgument(
+            "camera, height and width choose among the pictures of a dm_control "
+            f"environment, and {type(env).__name__} has no physics."
+        )
+    return NoPictureSource(_NO_PHYSICS)
+
+
+def _env_id(env: dm_env.Environment) -> str:
+    unknown = f"(unknown:{type(getattr(env, 'task', env)).__name__})"
+    logger.warning(
+        "dm_env environments do not know their names, so the recordings say %s. Give "
+        'Monitor(..., env_id="dm_control/cheetah-run") to name it.',
+        unknown,
+    )
+    return unknown
+
+
+def _close(recorder: Recorder, pictures: Any, env: dm_env.Environment) -> None:
+    try:
+        recorder.close()
+    finally:
+        pictures.close()
+        env.close()

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The monitor of Gymnasium environments."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+from collections.abc import Iterator
+from typing import Any, SupportsFloat
+
+import gymnasium
+
+from ..environments.gymnasium_pictures import gymnasium_pictures
+from ..recorder.clock import simulation_time
+from ..recorder.exit_guard import ExitGuard
+from ..recorder.recorder import Recorder, RecorderOptions
+from .controls import MonitorControls
+
+__all__ = ["GymnasiumMonitor"]
+
+logger = logging.getLogger(__name__)
+
+
+class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
+    """Records a Gymnasium environment; `mjrec.Monitor` makes one and says how.
+
+    An episode is over when it is terminated or truncated. A reset in mid-episode is
+    an error, unless early resets are allowed; a step before the first reset or after
+    the end of an episode is one too. A reset before any step keeps the episode's
+    number and replaces its picture. Below Gymnasium's `Autoreset` wrapper's step after
+    the end, which is a reset, begins the next episode.
+
+    After `close` nothing is recorded: calls go straight to the environment, which is
+    closed.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        directory: str | os.PathLike[str],
+        options: RecorderOptions,
+        *,
+        camera: Any = None,
+        height: int | None = None,
+        width: int | None = None,
+        env_id: str | None = None,
+    ) -> None:
+        super().__init__(env)
+        # gym's own convention: the step that ends an episode begins the next.
+        self._same_step_autoreset = bool(env.metadata.get("semantics.autoreset"))
+        self._next_step_autoreset = any(
+            isinstance(wrapper, gymnasium.wrappers.Autoreset) for wrapper in _chain(env)
+        )
+        pictures = gymnasium_pictures(env, camera=camera, height=height, width=width)
+        self._recorder = Recorder(
+            directory,
+            env_id=env_id or _env_id(env),
+            pictures=pictures,
+            options=options,
+            clock=functools.partial(simulation_time, env),
+            facts=pictures.facts,
+        )
+        self._guard = ExitGuard(
+            self, functools.partial(_close, self._recorder, pictures, env)
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment and begin an episode.
+
+        Raises:
+            ResetNotAllowed: in mid-episode, unless early resets are allowed.
+        """
+        if self._recorder.closed:
+            return self.env.reset(seed=seed, options=options)
+        self._recorder.before_reset()
+        result = self.env.reset(seed=seed, options=options)
+        self._begin(seed=seed, options=options)
+        return result
+
+    def step(
+        self, action: Any
+    ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Step the environment and record what happened.
+
+        Raises:
+            ResetNeeded: before the first reset, or after the end of an episode.
+        """
+        if self._recorder.closed:
+            return self.env.step(action)
+        if self._recorder.done and self._next_step_autoreset:
+            return self._reset_by_step(action)
+        self._recorder.before_step()
+        result = self.env.step(action)
+        _, reward, terminated, truncated, _ = result
+        resets_itself = self._same_step_autoreset and bool(terminated or truncated)
+        self._recorder.step(
+            reward,
+            terminated=terminated,
+            truncated=truncated,
+            picture=not resets_itself,
+        )
+        if resets_itself:
+            self._recorder.before_reset()
+            self._begin()
+        return result
+
+    def close(self) -> None:
+        """Finish the recordings, then close the environment. Idempotent."""
+        self._guard.close()
+
+    def _reset_by_step(
+        self, action: Any
+    ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        self._recorder.before_reset()
+        result = self.env.step(action)
+        self._begin()
+        return result
+
+    def _begin(self, *, seed: int | None = None, options: Any = None) -> None:
+        self._recorder.reset(seed=seed, options=options)
+        # Drawing has loaded OpenGL by now, which tears itself down at exit.
+        self._guard.run_first_at_exit()
+
+
+def _env_id(env: gymnasium.Env[Any, Any]) -> str:
+    if env.spec is not None:
+        return env.spec.id
+    unknown = f"(unknown:{type(env.unwrapped).__name__})"
+    logger.warning(
+        "The environment has no spec, so the recordings cannot name it; they say %s. "
+        "An environment made with gymnasium.make has one.",
+        unknown,
+    )
+    return unknown
+
+
+def _chain(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
+    """Yield `env` and the environments inside it, from the outside in."""
+    yield env
+    while isinstance(env, gymnasium.Wrapper):
+        env = env.env
+        yield env
+
+
+def _close(recorder: Recorder, pictures: Any, env: gymnasium.Env[Any, Any]) -> None:
+    try:
+        recorder.close()
+    finally:
+        pictures.close()
+        env.close()

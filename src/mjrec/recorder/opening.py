@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Opening a monitor directory: new, resumed, or emptied by force.
+
+Opening claims an infix, which stands for one monitor from then on: a lock file made
+with `O_EXCL` and held with `flock` while the monitor is open. A lock that is there
+but not held is a dead monitor's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from .. import json_text
+from ..errors import (
+    DifferentEnvironment,
+    DirectoryNotWritable,
+    ExistingRecordings,
+    UnreadableFile,
+)
+from ..formats.journal import read_journal
+from ..formats.locks import Lock, is_locked
+from ..formats.manifest import read_manifest
+from ..formats.monitor_directory import (
+    Infix,
+    check_uid,
+    episode_of,
+    infix_of,
+    is_manifest,
+    iter_monitor_files,
+    journal_name,
+    lock_name,
+    manifest_name,
+)
+from ..formats.stats_file import read_stats_file
+from ..results import clear_monitor_files
+
+__all__ = ["OpenDirectory", "open_directory"]
+
+
+class _MonitorIds:
+    """Counts the monitors of this process; no number is given twice."""
+
+    def __init__(self) -> None:
+        self._next = itertools.count()
+        self._guard = threading.Lock()
+
+    def take(self) -> int:
+        with self._guard:
+            return next(self._next)
+
+
+_monitor_ids = _MonitorIds()
+
+
+@dataclass(frozen=True)
+class OpenDirectory:
+    """A monitor directory with a claim in it.
+
+    Attributes:
+        path: the directory, absolute.
+        infix: what the claim is for.
+        first_episode_id: the number of the next episode.
+        lock: held until the monitor closes.
+    """
+
+    path: Path
+    infix: Infix
+    first_episode_id: int
+    lock: Lock
+
+
+def open_directory(
+    directory: str | os.PathLike[str],
+    *,
+    force: bool,
+    resume: bool,
+    uid: str | None,
+    env_info: Mapping[str, str],
+) -> OpenDirectory:
+    """Claim a place in `directory`, which is made where it is missing.
+
+    Args:
+        directory: where to record.
+        force: delete the monitor files that are there; wins over `resume`.
+        resume: add to the recordings that are there. Episodes are numbered on from
+            the highest number of the monitors with this `uid` that closed or died
+            (without `uid`: of all of them); monitors that are still open do not count.
+        uid: stands in the file names instead of the process id.
+        env_info: `env_id` of the environment, among others.
+
+    Raises:
+        ExistingRecordings: there are recordings, and neither `force` nor `resume`.
+        DirectoryInUse: `force`, and another monitor is recording there.
+        DifferentEnvironment: `resume` over recordings of another environment.
+        DirectoryNotWritable: it cannot be made or written to.
+        InvalidArgument: `uid` makes no file name.
+    """
+    wanted_uid = None if uid is None else check_uid(uid)
+    # Absolute, so that a later chdir does not scatter the files.
+    path = Path(directory).absolute()
+    with _made(path):
+        _check_existing(path, force=force, resume=resume, env_id=env_info["env_id"])
+        first = 0 if force else _next_episode_id(path, uid=wanted_uid)
+        infix, lock = _claim(path, uid=wanted_uid, env_info=env_info)
+    return OpenDirectory(path, infix, first, lock)
+
+
+@contextlib.contextmanager
+def _made(path: Path) -> Iterator[None]:
+    """Make `path` and its parents; remove those made if the block raises."""
+    missing = [p for p in (path, *path.parents) if not p.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DirectoryNotWritable(path, error.strerror) from error
+    try:
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise DirectoryNotWritable(path, "permission denied")
+        yield
+    except BaseException:
+        for made in missing:
+            # Somebody else's files may have come into it meanwhile.
+            with contextlib.suppress(OSError):
+                made.rmdir()
+        raise
+
+
+def _check_existing(path: Path, *, force: bool, resume: bool, env_id: str) -> None:
+    if force:
+        clear_monitor_files(path)
+        return
+    existing = list(iter_monitor_files(path, hidden=True))
+    if existing and not resume:
+        raise ExistingRecordings(path, [file.name for file in existing])
+    for recorded in _recorded_env_ids(existing):
+        if recorded != env_id:
+            raise DifferentEnvironment(path, recorded, env_id)
+
+
+def _recorded_env_ids(files: Iterable[Path]) -> Iterator[str]:
+    for file in files:
+        env_info: object = None
+        if is_manifest(file.name):
+            env_info = read_manifest(file).env_info
+        elif file.suffix == ".lock":
+            env_info = _lock_content(file).get("env_info")
+        if isinstance(env_info, Mapping) and isinstance(env_info.get("env_id"), str):
+            yield env_info["env_id"]
+
+
+def _lock_content(path: Path) -> Mapping[str, object]:
+    # A lock vanishes when its monitor closes, and is empty for a moment after it was
+    # made: neither says anything.
+    try:
+        content = json_text.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, Mapping) else {}
+
+
+def _next_episode_id(path: Path, *, uid: str | None) -> int:
+    """Return the number after the highest of the monitors that are not open."""
+    highest = -1
+    open_monitors: dict[str, bool] = {}
+    for file in iter_monitor_files(path):
+        text = infix_of(file.name)
+        infix = Infix.parse(text) if text else None
+        if infix is None or (uid is not None and infix.uid != uid):
+            continue
+        if str(infix) not in open_monitors:
+            open_monitors[str(infix)] = is_locked(path / lock_name(infix))
+        if not open_monitors[str(infix)]:
+            highest = max(highest, _highest_episode_id(file))
+    return highest + 1
+
+
+def _highest_episode_id(file: Path) -> int:
+    """Return the highest episode number that one monitor file speaks of; -1 if none."""
+    in_name = episode_of(file.name)
+    if in_name is not None:
+        return in_name
+    if file.name.endswith(".jsonl"):
+        return max((entry.episode_id for entry in read_journal(file)), default=-1)
+    if not is_manifest(file.name):
+        return -1
+    manifest = read_manifest(file)
+    if manifest.mjrec is not None:
+        next_id = manifest.mjrec.get("next_episode_id")
+        if not isinstance(next_id, int):
+            raise UnreadableFile(file, "its mjrec.next_episode_id is no whole number")
+        return next_id - 1
+    # Gym's own: its numbers count the resets and begin at 0.
+    return len(read_stats_file(file.with_name(manifest.stats)).timestamps) - 1
+
+
+def _claim(
+    path: Path, *, uid: str | None, env_info: Mapping[str, str]
+) -> tuple[Infix, Lock]:
+    content = json_text.dumps(
+        {"pid": os.getpid(), "since": time.time(), "env_info": dict(env_info)}
+    )
+    while True:
+        infix = Infix(_monitor_ids.take(), uid or str(os.getpid()))
+        if _is_taken(path, infix):
+            continue
+        try:
+            lock = Lock(path / lock_name(infix), content)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise DirectoryNotWritable(path, error.strerror) from error
+        # The monitor that had it may have closed, and so unlocked, between the look
+        # at the files and the lock.
+        if not _is_taken(path, infix, besides=lock_name(infix)):
+            return infix, lock
+        lock.release()
+
+
+def _is_taken(path: Path, infix: Infix, *, besides: str | None = None) -> bool:
+    # The rare case is a pid or uid that was here before; the manifest, there after
+    # every close, answers most of them without a look at the whole directory.
+    if (path / manifest_name(infix)).exists() or (path / journal_name(infix)).exists():
+        return True
+    return any(
+        file.name != besides and infix_of(file.name) == str(infix)
+        for file in iter_monitor_files(path, hidden=True)
+    )

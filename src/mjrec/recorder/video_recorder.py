@@ -1,0 +1,373 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One video of one environment, picture by picture, with its metadata."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Protocol
+
+from .. import json_text
+from ..atomic_files import write_text
+from ..errors import Error, InvalidArgument, InvalidFrame
+from ..formats.asciicast import AsciicastWriter, text_of_frame
+from ..formats.video_writer import VideoFile, VideoWriter
+from ..frames import Frame, check_frame
+from ..rates import rate_from_timestep, to_rate
+from .clock import declared_rate, simulation_time
+
+__all__ = ["PictureSource", "VideoRecorder", "can_give_pictures"]
+
+logger = logging.getLogger(__name__)
+
+_IMAGE_MODES = ("rgb_array", "rgb_array_list")
+_TEXT_MODES = ("ansi", "ansi_list")
+
+
+class PictureSource(Protocol):
+    """What a video is taken from: an environment, or what stands for one."""
+
+    @property
+    def render_mode(self) -> str | None:
+        """What `render` gives: `rgb_array`, `rgb_array_list`, `ansi` or `ansi_list`.
+
+        With any other there are no pictures.
+        """
+
+    def render(self) -> Any:
+        """Return the picture of this moment, or the list of those since the last."""
+
+
+def can_give_pictures(source: object) -> bool:
+    """Tell whether `source` has a render mode that a video can be made of."""
+    return getattr(source, "render_mode", None) in (*_IMAGE_MODES, *_TEXT_MODES)
+
+
+class VideoRecorder:
+    """Records what `env.render()` gives, one frame for each `capture_frame`.
+
+    Images become an mp4 (`VideoWriter` says which), text becomes an asciicast of
+    version 1 (`.json`). The rate is real time: the simulated time between the first
+    two captures where `env` is a MuJoCo environment, else what `env` declares. `close`
+    finishes the file and writes `<path without extension>.meta.json`.
+
+    A frame that is none (None, or another size or type than the first) stops the
+    video: what came before it stays as a playable file, `broken` is set, and one
+    warning and the metadata say so.
+
+    Args:
+        env: has `render_mode` and `render()`. With a render mode that gives no
+            pictures the recorder is not enabled and does nothing.
+        path: the video, ending in `.mp4`, or `.json` for text. A file in a new
+            temporary directory without `path` and `base_path`.
+        metadata: goes first into the metadata file. It is copied.
+        enabled: False makes a recorder that does nothing.
+        base_path: the path without extension, instead of `path`.
+        fps: frames per second of the file, instead of real time.
+        frame_hashes: also write the `.framehash` of an image video.
+        clock: returns the simulated time in seconds, or None where there is none.
+        facts: returns more for the metadata, asked for once, after the last frame.
+
+    Raises:
+        InvalidArgument: both `path` and `base_path` are given, or the extension is
+            another.
+
+    Attributes:
+        path: the video; None when not enabled.
+        metadata_path: the metadata file; None when not enabled.
+        metadata: what the metadata file will hold, as far as it is known.
+        enabled: whether it records.
+        broken: a bad frame, or an encoder that failed, ended the video early.
+    """
+
+    def __init__(
+        self,
+        env: PictureSource,
+        path: str | os.PathLike[str] | None = None,
+        metadata: Mapping[str, Any] | None = None,
+        enabled: bool = True,
+        base_path: str | os.PathLike[str] | None = None,
+        *,
+        fps: float | Fraction | None = None,
+        frame_hashes: bool = False,
+        clock: Callable[[], float | None] | None = None,
+        facts: Callable[[], Mapping[str, Any]] | None = None,
+    ) -> None:
+        self.env = env
+        self.enabled = bool(enabled) and can_give_pictures(env)
+        self.broken = False
+        self.path: str | None = None
+        self.metadata_path: str | None = None
+        self.metadata = dict(metadata or {})
+        self.ansi_mode = getattr(env, "render_mode", None) in _TEXT_MODES
+        self._clock = clock or (lambda: simulation_time(env))
+        self._facts = facts
+        self._fps = None if fps is None else to_rate(fps)
+        self._frame_hashes = frame_hashes
+        self._take = text_of_frame if self.ansi_mode else self._checked_frame
+        self._size: tuple[int, int] | None = None
+        self._writer: VideoWriter | AsciicastWriter | None = None
+        # Frames wait here until the second capture tells the rate.
+        self._waiting: list[Any] = []
+        self._captures = 0
+        self._first_time: float | None = None
+        self._timestep: Fraction | None = None
+        self._rate: Fraction | None = None
+        self._steps = _Runs()
+        self._closed = False
+        if not self.enabled:
+            if enabled:
+                logger.info(
+                    "No video of %s: its render mode is %r.",
+                    type(env).__name__,
+                    getattr(env, "render_mode", None),
+                )
+            return
+        self.path = self._path_of(path, base_path)
+        self.metadata_path = str(Path(self.path).with_suffix(".meta.json"))
+        self.metadata["content_type"] = (
+            "video/vnd.openai.ansivid" if self.ansi_mode else "video/mp4"
+        )
+
+    @property
+    def functional(self) -> bool:
+        """Whether frames are (or were) recorded: enabled and not broken."""
+        return self.enabled and not self.broken
+
+    @property
+    def empty(self) -> bool:
+        """Whether no frame was recorded."""
+        return self._steps.total == 0
+
+    @property
+    def frame_count(self) -> int:
+        """The number of frames recorded so far."""
+        return self._steps.total
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` or `discard` was called."""
+        return self._closed
+
+    def capture_frame(self) -> None:
+        """Record what `env.render()` gives now.
+
+        Nothing happens when the recorder is not functional or is closed. What
+        `env.render()` raises is raised.
+
+        Raises:
+            EncoderError: ffmpeg failed; the recorder is broken from then on.
+        """
+        if not self.functional or self._closed:
+            return
+        rendered = self.env.render()
+        frames = rendered if isinstance(rendered, list) else [rendered]
+        time = self._clock()
+        step, self._captures = self._captures, self._captures + 1
+        try:
+            for frame in frames:
+                self._add(self._take(frame))
+                self._steps.add(step)
+            self._settle_rate(time, len(frames))
+        except InvalidFrame as error:
+            self._break(str(error))
+        except Error:
+            self._abandon()
+            raise
+
+    def close(self) -> None:
+        """Finish the video and write its metadata. A second call does nothing.
+
+        Without a frame there is no video, and the metadata says `empty`.
+
+        Raises:
+            EncoderError: ffmpeg failed; the metadata is written all the same.
+        """
+        if self._closed or not self.enabled:
+            self._closed = True
+            return
+        self._closed = True
+        try:
+            self._finish_writer()
+        except Error:
+            self._abandon()
+            raise
+        finally:
+            self._write_metadata()
+
+    def discard(self) -> None:
+        """End without a video and without metadata."""
+        self._closed = True
+        self._waiting.clear()
+        if self._writer is not None:
+            self._writer.abort()
+
+    def _path_of(
+        self,
+        path: str | os.PathLike[str] | None,
+        base_path: str | os.PathLike[str] | None,
+    ) -> str:
+        extension = ".json" if self.ansi_mode else ".mp4"
+        if path is not None and base_path is not None:
+            raise InvalidArgument(
+                f"Give either path ({path}) or base_path ({base_path}), not both."
+            )
+        if base_path is not None:
+            return os.fspath(base_path) + extension
+        if path is None:
+            return str(Path(tempfile.mkdtemp(prefix="mjrec-")) / f"video{extension}")
+        if Path(path).suffix != extension:
+            kind = "text, an asciicast" if self.ansi_mode else "images, an mp4"
+            raise InvalidArgument(
+                f"With render_mode={self.env.render_mode!r} the recording is {kind}: "
+                f"its path must end in {extension}, got {os.fspath(path)!r}."
+            )
+        return os.fspath(path)
+
+    def _checked_frame(self, frame: object) -> Frame:
+        checked = check_frame(frame, size=self._size)
+        self._size = (checked.shape[0], checked.shape[1])
+        return checked
+
+    def _add(self, frame: Any) -> None:
+        if self._writer is not None:
+            self._writer.write(frame)
+        elif self.ansi_mode:
+            self._waiting.append(frame)
+        else:
+            # The environment may draw the next picture into the same array.
+            self._waiting.append(frame.copy())
+
+    def _settle_rate(self, time: float | None, frames: int) -> None:
+        if self._captures == 1:
+            self._first_time = time
+            if self._fps is not None:
+                self._open_writer(self._fps)
+        elif self._captures == 2:
+            if time is not None and self._first_time is not None:
+                self._timestep = _step_between(self._first_time, time)
+            if self._writer is None:
+                self._open_writer(self._real_time(frames))
+
+    def _real_time(self, frames: int) -> Fraction:
+        if self._timestep is not None and frames:
+            return rate_from_timestep(float(self._timestep)) * frames
+        return declared_rate(self.env)
+
+    def _open_writer(self, rate: Fraction) -> None:
+        assert self.path is not None
+        self._rate = rate
+        if self.ansi_mode:
+            self._writer = AsciicastWriter(Path(self.path), rate=rate)
+        else:
+            self._writer = VideoWriter(
+                self.path, fps=rate, frame_hashes=self._frame_hashes
+            )
+        for frame in self._waiting:
+            self._writer.write(frame)
+        self._waiting.clear()
+
+    def _break(self, reason: str) -> None:
+        self.broken = True
+        self.metadata["broken_reason"] = reason
+        logger.warning(
+            "The video %s ends after %d frames, because the next one was bad: %s",
+            self.path,
+            self.frame_count,
+            reason,
+        )
+
+    def _abandon(self) -> None:
+        """Give the video up: its encoder failed, and no part of it is to be trusted."""
+        self.broken = True
+        self._waiting.clear()
+        if self._writer is not None:
+            self._writer.abort()
+
+    def _finish_writer(self) -> None:
+        if self._waiting:
+            self._open_writer(self._fps or declared_rate(self.env))
+        if self._writer is not None:
+            self._writer.close()
+
+    def _write_metadata(self) -> None:
+        if self._steps.total:
+            self.metadata.update(self._description())
+            self.metadata.update(self._facts() if self._facts else {})
+        else:
+            self.metadata["empty"] = True
+        if self.broken:
+            self.metadata["broken"] = True
+        assert self.metadata_path is not None
+        write_text(Path(self.metadata_path), json_text.dumps(self.metadata))
+
+    def _description(self) -> dict[str, Any]:
+        description: dict[str, Any] = {
+            "fps": str(self._rate),
+            "timestep": None if self._timestep is None else str(self._timestep),
+            "playback_speed": self._playback_speed(),
+            "stride": 1,
+            "frame_count": self.frame_count,
+            "frame_steps": self._steps.ranges,
+        }
+        if isinstance(self._writer, AsciicastWriter):
+            encoder = {"backend": "TextEncoder", "version": 1}
+            return {"encoder_version": encoder, **description}
+        if isinstance(self._writer, VideoWriter) and self._writer.result is not None:
+            return {**description, **_file_facts(self._writer.result)}
+        return description
+
+    def _playback_speed(self) -> float | None:
+        """Simulated seconds that pass in a second of the video."""
+        if self._timestep is None or self._rate is None:
+            return None
+        frames_per_capture = Fraction(self._steps.total, max(self._captures, 1))
+        # The exact figure for one frame a capture, the usual case.
+        return float(self._rate * self._timestep / round(frames_per_capture or 1))
+
+
+class _Runs:
+    """The step of every frame, as runs, so that memory does not grow with frames."""
+
+    def __init__(self) -> None:
+        self.ranges: list[list[int]] = []
+        self.total = 0
+
+    def add(self, step: int) -> None:
+        """Note a frame of `step`."""
+        self.total += 1
+        if self.ranges and self.ranges[-1][1] == step - 1:
+            self.ranges[-1][1] = step
+        else:
+            self.ranges.append([step, step])
+
+
+def _step_between(earlier: float, later: float) -> Fraction | None:
+    if later <= earlier:
+        return None
+    return 1 / rate_from_timestep(later - earlier)
+
+
+def _file_facts(file: VideoFile) -> dict[str, Any]:
+    return {
+        # gym's three keys; the command line names no directory, so that it stays true
+        # when the recordings are moved.
+        "encoder_version": {
+            "backend": "ffmpeg",
+            "version": file.encoder["version"],
+            "cmdline": [file.encoder["ffmpeg"], *file.encoder["arguments"]],
+        },
+        "ffmpeg_sha256": file.encoder["sha256"],
+        "height": file.height,
+        "width": file.width,
+        "padded_height": file.padded_height,
+        "padded_width": file.padded_width,
+        "codec": file.codec,
+        "pixel_format": file.pixel_format,
+        "file_sha256": file.file_sha256,
+        "decoded_sha256": file.decoded_sha256,
+    }
