@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ffmpeg: which one, and running it so that a failure is never missed.
+
+`imageio-ffmpeg` brings the binary (or finds one); driving it is done here. Every
+failure is one `EncoderError` with the command, the exit status and the end of what
+ffmpeg said.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import functools
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO
+
+from ..errors import EncoderError, MissingDependency
+from ..frames import Frame
+
+__all__ = [
+    "FfmpegProcess",
+    "ffmpeg_executable",
+    "ffmpeg_sha256",
+    "ffmpeg_version",
+    "run_ffmpeg",
+    "video_encoders",
+]
+
+_ENVIRONMENT_VARIABLE = "IMAGEIO_FFMPEG_EXE"
+_END_OF_STDERR = 2000
+_PIPE_SIZE = 1 << 20
+# An encoder that closed its input ends by itself; a wrapper script may not.
+_SECONDS_TO_DIE = 10.0
+
+
+def ffmpeg_executable() -> str:
+    """Return the path of ffmpeg.
+
+    It is the one that `IMAGEIO_FFMPEG_EXE` names, else the one that comes with
+    `imageio-ffmpeg`, else conda's or the system's.
+
+    Raises:
+        MissingDependency: there is none.
+        EncoderError: `IMAGEIO_FFMPEG_EXE` names none.
+    """
+    # Not at the top: importing mjrec imports no ffmpeg.
+    import imageio_ffmpeg
+
+    try:
+        name = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise MissingDependency(
+            "ffmpeg",
+            purpose="Writing a video",
+            install=f"pip install imageio-ffmpeg, or set {_ENVIRONMENT_VARIABLE} to "
+            "the path of an ffmpeg",
+        ) from error
+    path = shutil.which(name)
+    if path is None:
+        raise EncoderError(
+            f"{_ENVIRONMENT_VARIABLE} is {name!r}, and no program can be started "
+            "under that name: unset it, or set it to the path of an ffmpeg.",
+            command=[name],
+            returncode=None,
+            stderr="",
+        )
+    return path
+
+
+def ffmpeg_version() -> str:
+    """Return the first line of `ffmpeg -version`."""
+    return _version(*_identity(ffmpeg_executable()))
+
+
+def ffmpeg_sha256() -> str:
+    """Return the sha256 of the ffmpeg binary, in hexadecimal; read once a process."""
+    return _sha256(*_identity(ffmpeg_executable()))
+
+
+def video_encoders() -> list[str]:
+    """Return the names of the video encoders that this ffmpeg has."""
+    return list(_video_encoders(*_identity(ffmpeg_executable())))
+
+
+def run_ffmpeg(
+    arguments: Sequence[str], *, standard_input: bytes = b""
+) -> subprocess.CompletedProcess[bytes]:
+    """Run ffmpeg to its end and return what it wrote.
+
+    Raises:
+        EncoderError: it could not be started or its exit status is not 0.
+    """
+    command = [ffmpeg_executable(), *arguments]
+    try:
+        done = subprocess.run(
+            command,
+            input=standard_input,
+            capture_output=True,
+            check=False,
+            start_new_session=True,
+        )
+    except OSError as error:
+        raise _not_started(command, error) from error
+    if done.returncode != 0:
+        raise EncoderError(
+            "ffmpeg failed.",
+            command=command,
+            returncode=done.returncode,
+            stderr=_text(done.stderr[-_END_OF_STDERR:]),
+        )
+    return done
+
+
+class FfmpegProcess:
+    """An ffmpeg that is fed through, or read from, a pipe.
+
+    It runs in a session of its own: Ctrl-C in the terminal reaches only the parent,
+    which decides. When the parent dies, ffmpeg sees the end of its input and finishes
+    its file by itself.
+
+    Args:
+        arguments: those after the program's name.
+        what: what fails when it fails: the first sentence of the error.
+        reads: whether it is fed through `write`.
+        writes: whether it is read through `read`.
+    """
+
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        *,
+        what: str,
+        reads: bool = False,
+        writes: bool = False,
+    ) -> None:
+        self._what = what
+        self._command = [ffmpeg_executable(), *arguments]
+        # A file, not a pipe: nobody has to empty it while the process runs.
+        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  see _release
+        try:
+            self._process = subprocess.Popen(
+                self._command,
+                stdin=subprocess.PIPE if reads else subprocess.DEVNULL,
+                stdout=subprocess.PIPE if writes else subprocess.DEVNULL,
+                stderr=self._stderr,
+                bufsize=0,
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._stderr.close()
+            raise _not_started(self._command, error) from error
+        for pipe in filter(None, (self._process.stdin, self._process.stdout)):
+            # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More is
+            # a favour that the kernel may refuse.
+            with contextlib.suppress(OSError):
+                fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
+        _running.add(self)
+
+    @property
+    def pid(self) -> int:
+        """The process's number."""
+        return self._process.pid
+
+    @property
+    def command(self) -> list[str]:
+        """The program and its arguments."""
+        return list(self._command)
+
+    def write(self, data: bytes | Frame) -> None:
+        """Feed `data`, waiting until the pipe has taken all of it.
+
+        Raises:
+            EncoderError: ffmpeg has ended.
+        """
+        pipe = self._process.stdin
+        assert pipe is not None
+        rest = memoryview(data).cast("B")
+        try:
+            # A raw pipe may take less than it was given.
+            while rest:
+                rest = rest[pipe.write(rest) :]
+        except (OSError, ValueError) as error:
+            # ValueError: the pipe was closed under us by `kill`.
+            raise self._died() from error
+
+    def read(self, size: int) -> bytes:
+        """Return at most `size` bytes of output; none at its end."""
+        pipe = self._process.stdout
+        assert pipe is not None
+        return pipe.read(size)
+
+    def end_input(self) -> None:
+        """Say that nothing follows."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+
+    def wait(self) -> None:
+        """Wait for the end. May be called again.
+
+        Raises:
+            EncoderError: the exit status is not 0.
+        """
+        self._process.wait()
+        if self._process.returncode != 0:
+            raise self.error(self._what)
+        self._release()
+
+    def kill(self) -> None:
+        """End the process at once, if it runs, and leave nothing of it."""
+        self._process.kill()
+        self._process.wait()
+        self._release()
+
+    def error(self, what: str) -> EncoderError:
+        """Return the error that says `what`, the exit status and ffmpeg's own words."""
+        return EncoderError(
+            what,
+            command=self._command,
+            returncode=self._process.returncode,
+            stderr=self._end_of_stderr(),
+        )
+
+    def close_inherited_pipes(self) -> None:
+        """Close a forked child's copies of the pipes.
+
+        While any process holds the writing end, ffmpeg does not see the end of its
+        input, and the parent's `wait` would last as long as the child lives.
+        """
+        for pipe in filter(None, (self._process.stdin, self._process.stdout)):
+            pipe.close()
+
+    def _died(self) -> EncoderError:
+        try:
+            self._process.wait(_SECONDS_TO_DIE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        return self.error(self._what)
+
+    def _end_of_stderr(self) -> str:
+        if self._stderr.closed:
+            return ""
+        size = self._stderr.seek(0, os.SEEK_END)
+        self._stderr.seek(max(0, size - _END_OF_STDERR))
+        return _text(self._stderr.read())
+
+    def _release(self) -> None:
+        self.close_inherited_pipes()
+        self._stderr.close()
+        _running.discard(self)
+
+
+_running: weakref.WeakSet[FfmpegProcess] = weakref.WeakSet()
+
+
+def _close_pipes_after_fork() -> None:
+    for process in list(_running):
+        process.close_inherited_pipes()
+
+
+os.register_at_fork(after_in_child=_close_pipes_after_fork)
+
+
+def _identity(executable: str) -> tuple[str, int, int]:
+    """Return what changes when the binary changes, as a key for the caches below."""
+    status = Path(executable).stat()
+    return executable, status.st_size, status.st_mtime_ns
+
+
+@functools.lru_cache
+def _version(executable: str, size: int, modified: int) -> str:
+    return _text(run_ffmpeg(["-version"]).stdout).partition("\n")[0].strip()
+
+
+@functools.lru_cache
+def _sha256(executable: str, size: int, modified: int) -> str:
+    with Path(executable).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@functools.lru_cache
+def _video_encoders(executable: str, size: int, modified: int) -> tuple[str, ...]:
+    listing = _text(run_ffmpeg(["-hide_banner", "-encoders"]).stdout)
+    _, _, table = listing.partition("------\n")
+    return tuple(re.findall(r"^ *V\S* +(\S+)", table, re.MULTILINE))
+
+
+def _not_started(command: Sequence[str], error: OSError) -> EncoderError:
+    return EncoderError(
+        f"ffmpeg could not be started: {error}.",
+        command=command,
+        returncode=None,
+        stderr="",
+    )
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", errors="replace")

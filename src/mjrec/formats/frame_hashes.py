@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The `.framehash` file: the sha256 of each frame as it was rendered.
+
+The text is what ffmpeg's `framehash` muxer writes, byte for byte, for the same frames
+as raw video (`-fflags +bitexact -f rawvideo -pix_fmt rgb24 ... -f framehash`), so that
+its users' tools read it::
+
+    #format: frame checksums
+    #version: 2
+    #hash: SHA256
+    #tb 0: 1/40
+    #media_type 0: video
+    #codec_id 0: rawvideo
+    #dimensions 0: 480x480
+    #sar 0: 0/1
+    #stream#, dts,        pts, duration,     size, hash
+    0,          0,          0,        1,   691200, 5b1f...
+
+The time base (`tb`) is the duration of a frame in seconds; dimensions are WIDTHxHEIGHT;
+`size` is in bytes. A frame's bytes are its rows from top to bottom, each pixel red,
+green, blue.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from fractions import Fraction
+
+import numpy as np
+
+from ..frames import Frame
+
+__all__ = ["frame_hash_header", "frame_hash_line"]
+
+
+def frame_hash_header(*, height: int, width: int, fps: Fraction) -> str:
+    """Return the lines before the first frame."""
+    return (
+        "#format: frame checksums\n"
+        "#version: 2\n"
+        "#hash: SHA256\n"
+        f"#tb 0: {fps.denominator}/{fps.numerator}\n"
+        "#media_type 0: video\n"
+        "#codec_id 0: rawvideo\n"
+        f"#dimensions 0: {width}x{height}\n"
+        "#sar 0: 0/1\n"
+        "#stream#, dts,        pts, duration,     size, hash\n"
+    )
+
+
+def frame_hash_line(number: int, frame: Frame) -> str:
+    """Return the line of the frame with this number, counted from 0."""
+    digest = hashlib.sha256(np.ascontiguousarray(frame)).hexdigest()
+    return f"0, {number:10d}, {number:10d}, {1:8d}, {frame.nbytes:8d}, {digest}\n"
