@@ -26,7 +26,7 @@ import mujoco
 
 from ..errors import ClosedError, Error, GLError
 
-__all__ = ["GLStrings", "GLThread", "gl_error"]
+__all__ = ["GLStrings", "GLThread", "gl_error", "opengl"]
 
 _logger = logging.getLogger(__name__)
 
@@ -101,12 +101,17 @@ class GLThread:
         )
         # Its own atexit hook may run after EGL was shut down, ours may not.
         self._release.atexit = False
-        self._answer(made)
+        self._strings: GLStrings = self._answer(made)
         # Hooks run in reverse order, and mujoco's, which shuts EGL down, was registered
         # when the first context was made.
         self._exit_hook = functools.partial(_close_at_exit, weakref.ref(self))
         atexit.register(self._exit_hook)
         weakref.finalize(self, atexit.unregister, self._exit_hook).atexit = False
+
+    @property
+    def strings(self) -> GLStrings:
+        """Who draws: OpenGL's vendor, renderer and version."""
+        return self._strings
 
     def call(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Return `function(*args, **kwargs)`, called on the thread.
@@ -191,14 +196,23 @@ class GLThread:
             ) from None
 
 
-def gl_error(what: str, reason: object) -> GLError:
-    """Return the error for something that OpenGL cannot do here."""
+def gl_error(what: str, reason: object, *, remedy: str = "") -> GLError:
+    """Return the error for something that OpenGL cannot do here.
+
+    Args:
+        what: what cannot be done.
+        reason: what mujoco or the driver said.
+        remedy: what to try before `mjrec doctor`.
+    """
     backend = os.environ.get("MUJOCO_GL")
     setting = "unset" if backend is None else repr(backend)
-    return GLError(
-        f"{what}, with MUJOCO_GL {setting}: {reason or 'no reason given'}. Run `mjrec "
-        "doctor` to see which backend renders here and what the others lack."
-    )
+    parts = [
+        f"{what}, with MUJOCO_GL {setting}: {str(reason).rstrip('. ')}.",
+        remedy,
+        "Run `mjrec doctor` to see which backend renders here and what the others "
+        "lack.",
+    ]
+    return GLError(" ".join(filter(None, parts)))
 
 
 def _serve(
@@ -208,10 +222,10 @@ def _serve(
 ) -> None:
     try:
         context = _make_context()
+        made.put(_Outcome(_read_strings()))
     except BaseException as error:
         made.put(_Outcome(error=error))
         return
-    made.put(_Outcome())
     while (request := requests.get()) is not None:
         _serve_one(request, context)
         # Nothing of the caller's is kept alive while waiting for the next request.
@@ -258,12 +272,33 @@ def _make_context() -> Any:
             context: Any = _owned(_context_class())(_WINDOW_SIDE, _WINDOW_SIDE)
             _has_made_context = True
         context.make_current()
+        works = bool(_read_strings().renderer)
     except Error:
         raise
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         raise gl_error("No OpenGL context can be made", reason) from error
+    if not works:
+        # GLFW without a display makes an object that does nothing.
+        raise gl_error("No OpenGL context can be made", "nothing draws into it")
     return context
+
+
+def _read_strings() -> GLStrings:
+    gl = opengl()
+    names = (gl.GL_VENDOR, gl.GL_RENDERER, gl.GL_VERSION)
+    return GLStrings(
+        *((gl.glGetString(name) or b"").decode(errors="replace") for name in names)
+    )
+
+
+def opengl() -> Any:
+    """Return PyOpenGL's functions, for use on a thread with a context."""
+    # It chooses its platform when it is imported, and mujoco sets which one when it
+    # imports its context class: not before there is a context.
+    from OpenGL import GL
+
+    return GL
 
 
 def _context_class() -> Any:

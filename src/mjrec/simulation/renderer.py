@@ -15,7 +15,7 @@ from ..errors import InvalidArgument
 from ..frames import Frame, check_size
 from .baked_fields import BakedFields
 from .cameras import FREE_CAMERA, Camera, raw_data, raw_model, resolve_camera
-from .gl_thread import GLStrings, GLThread, gl_error
+from .gl_thread import GLStrings, GLThread, gl_error, opengl
 
 __all__ = ["SceneRenderer"]
 
@@ -84,7 +84,6 @@ class SceneRenderer:
         try:
             self._baked = BakedFields.of(self._model)
             self._thread.call(self._canvas.prepare, self._model)
-            self._gl_strings = self._thread.call(_read_gl_strings)
         except BaseException:
             self._thread.close()
             raise
@@ -97,7 +96,7 @@ class SceneRenderer:
     @property
     def gl_strings(self) -> GLStrings:
         """Who draws: OpenGL's vendor, renderer and version."""
-        return self._gl_strings
+        return self._thread.strings
 
     def render(self, data: Any) -> Frame:
         """Return the picture of `data`, a new `(height, width, 3) uint8` array.
@@ -168,7 +167,7 @@ class SceneRenderer:
     def __repr__(self) -> str:
         return (
             f"SceneRenderer(height={self._height}, width={self._width}, "
-            f"camera={self._camera!r}, gl={self._gl_strings.renderer!r})"
+            f"camera={self._camera!r}, gl={self.gl_strings.renderer!r})"
         )
 
     def _update_scene(self, data: mujoco.MjData) -> None:
@@ -226,7 +225,7 @@ class _Canvas:
             )
         except mujoco.FatalError as error:
             what = f"A {rectangle.width}x{rectangle.height} picture cannot be drawn"
-            raise gl_error(what, error) from error
+            raise gl_error(what, error, remedy="Ask for a smaller one.") from error
         self._context = context
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), context)
 
@@ -301,26 +300,10 @@ def _with_buffer(model: mujoco.MjModel, height: int, width: int) -> mujoco.MjMod
 
 
 def _check_driver_can_draw(height: int, width: int) -> None:
-    gl = _opengl()
+    gl = opengl()
     limit = int(gl.glGetIntegerv(gl.GL_MAX_RENDERBUFFER_SIZE))
     if max(height, width) > limit:
         raise InvalidArgument(
             f"A picture of {width}x{height} pixels is larger than this OpenGL driver "
-            f"({_read_gl_strings().renderer}) can draw: {limit}x{limit}."
+            f"({gl.glGetString(gl.GL_RENDERER).decode()}) can draw: {limit}x{limit}."
         )
-
-
-def _read_gl_strings() -> GLStrings:
-    gl = _opengl()
-    names = (gl.GL_VENDOR, gl.GL_RENDERER, gl.GL_VERSION)
-    return GLStrings(
-        *((gl.glGetString(name) or b"").decode(errors="replace") for name in names)
-    )
-
-
-def _opengl() -> Any:
-    # PyOpenGL chooses its platform when it is imported, and mujoco sets which one when
-    # it makes its context class: not before there is a context.
-    from OpenGL import GL
-
-    return GL
