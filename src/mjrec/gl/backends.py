@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The OpenGL backends: their names, and the environment variables that choose one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+from ..errors import GLError, UnknownName
+
+__all__ = [
+    "BACKENDS",
+    "backend_in_environment",
+    "backend_name",
+    "environment_for",
+    "platforms_contradict",
+    "rendering_is_off",
+]
+
+# In the order in which they are tried: EGL needs no display and can use a GPU, OSMesa
+# needs no display, GLFW needs one.
+BACKENDS = ("egl", "osmesa", "glfw")
+
+_KIND = "OpenGL backend"
+_SYNONYMS = {"glx": "glfw"}
+# What mujoco understands besides names. "On" names no backend.
+_ON = frozenset({"", "enable", "enabled", "on", "true", "1"})
+_OFF = frozenset({"disable", "disabled", "off", "false", "0"})
+
+
+def backend_name(text: object) -> str:
+    """Return the backend that `text` names, as every program spells it.
+
+    Case and surrounding blanks do not count: mujoco takes `EGL`, Gymnasium and
+    dm_control do not.
+
+    Raises:
+        UnknownName: there is no such backend.
+    """
+    name = _normalised(text)
+    if name not in BACKENDS:
+        raise UnknownName(_KIND, text, BACKENDS)
+    return name
+
+
+def backend_in_environment(environ: Mapping[str, str] | None = None) -> str | None:
+    """Return the backend that `MUJOCO_GL` names; None where it names none.
+
+    Args:
+        environ: the environment variables; this process's, if None.
+
+    Raises:
+        UnknownName: it names one that does not exist.
+        GLError: it turns rendering off.
+    """
+    environ = os.environ if environ is None else environ
+    text = environ.get("MUJOCO_GL", "")
+    if rendering_is_off(environ):
+        raise GLError(
+            f"The environment variable MUJOCO_GL is {text!r}, which turns rendering "
+            f"off. Unset it, or set it to one of {', '.join(BACKENDS)}."
+        )
+    name = _normalised(text)
+    if name in _ON:
+        return None
+    if name not in BACKENDS:
+        raise UnknownName(
+            _KIND,
+            text,
+            BACKENDS,
+            hint="The environment variable MUJOCO_GL names it: set it to one of "
+            "these, or unset it and let mjrec try them.",
+        )
+    return name
+
+
+def rendering_is_off(environ: Mapping[str, str]) -> bool:
+    """Tell whether `MUJOCO_GL` turns rendering off."""
+    return _normalised(environ.get("MUJOCO_GL", "")) in _OFF
+
+
+def platforms_contradict(environ: Mapping[str, str], backend: str | None) -> bool:
+    """Tell whether `PYOPENGL_PLATFORM` keeps mujoco from using `backend`."""
+    platform = environ.get("PYOPENGL_PLATFORM", "").lower()
+    return backend in ("egl", "osmesa") and platform not in ("", backend)
+
+
+def environment_for(backend: str, environ: Mapping[str, str]) -> dict[str, str]:
+    """Return `environ` with the variables set, or left out, that mean `backend`."""
+    changed = {**environ, "MUJOCO_GL": backend}
+    if backend in ("egl", "osmesa"):
+        changed["PYOPENGL_PLATFORM"] = backend
+    elif changed.get("PYOPENGL_PLATFORM", "").lower() == "osmesa":
+        # GLFW's contexts are GLX's or EGL's, never OSMesa's.
+        del changed["PYOPENGL_PLATFORM"]
+    return changed
+
+
+def _normalised(text: object) -> str:
+    name = str(text).strip().lower()
+    return _SYNONYMS.get(name, name)

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trying a backend: in a child process, so that a crash or a hang is an answer too."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ..machine import gpu_device_files
+from .backends import backend_name, environment_for
+from .diagnosis import Diagnosis, diagnose
+
+__all__ = ["EglDevice", "Probe", "probe", "probe_environment"]
+
+# Drivers of machines with many GPUs take ten seconds and more to wake up.
+TIMEOUT = 60.0
+
+# How long after its own end of patience the child is killed.
+_GRACE = 5.0
+_END_OF_OUTPUT = 4000
+_SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|SwiftShader|software", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class EglDevice:
+    """One of EGL's devices.
+
+    Attributes:
+        index: its place in EGL's list, which is what `MUJOCO_EGL_DEVICE_ID` means to
+            mujoco 3 (and to mujoco 4 where no device has a CUDA number).
+        device_file: for example `/dev/dri/renderD128`; empty where EGL does not tell.
+        cuda_id: CUDA's number of the same device; None where it has none.
+        software: whether it is the CPU.
+        in_use: whether the probe drew on it.
+    """
+
+    index: int
+    device_file: str
+    cuda_id: int | None
+    software: bool
+    in_use: bool
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What came of trying a backend.
+
+    Attributes:
+        backend: its name.
+        renders: whether a picture of several colours came out as it should.
+        gl_renderer: what draws, in OpenGL's words; empty where unknown.
+        gl_vendor: whose it is.
+        gl_version: OpenGL's version, with the driver's.
+        frames_per_second: 480x480 pictures of a small scene with MuJoCo's default
+            quality, read back; None where it was not measured.
+        devices: EGL's devices, where it tells.
+        cause: why it does not render.
+        fix: what to do about it; empty where that is not known.
+        output: the end of what the child process said, if it does not render.
+    """
+
+    backend: str
+    renders: bool
+    gl_renderer: str = ""
+    gl_vendor: str = ""
+    gl_version: str = ""
+    frames_per_second: float | None = None
+    devices: tuple[EglDevice, ...] = ()
+    cause: str = ""
+    fix: str = ""
+    output: str = ""
+
+    @property
+    def software(self) -> bool:
+        """Whether the CPU draws."""
+        return self.renders and bool(
+            self.backend == "osmesa" or _SOFTWARE.search(self.gl_renderer)
+        )
+
+    def warning(self) -> str:
+        """Return what is odd about a backend that renders; mostly nothing."""
+        files = gpu_device_files() if self.software else []
+        if not files:
+            return ""
+        what = self.gl_renderer or self.backend
+        if self.backend == "osmesa":
+            advice = "OSMesa always does; EGL can use the GPU."
+        else:
+            advice = (
+                "The GPU's EGL driver is missing: in a container, start it with "
+                "NVIDIA_DRIVER_CAPABILITIES=all (NVIDIA) or --device /dev/dri."
+            )
+        return (
+            f"{self.backend} draws on the CPU ({what}) though there is a GPU "
+            f"({', '.join(files)}). {advice}"
+        )
+
+
+def probe(backend: str, *, measure: bool = False, timeout: float = TIMEOUT) -> Probe:
+    """Try `backend` as `use_gl` would set it; the answer is kept for this process.
+
+    Another environment is another question: the answer is not used again after an
+    environment variable has changed.
+
+    Args:
+        backend: its name.
+        measure: measure its speed too.
+        timeout: how many seconds to wait for the picture.
+
+    Raises:
+        UnknownName: there is no such backend.
+    """
+    environ = environment_for(backend_name(backend), os.environ)
+    key = (environ["MUJOCO_GL"], frozenset(environ.items()))
+    known = _answers.get(key)
+    if known and not (measure and known.renders and known.frames_per_second is None):
+        return known
+    _answers[key] = probe_environment(environ, measure=measure, timeout=timeout)
+    return _answers[key]
+
+
+_answers: dict[tuple[str, frozenset[tuple[str, str]]], Probe] = {}
+
+
+def probe_environment(
+    environ: Mapping[str, str], *, measure: bool = False, timeout: float = TIMEOUT
+) -> Probe:
+    """Try the backend that `environ` names in `MUJOCO_GL`, with just these variables.
+
+    Args:
+        environ: the child's environment variables, none of which is put right.
+        measure: measure its speed too.
+        timeout: how many seconds to wait for the picture.
+    """
+    backend = environ["MUJOCO_GL"]
+    facts, output = _ask_child(environ, measure=measure, timeout=timeout)
+    if facts.get("renders"):
+        return Probe(
+            backend=backend,
+            renders=True,
+            gl_renderer=facts.get("gl_renderer", ""),
+            gl_vendor=facts.get("gl_vendor", ""),
+            gl_version=facts.get("gl_version", ""),
+            frames_per_second=facts.get("frames_per_second"),
+            devices=tuple(EglDevice(**device) for device in facts.get("devices", ())),
+        )
+    found = diagnose(output, backend=backend, environ=environ) or _unknown(output)
+    return Probe(
+        backend,
+        False,
+        cause=found.cause,
+        fix=found.fix,
+        output=output[-_END_OF_OUTPUT:],
+    )
+
+
+def _unknown(output: str) -> Diagnosis:
+    """Keep the words of a failure that nobody has explained yet."""
+    words = [line for line in output.strip().splitlines() if line.strip()]
+    return Diagnosis("\n".join(words[-3:]) or "The child process said nothing.", "")
+
+
+def _ask_child(
+    environ: Mapping[str, str], *, measure: bool, timeout: float
+) -> tuple[dict[str, Any], str]:
+    """Return what the child reported, and in words all that points to a failure."""
+    command = [
+        sys.executable,
+        # The working directory may hold a file called `random.py`.
+        "-P",
+        "-m",
+        "mjrec.simulation.gl_probe",
+        f"--seconds={timeout}",
+        *(["--measure"] if measure else []),
+    ]
+    start = time.monotonic()
+    try:
+        child = subprocess.Popen(
+            command,
+            env=dict(environ),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            # Ctrl-C is the parent's to handle.
+            start_new_session=True,
+        )
+    except OSError as error:
+        return {}, f"{sys.executable} could not be started: {error}"
+    try:
+        answer, said = child.communicate(timeout=timeout + _GRACE)
+    except BaseException as error:
+        child.kill()
+        answer, said = child.communicate()
+        if not isinstance(error, subprocess.TimeoutExpired):
+            raise
+    facts = _merged(answer)
+    words = [said.decode(errors="replace").strip(), *facts.get("notes", [])]
+    if facts.get("error"):
+        words.append(facts["error"])
+    else:
+        words.append(_end_of(child.returncode, time.monotonic() - start, timeout))
+    return facts, "\n".join(filter(None, words))
+
+
+def _merged(answer: bytes) -> dict[str, Any]:
+    facts: dict[str, Any] = {}
+    for line in answer.splitlines():
+        # The last line is torn if the child died in it.
+        try:
+            facts |= json.loads(line)
+        except ValueError:
+            continue
+    return facts
+
+
+def _end_of(returncode: int, seconds: float, timeout: float) -> str:
+    if seconds >= timeout:
+        return f"no answer within {timeout:g} seconds"
+    if returncode < 0:
+        return f"The driver crashed ({signal.Signals(-returncode).name})."
+    return f"The child process ended with status {returncode}."

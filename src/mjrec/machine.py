@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What this machine lets this process use."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path, PurePosixPath
+
+__all__ = ["cgroup_cpu_quota", "gpu_device_files", "usable_cpus"]
+
+_CGROUPS = Path("/sys/fs/cgroup")
+_OWN_CGROUPS = Path("/proc/self/cgroup")
+
+
+def usable_cpus() -> int:
+    """Return how many CPUs this process can keep busy; at least 1.
+
+    It is the number that the process may run on (its affinity), or the quota of its
+    cgroup where that is less: a container that is given 2.5 CPUs of 64 has 2.
+    """
+    allowed = len(os.sched_getaffinity(0))
+    quota = cgroup_cpu_quota()
+    return allowed if quota is None else max(1, min(allowed, int(quota)))
+
+
+def cgroup_cpu_quota(
+    *, root: Path = _CGROUPS, own: Path = _OWN_CGROUPS
+) -> float | None:
+    """Return the CPUs that the cgroup grants, or None where nothing limits them.
+
+    A limit on any group above counts too; both versions of cgroups are read.
+
+    Args:
+        root: where the cgroup file systems are mounted.
+        own: the file that names the groups of this process.
+    """
+    quotas = []
+    for controllers, group in _own_groups(own):
+        if controllers == "":
+            quotas += [_quota_v2(root / part) for part in _upwards(group)]
+        elif "cpu" in controllers.split(","):
+            for mounted in (root / "cpu", root / controllers):
+                quotas += [_quota_v1(mounted / part) for part in _upwards(group)]
+    return min((quota for quota in quotas if quota is not None), default=None)
+
+
+def gpu_device_files(*, root: Path = Path("/dev")) -> list[str]:
+    """Return the device files of the GPUs that there are, sorted.
+
+    Args:
+        root: the directory of device files.
+    """
+    found = [*root.glob("nvidia[0-9]*"), *root.glob("dri/renderD*")]
+    return sorted(map(str, found))
+
+
+def _own_groups(own: Path) -> list[tuple[str, str]]:
+    """Return pairs of controllers ("" is version 2) and the group's path."""
+    try:
+        lines = own.read_text().splitlines()
+    except OSError:
+        return []
+    fields = (line.split(":", 2) for line in lines)
+    return [(field[1], field[2]) for field in fields if len(field) == 3]
+
+
+def _upwards(group: str) -> list[str]:
+    """Return the relative paths of a group and all those above it.
+
+    Inside a container the path may be the host's, of which nothing is mounted; the
+    last one, the root, then is the container's own group.
+    """
+    path = PurePosixPath(group.lstrip("/"))
+    return [str(part) for part in (path, *path.parents)]
+
+
+def _quota_v2(group: Path) -> float | None:
+    words = _words(group / "cpu.max")
+    if len(words) != 2 or words[0] == "max":
+        return None
+    return int(words[0]) / int(words[1])
+
+
+def _quota_v1(group: Path) -> float | None:
+    quota = _words(group / "cpu.cfs_quota_us")
+    period = _words(group / "cpu.cfs_period_us")
+    if not quota or not period or int(quota[0]) <= 0:
+        return None
+    return int(quota[0]) / int(period[0])
+
+
+def _words(path: Path) -> list[str]:
+    try:
+        return path.read_text().split()
+    except OSError:
+        return []
