@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands that a new user runs first, as far as no download is needed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+COMMANDS = ["scripts/setup", "scripts/demo", "scripts/test", ".ci/run"]
+
+# Stands before a function call: the real file, sourced as demo and test do.
+SOURCE = "set -euo pipefail; source scripts/setup; libraries=; "
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """What the commands read of the repository, at a place of its own."""
+    shutil.copytree(ROOT / "scripts", tmp_path / "scripts")
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    return tmp_path
+
+
+def bash(
+    checkout: Path, command: str, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("MJREC_")}
+    return subprocess.run(
+        ["bash", "-c", command],
+        cwd=checkout,
+        env={**kept, **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def make_environment(checkout: Path) -> None:
+    subprocess.run(
+        [sys.executable, "-m", "venv", "--without-pip", checkout / ".venv"], check=True
+    )
+
+
+def write_stamp(checkout: Path) -> None:
+    """Leave what a finished installation leaves."""
+    stamp = '"$(stamp_of "$venv" demo)"'
+    wrote = bash(checkout, SOURCE + f'describe_installation "$venv" -e . >{stamp}')
+    assert wrote.returncode == 0, wrote.stderr
+
+
+def is_installed(checkout: Path) -> bool:
+    answer = bash(checkout, SOURCE + 'is_installed "$venv" demo -e .')
+    assert answer.returncode in (0, 1), answer.stderr
+    return answer.returncode == 0
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_are_executable_and_parse(command: str) -> None:
+    """A clone can run them as they are."""
+    assert os.access(ROOT / command, os.X_OK)
+    subprocess.run(["bash", "-n", ROOT / command], check=True)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_installs_nothing(checkout: Path, command: str) -> None:
+    """Asking what a command does changes nothing."""
+    shutil.copytree(ROOT / ".ci", checkout / ".ci")
+    answer = bash(checkout, f"{command} --help")
+    assert answer.returncode == 0
+    assert answer.stdout.startswith("usage: scripts/")
+    assert not (checkout / ".venv").exists()
+
+
+def test_finished_installation_is_not_repeated(checkout: Path) -> None:
+    """The stamp of a finished installation is enough for the next start."""
+    make_environment(checkout)
+    assert not is_installed(checkout)
+    write_stamp(checkout)
+    assert is_installed(checkout)
+
+
+def test_changed_project_is_installed_again(checkout: Path) -> None:
+    """A new dependency in pyproject.toml reaches an environment that exists."""
+    make_environment(checkout)
+    write_stamp(checkout)
+    with (checkout / "pyproject.toml").open("a") as project:
+        project.write("\n# another\n")
+    assert not is_installed(checkout)
+
+
+def test_interrupted_installation_is_made_anew(checkout: Path) -> None:
+    """The mark of the unfinished outweighs a stamp."""
+    make_environment(checkout)
+    write_stamp(checkout)
+    (checkout / ".venv" / "mjrec-unfinished").touch()
+    assert not is_installed(checkout)
+    assert bash(checkout, SOURCE + 'must_be_made_anew "$venv"').returncode == 0
+
+
+def test_moved_checkout_is_made_anew(checkout: Path, tmp_path: Path) -> None:
+    """An environment's scripts name the place where it was made."""
+    make_environment(checkout)
+    write_stamp(checkout)
+    assert bash(checkout, SOURCE + 'must_be_made_anew "$venv"').returncode == 1
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for name in ("scripts", "pyproject.toml", ".venv"):
+        shutil.move(checkout / name, moved)
+    assert bash(moved, SOURCE + 'must_be_made_anew "$venv"').returncode == 0
+
+
+def test_directory_of_somebody_else_stays(checkout: Path) -> None:
+    """A directory that the scripts did not make is neither emptied nor changed."""
+    mine = checkout / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("precious")
+    answer = bash(checkout, "scripts/setup", MJREC_VENV="mine")
+    assert answer.returncode == 1
+    assert f"{mine} is there, and these scripts did not make it" in answer.stderr
+    assert [path.name for path in mine.iterdir()] == ["thesis.tex"]
+
+
+def test_python_that_does_not_fit_is_named(checkout: Path) -> None:
+    """The error says what was looked for, what is there and what to do."""
+    old = checkout / "old-python"
+    old.write_text("#!/bin/sh\n[ $1 = --version ] && echo Python 3.9.2\nexit 1\n")
+    old.chmod(0o755)
+    answer = bash(checkout, SOURCE + "find_python", MJREC_PYTHON=str(old))
+    assert answer.returncode == 1
+    assert "Python 3.11 or 3.12" in answer.stderr
+    assert f"{old} is: Python 3.9.2" in answer.stderr
+    assert "MJREC_PYTHON=" in answer.stderr
+
+
+def test_missing_libraries_are_named_with_the_line_to_run(checkout: Path) -> None:
+    """Where packages may not be installed, one line does it."""
+    no_root = "may_install() { false; }; in_package_lists() { false; }; "
+    answer = bash(checkout, SOURCE + no_root + "install_required $(missing_egl)")
+    assert answer.returncode == 1
+    assert "apt-get install -y --no-install-recommends libegl1 " in answer.stderr
+
+
+def test_failed_step_is_named(checkout: Path) -> None:
+    """A stop names the step, the command and its exit status."""
+    answer = bash(checkout, SOURCE + 'step "counting" false --quick')
+    assert answer.returncode == 1
+    assert "stopped at: counting" in answer.stderr
+    assert "exit status 1 of: false --quick" in answer.stderr
