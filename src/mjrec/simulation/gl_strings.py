@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 
 __all__ = ["current_gl_strings"]
@@ -16,11 +17,11 @@ def current_gl_strings() -> dict[str, str]:
     The keys are `gl_vendor`, `gl_renderer` and `gl_version`; empty where no context
     is current, or none was made through PyOpenGL.
     """
-    # PyOpenGL chooses its platform at import: whoever drew has imported it already,
-    # and nobody else may do so here.
-    gl = sys.modules.get("OpenGL.GL")
-    if gl is None:
+    # PyOpenGL chooses its platform when it is first imported: whoever drew has done so
+    # already, and nobody else may do it here.
+    if "OpenGL.platform" not in sys.modules:
         return {}
+    gl = importlib.import_module("OpenGL.GL")
     strings = {}
     for name in _NAMES:
         try:
