@@ -91,9 +91,17 @@ def video_encoders() -> list[str]:
 
 
 def run_ffmpeg(
-    arguments: Sequence[str], *, standard_input: bytes = b""
+    arguments: Sequence[str],
+    *,
+    standard_input: bytes = b"",
+    what: str = "ffmpeg failed.",
 ) -> subprocess.CompletedProcess[bytes]:
     """Run ffmpeg to its end and return what it wrote.
+
+    Args:
+        arguments: those after the program's name.
+        standard_input: what it reads.
+        what: what fails when it fails: the first sentence of the error.
 
     Raises:
         EncoderError: it could not be started or its exit status is not 0.
@@ -111,7 +119,7 @@ def run_ffmpeg(
         raise _not_started(command, error) from error
     if done.returncode != 0:
         raise EncoderError(
-            "ffmpeg failed.",
+            what,
             command=command,
             returncode=done.returncode,
             stderr=_text(done.stderr[-_END_OF_STDERR:]),
@@ -144,7 +152,7 @@ class FfmpegProcess:
         self._what = what
         self._command = [ffmpeg_executable(), *arguments]
         # A file, not a pipe: nobody has to empty it while the process runs.
-        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  see _release
+        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  see release
         try:
             self._process = subprocess.Popen(
                 self._command,
@@ -157,7 +165,7 @@ class FfmpegProcess:
         except OSError as error:
             self._stderr.close()
             raise _not_started(self._command, error) from error
-        for pipe in filter(None, (self._process.stdin, self._process.stdout)):
+        for pipe in self._pipes():
             # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More is
             # a favour that the kernel may refuse.
             with contextlib.suppress(OSError):
@@ -188,7 +196,7 @@ class FfmpegProcess:
             while rest:
                 rest = rest[pipe.write(rest) :]
         except (OSError, ValueError) as error:
-            # ValueError: the pipe was closed under us by `kill`.
+            # ValueError: the pipe was closed before.
             raise self._died() from error
 
     def read(self, size: int) -> bytes:
@@ -210,23 +218,22 @@ class FfmpegProcess:
         """
         self._process.wait()
         if self._process.returncode != 0:
-            raise self.error(self._what)
-        self._release()
+            raise self._error()
 
     def kill(self) -> None:
-        """End the process at once, if it runs, and leave nothing of it."""
+        """End the process at once, if it runs.
+
+        The pipes stay open: a thread may be about to write, and the number of a closed
+        one may be another file's by then.
+        """
         self._process.kill()
         self._process.wait()
-        self._release()
 
-    def error(self, what: str) -> EncoderError:
-        """Return the error that says `what`, the exit status and ffmpeg's own words."""
-        return EncoderError(
-            what,
-            command=self._command,
-            returncode=self._process.returncode,
-            stderr=self._end_of_stderr(),
-        )
+    def release(self) -> None:
+        """Close the pipes of a process that has ended, once no thread uses them."""
+        self.close_inherited_pipes()
+        self._stderr.close()
+        _running.discard(self)
 
     def close_inherited_pipes(self) -> None:
         """Close a forked child's copies of the pipes.
@@ -234,8 +241,11 @@ class FfmpegProcess:
         While any process holds the writing end, ffmpeg does not see the end of its
         input, and the parent's `wait` would last as long as the child lives.
         """
-        for pipe in filter(None, (self._process.stdin, self._process.stdout)):
+        for pipe in self._pipes():
             pipe.close()
+
+    def _pipes(self) -> list[IO[bytes]]:
+        return [pipe for pipe in (self._process.stdin, self._process.stdout) if pipe]
 
     def _died(self) -> EncoderError:
         try:
@@ -243,19 +253,20 @@ class FfmpegProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        return self.error(self._what)
+        return self._error()
+
+    def _error(self) -> EncoderError:
+        return EncoderError(
+            self._what,
+            command=self._command,
+            returncode=self._process.returncode,
+            stderr=self._end_of_stderr(),
+        )
 
     def _end_of_stderr(self) -> str:
-        if self._stderr.closed:
-            return ""
         size = self._stderr.seek(0, os.SEEK_END)
         self._stderr.seek(max(0, size - _END_OF_STDERR))
         return _text(self._stderr.read())
-
-    def _release(self) -> None:
-        self.close_inherited_pipes()
-        self._stderr.close()
-        _running.discard(self)
 
 
 _running: weakref.WeakSet[FfmpegProcess] = weakref.WeakSet()

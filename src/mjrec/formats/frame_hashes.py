@@ -23,14 +23,25 @@ green, blue.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+from collections.abc import Iterator
 from fractions import Fraction
+from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
+from ..atomic_files import temporary_path
+from ..errors import DirectoryNotWritable
 from ..frames import Frame
 
-__all__ = ["frame_hash_header", "frame_hash_line"]
+__all__ = [
+    "FrameHashFile",
+    "frame_hash_header",
+    "frame_hash_line",
+    "frame_hash_path",
+]
 
 
 def frame_hash_header(*, height: int, width: int, fps: Fraction) -> str:
@@ -52,3 +63,55 @@ def frame_hash_line(number: int, frame: Frame) -> str:
     """Return the line of the frame with this number, counted from 0."""
     digest = hashlib.sha256(np.ascontiguousarray(frame)).hexdigest()
     return f"0, {number:10d}, {number:10d}, {1:8d}, {frame.nbytes:8d}, {digest}\n"
+
+
+class FrameHashFile:
+    """A `.framehash` file in the making: complete, or not there.
+
+    Args:
+        path: its final name.
+        size: `(height, width)` of the frames.
+        fps: frames per second.
+
+    Every method raises `DirectoryNotWritable` when the file cannot be written.
+    """
+
+    def __init__(self, path: Path, *, size: tuple[int, int], fps: Fraction) -> None:
+        self._path = path
+        self._temporary = temporary_path(path)
+        self._frame_count = 0
+        with self._naming_the_directory():
+            self._file: TextIO = self._temporary.open("w", encoding="ascii")
+            self._file.write(frame_hash_header(height=size[0], width=size[1], fps=fps))
+
+    def add(self, frame: Frame) -> None:
+        """Write the next frame's line."""
+        with self._naming_the_directory():
+            self._file.write(frame_hash_line(self._frame_count, frame))
+        self._frame_count += 1
+
+    def finish(self) -> None:
+        """Give the file its name. May be called again."""
+        with self._naming_the_directory():
+            self._file.close()
+            if self._temporary.exists():
+                self._temporary.replace(self._path)
+
+    def abort(self) -> None:
+        """Leave nothing."""
+        # What cannot be written any more need not be.
+        with contextlib.suppress(OSError):
+            self._file.close()
+        self._temporary.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _naming_the_directory(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise DirectoryNotWritable(self._path.parent, error) from error
+
+
+def frame_hash_path(video: Path) -> Path:
+    """Return the name of the `.framehash` file of a video."""
+    return video.with_suffix(".framehash")

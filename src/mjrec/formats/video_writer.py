@@ -8,20 +8,17 @@ is complete and its frames have been counted again.
 
 from __future__ import annotations
 
-import contextlib
-import functools
 import hashlib
 import inspect
 import itertools
-import numbers
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TextIO
+from typing import Any, Self
 
 import numpy as np
 
@@ -37,62 +34,25 @@ from ..frames import Frame, check_frame, check_size, pad_to_even
 from ..rates import to_rate
 from ..schedules import capped_cubic_video_schedule
 from ..worker_thread import WorkerThread
+from .encoder_settings import (
+    MUXERS,
+    EncoderSettings,
+    encoder_settings,
+    try_encoding,
+)
 from .ffmpeg import (
     FfmpegProcess,
     ffmpeg_executable,
     ffmpeg_sha256,
     ffmpeg_version,
-    run_ffmpeg,
-    video_encoders,
 )
-from .frame_hashes import frame_hash_header, frame_hash_line
+from .frame_hashes import FrameHashFile, frame_hash_path
 
 __all__ = ["VideoFile", "VideoWriter", "save_video"]
 
-_DEFAULT_CODEC = "libx264"
-_DEFAULT_CRF = 18.0
-_WORST_CRF = 51.0
-# x264's output depends on the number of its threads, so that the number is a constant
-# and not the machine's.
-_ENCODER_THREADS = 4
 _QUEUED_BYTES = 32 << 20
 _MAX_QUEUED_FRAMES = 64
 _READ_SIZE = 1 << 20
-
-_MUXERS = {
-    ".mp4": "mp4",
-    ".mov": "mov",
-    ".mkv": "matroska",
-    ".webm": "webm",
-    ".avi": "avi",
-}
-_WITH_MOOV = ("mp4", "mov")
-
-# Pixel formats that hold rgb24 without loss.
-_RGB_FORMATS = ("rgb24", "bgr24", "gbrp", "bgr0", "rgb0")
-_LOSSLESS_CODECS = frozenset(
-    {"ffv1", "libx264rgb", "utvideo", "png", "apng", "qtrle", "ffvhuff", "huffyuv"}
-)
-# Where ffmpeg's own default is poor, or not what the codec is taken for.
-_QUALITY = {
-    _DEFAULT_CODEC: ("-crf", f"{_DEFAULT_CRF:g}"),
-    "libx264rgb": ("-crf", "0"),
-    "mpeg4": ("-q:v", "2"),
-}
-
-# Rounding and chroma averaging as the definition says rather than as the CPU likes
-# best: without `bitexact` and `accurate_rnd`, swscale's result depends on the CPU.
-_SCALE_FLAGS = "area+accurate_rnd+full_chroma_int+full_chroma_inp+bitexact"
-_TO_BT709 = (
-    f"scale=out_color_matrix=bt709:out_range=limited:flags={_SCALE_FLAGS},"
-    "format=yuv420p"
-)
-_BT709_TAGS = (
-    *("-color_primaries", "bt709"),
-    *("-color_trc", "bt709"),
-    *("-colorspace", "bt709"),
-    *("-color_range", "tv"),
-)
 
 
 @dataclass(frozen=True)
@@ -191,15 +151,16 @@ class VideoWriter:
         self.result: VideoFile | None = None
         self.path = _check_path(path)
         self.fps = to_rate(fps)
-        self._settings = _settings(
-            codec=_check_codec(codec),
-            crf=_check_crf(crf),
-            muxer=_MUXERS[self.path.suffix.lower()],
-            encoder_arguments=tuple(encoder_arguments),
+        self._settings = encoder_settings(
+            codec=codec,
+            crf=crf,
+            muxer=MUXERS[self.path.suffix.lower()],
+            encoder_arguments=encoder_arguments,
         )
         self._wants_frame_hashes = bool(frame_hashes)
-        _try_encoding(ffmpeg_executable(), self._settings, self.fps)
+        try_encoding(ffmpeg_executable(), self._settings, self.fps)
         self._frame_count = 0
+        self._process_id = os.getpid()
         self._closed = False
 
     @property
@@ -228,8 +189,10 @@ class VideoWriter:
                 f"The video {self.path} is closed after {self._frame_count} frames; "
                 "a file cannot be reopened: write another one."
             )
+        self._check_process()
         started = self._encoding
         checked = check_frame(frame, size=started.size if started else None)
+        check_size(*checked.shape[:2])
         try:
             encoding = started or self._start(checked)
             # A plain copy in rows from top to bottom, whatever the view was.
@@ -250,7 +213,7 @@ class VideoWriter:
         """
         if self._closed:
             return
-        if self._encoding is not None:
+        if self._encoding is not None and not self._was_forked():
             try:
                 self.result = self._encoding.finish()
             except Exception:
@@ -260,8 +223,10 @@ class VideoWriter:
 
     def abort(self) -> None:
         """Stop at once and leave nothing; an older file of that name stays."""
+        if self._closed:
+            return
         self._closed = True
-        if self._encoding is not None and self.result is None:
+        if self._encoding is not None and not self._was_forked():
             self._encoding.abort()
 
     def __enter__(self) -> Self:
@@ -283,9 +248,7 @@ class VideoWriter:
             error.add_note(f"The video {self.path} could not be finished: {failure}")
 
     def __del__(self) -> None:
-        if self._closed:
-            return
-        if self._encoding is None:
+        if self._closed or self._encoding is None or self._was_forked():
             return
         # Waiting is not for a finaliser. The thread encodes what waits and ffmpeg
         # finishes its file, under the temporary name.
@@ -305,8 +268,18 @@ class VideoWriter:
             f"codec={self._settings.codec} {state}, {self._frame_count} frames>"
         )
 
+    def _was_forked(self) -> bool:
+        """Tell whether this is a forked child's copy: the video is the parent's."""
+        return os.getpid() != self._process_id
+
+    def _check_process(self) -> None:
+        if self._was_forked():
+            raise ClosedError(
+                f"The video {self.path} belongs to process {self._process_id}, from "
+                "which this one was forked: write it there, or another one here."
+            )
+
     def _start(self, first: Frame) -> _Encoding:
-        check_size(*first.shape[:2])
         self._encoding = _Encoding(
             self.path,
             fps=self.fps,
@@ -315,38 +288,6 @@ class VideoWriter:
             frame_hashes=self._wants_frame_hashes,
         )
         return self._encoding
-
-
-@dataclass(frozen=True)
-class _Settings:
-    """How to encode, whatever the size and the rate.
-
-    Attributes:
-        codec: ffmpeg's name of the encoder.
-        pixel_format: of the encoded pixels.
-        muxer: ffmpeg's name of the kind of file.
-        arguments: the output arguments but for the kind of file and its name.
-    """
-
-    codec: str
-    pixel_format: str
-    muxer: str
-    arguments: tuple[str, ...]
-
-    @property
-    def decoded_format(self) -> str:
-        """The pixel format in which the finished file's frames are hashed."""
-        return "yuv420p" if self.pixel_format == "yuv420p" else "rgb24"
-
-    def input_arguments(self, *, height: int, width: int, fps: Fraction) -> list[str]:
-        """Return the arguments for raw frames on standard input."""
-        return [
-            *("-hide_banner", "-loglevel", "error", "-nostdin", "-y"),
-            *("-f", "rawvideo", "-pixel_format", "rgb24"),
-            *("-video_size", f"{width}x{height}"),
-            *("-framerate", f"{fps.numerator}/{fps.denominator}"),
-            *("-i", "pipe:0"),
-        ]
 
 
 class _Encoding:
@@ -358,7 +299,7 @@ class _Encoding:
         *,
         fps: Fraction,
         size: tuple[int, int],
-        settings: _Settings,
+        settings: EncoderSettings,
         frame_hashes: bool,
     ) -> None:
         self.size = size
@@ -367,20 +308,18 @@ class _Encoding:
         self._fps = fps
         self._settings = settings
         self._padded = (size[0] + size[0] % 2, size[1] + size[1] % 2)
-        self._hashes = _FrameHashFile(path, size, fps) if frame_hashes else None
         self._encoded = 0
-        height, width = self._padded
-        self._process = FfmpegProcess(
-            [
-                *settings.input_arguments(height=height, width=width, fps=fps),
-                *settings.arguments,
-                *(("-movflags", "+faststart") if settings.muxer in _WITH_MOOV else ()),
-                *("-f", settings.muxer),
-                _as_file(self.temporary),
-            ],
-            what=f"The video {path} could not be encoded.",
-            reads=True,
+        self._hashes = (
+            FrameHashFile(frame_hash_path(path), size=size, fps=fps)
+            if frame_hashes
+            else None
         )
+        try:
+            self._process = self._start_ffmpeg()
+        except BaseException:
+            self._abort_hashes()
+            raise
+        height, width = self._padded
         frame_bytes = height * width * 3
         self.worker = WorkerThread[Frame](
             self._encode,
@@ -407,10 +346,11 @@ class _Encoding:
             pixel_format=self._settings.pixel_format,
             file_sha256=file_sha256,
             decoded_sha256=decoded_sha256,
-            frame_hash_path=_frame_hash_path(self._path) if self._hashes else None,
+            frame_hash_path=frame_hash_path(self._path) if self._hashes else None,
             encoder=self._describe_encoder(),
         )
         self._rename()
+        self._process.release()
         return result
 
     def abort(self) -> None:
@@ -418,13 +358,25 @@ class _Encoding:
         # First the process: the thread may be waiting for it to read.
         self._process.kill()
         self.worker.abort()
+        self._process.release()
         self.temporary.unlink(missing_ok=True)
+        self._abort_hashes()
+
+    def _start_ffmpeg(self) -> FfmpegProcess:
+        height, width = self._padded
+        arguments = self._settings.arguments(
+            height=height, width=width, fps=self._fps, output=_as_file(self.temporary)
+        )
+        what = f"The video {self._path} could not be encoded."
+        return FfmpegProcess(arguments, what=what, reads=True)
+
+    def _abort_hashes(self) -> None:
         if self._hashes is not None:
             self._hashes.abort()
 
     def _encode(self, frame: Frame) -> None:
         if self._hashes is not None:
-            self._hashes.add(self._encoded, frame)
+            self._hashes.add(frame)
         self._process.write(pad_to_even(frame))
         self._encoded += 1
 
@@ -436,24 +388,26 @@ class _Encoding:
             fps=self._fps,
         )
         if frame_count != self._encoded:
-            error = self._process.error("")
             raise FrameCountError(
                 f"{self._path} was to hold {self._encoded} frames, and decoding gives "
                 f"{frame_count}. It was not kept.",
-                command=error.command,
-                returncode=error.returncode,
-                stderr=error.stderr,
+                command=self._process.command,
+                returncode=0,
+                stderr="",
             )
         return digest
 
     def _rename(self) -> None:
         # The hashes first: where there is a video, what belongs to it is there too.
-        if self._hashes is not None:
-            self._hashes.finish()
-        else:
-            # Those of the video that is replaced now would be wrong.
-            _frame_hash_path(self._path).unlink(missing_ok=True)
-        self.temporary.replace(self._path)
+        try:
+            if self._hashes is not None:
+                self._hashes.finish()
+            elif self._path.exists():
+                # Those of the video that is replaced now would be wrong.
+                frame_hash_path(self._path).unlink(missing_ok=True)
+            self.temporary.replace(self._path)
+        except OSError as error:
+            raise DirectoryNotWritable(self._path.parent, error) from error
 
     def _describe_encoder(self) -> dict[str, Any]:
         executable, *arguments = self._process.command
@@ -465,45 +419,6 @@ class _Encoding:
         }
 
 
-class _FrameHashFile:
-    """A `.framehash` file in the making."""
-
-    def __init__(self, video: Path, size: tuple[int, int], fps: Fraction) -> None:
-        self._path = _frame_hash_path(video)
-        self._temporary = temporary_path(self._path)
-        with self._naming_the_directory():
-            self._file: TextIO = self._temporary.open("w", encoding="ascii")
-            self._file.write(frame_hash_header(height=size[0], width=size[1], fps=fps))
-
-    def add(self, number: int, frame: Frame) -> None:
-        with self._naming_the_directory():
-            self._file.write(frame_hash_line(number, frame))
-
-    def finish(self) -> None:
-        with self._naming_the_directory():
-            self._file.close()
-            # Missing when an interrupted close is repeated.
-            with contextlib.suppress(FileNotFoundError):
-                self._temporary.replace(self._path)
-
-    def abort(self) -> None:
-        # What cannot be written any more need not be.
-        with contextlib.suppress(OSError):
-            self._file.close()
-        self._temporary.unlink(missing_ok=True)
-
-    @contextlib.contextmanager
-    def _naming_the_directory(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise DirectoryNotWritable(self._path.parent, error) from error
-
-
-def _frame_hash_path(video: Path) -> Path:
-    return video.with_suffix(".framehash")
-
-
 def _check_path(path: str | os.PathLike[str]) -> Path:
     try:
         checked = Path(os.fspath(path))
@@ -511,9 +426,9 @@ def _check_path(path: str | os.PathLike[str]) -> Path:
         raise InvalidArgument(
             f"path must be the name of a file, got {path!r}."
         ) from error
-    if checked.suffix.lower() not in _MUXERS:
+    if checked.suffix.lower() not in MUXERS:
         raise InvalidArgument(
-            f"The name of a video ends in {', '.join(_MUXERS)}, got {str(path)!r}."
+            f"The name of a video ends in {', '.join(MUXERS)}, got {str(path)!r}."
         )
     if checked.is_dir():
         raise InvalidArgument(f"{checked} is a directory; path must be a file's name.")
@@ -524,123 +439,6 @@ def _check_path(path: str | os.PathLike[str]) -> Path:
         raise DirectoryNotWritable(parent, "permission denied")
     # Absolute, so that a change of the working directory moves nothing.
     return checked.absolute()
-
-
-def _check_crf(crf: object) -> float | None:
-    if crf is None:
-        return None
-    number = isinstance(crf, numbers.Real) and not isinstance(crf, bool)
-    if not number or not 0 <= float(crf) <= _WORST_CRF:  # type: ignore[arg-type]  # number says so
-        raise InvalidArgument(
-            f"crf must be a number from 0 (largest) to {_WORST_CRF:g} (worst), got "
-            f"{crf!r}."
-        )
-    return float(crf)  # type: ignore[arg-type]  # as above
-
-
-def _check_codec(codec: object) -> str:
-    if codec is None:
-        return _DEFAULT_CODEC
-    if not isinstance(codec, str):
-        raise InvalidArgument(
-            f"codec must be ffmpeg's name of an encoder, got {codec!r}."
-        )
-    return codec
-
-
-def _settings(
-    *, codec: str, crf: float | None, muxer: str, encoder_arguments: tuple[str, ...]
-) -> _Settings:
-    help_text = _encoder_help(ffmpeg_executable(), codec)
-    pixel_format = _pixel_format(codec, help_text)
-    yuv = pixel_format == "yuv420p"
-    arguments = (
-        *("-an", "-map_metadata", "-1"),
-        *(("-vf", _TO_BT709) if yuv else ("-pix_fmt", pixel_format)),
-        *("-c:v", codec),
-        *_codec_arguments(codec, crf),
-        *_quality_arguments(codec, crf, help_text),
-        *("-threads", str(_ENCODER_THREADS)),
-        *("-fflags", "+bitexact", "-flags:v", "+bitexact"),
-        *(_BT709_TAGS if yuv else ()),
-        *encoder_arguments,
-    )
-    return _Settings(codec, pixel_format, muxer, arguments)
-
-
-def _codec_arguments(codec: str, crf: float | None) -> tuple[str, ...]:
-    if codec not in ("libx264", "libx264rgb"):
-        return ()
-    # x264 calls lossless what truncates to 0, and no profile High has it.
-    lossless = crf is not None and int(crf) == 0
-    high = codec == "libx264" and not lossless
-    return (
-        *("-preset", "veryfast"),
-        *(("-profile:v", "high") if high else ()),
-        *("-x264-params", "cpu-independent=1"),
-    )
-
-
-def _quality_arguments(
-    codec: str, crf: float | None, help_text: str
-) -> tuple[str, ...]:
-    if crf is None:
-        return _QUALITY.get(codec, ())
-    if " -crf " not in help_text:
-        raise InvalidArgument(
-            f"The encoder {codec} knows no crf, got crf={crf:g}: leave it out, or use "
-            "codec='libx264'."
-        )
-    return ("-crf", f"{crf:g}")
-
-
-def _pixel_format(codec: str, help_text: str) -> str:
-    _, _, rest = help_text.partition("Supported pixel formats:")
-    supported = rest.partition("\n")[0].split()
-    wanted = _RGB_FORMATS if codec in _LOSSLESS_CODECS else ("yuv420p",)
-    for pixel_format in wanted:
-        if pixel_format in supported:
-            return pixel_format
-    raise InvalidArgument(
-        f"The encoder {codec} takes none of {', '.join(wanted)}, only "
-        f"{', '.join(supported) or 'unknown formats'}: use codec='libx264', or "
-        "codec='ffv1' for a lossless video."
-    )
-
-
-@functools.lru_cache
-def _encoder_help(executable: str, codec: str) -> str:
-    """Return what ffmpeg says about an encoder; `executable` is a key of the cache."""
-    available = video_encoders()
-    if codec not in available:
-        raise UnknownName(
-            "video encoder",
-            codec,
-            available,
-            hint=f"They are those of {executable}, {ffmpeg_version()}.",
-        )
-    shown = run_ffmpeg(["-hide_banner", "-h", f"encoder={codec}"]).stdout
-    return shown.decode("utf-8", errors="replace")
-
-
-@functools.lru_cache
-def _try_encoding(executable: str, settings: _Settings, fps: Fraction) -> None:
-    """Encode one small grey frame, so that what cannot work fails before any work.
-
-    Once for each combination; `executable` is a key of the cache.
-    """
-    side = 64
-    fragmented = ("-movflags", "+frag_keyframe+empty_moov")
-    run_ffmpeg(
-        [
-            *settings.input_arguments(height=side, width=side, fps=fps),
-            *settings.arguments,
-            # A pipe cannot be rewritten from its start.
-            *(fragmented if settings.muxer in _WITH_MOOV else ()),
-            *("-f", settings.muxer, "pipe:1"),
-        ],
-        standard_input=bytes([128]) * (side * side * 3),
-    )
 
 
 def _decode(
@@ -669,6 +467,7 @@ def _decode(
         process.wait()
     finally:
         process.kill()
+        process.release()
     height, width = size
     frame_bytes = height * width * 3
     if pixel_format == "yuv420p":

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How ffmpeg is told to encode: the codec, its quality, the colours, the kind of file.
+
+The same frames give the same file on any CPU and with any number of cores: the number
+of threads is fixed, x264 keeps to what every CPU does alike (`cpu-independent=1`), and
+the conversion of colours rounds as its definition says.
+"""
+
+from __future__ import annotations
+
+import functools
+import numbers
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+from ..errors import InvalidArgument, UnknownName
+from .ffmpeg import ffmpeg_executable, ffmpeg_version, run_ffmpeg, video_encoders
+
+__all__ = ["MUXERS", "EncoderSettings", "encoder_settings", "try_encoding"]
+
+_DEFAULT_CODEC = "libx264"
+_DEFAULT_CRF = 18.0
+_WORST_CRF = 51.0
+# x264's output depends on the number of its threads, so that the number is a constant
+# and not the machine's.
+_ENCODER_THREADS = 4
+
+# The kinds of file, by the ending of the name.
+MUXERS = {
+    ".mp4": "mp4",
+    ".mov": "mov",
+    ".mkv": "matroska",
+    ".webm": "webm",
+    ".avi": "avi",
+}
+_WITH_MOOV = ("mp4", "mov")
+
+# Pixel formats that hold rgb24 without loss.
+_RGB_FORMATS = ("rgb24", "bgr24", "gbrp", "bgr0", "rgb0")
+_LOSSLESS_CODECS = frozenset(
+    {"ffv1", "libx264rgb", "utvideo", "png", "apng", "qtrle", "ffvhuff", "huffyuv"}
+)
+# Where ffmpeg's own default is poor, or not what the codec is taken for.
+_QUALITY = {
+    _DEFAULT_CODEC: ("-crf", f"{_DEFAULT_CRF:g}"),
+    "libx264rgb": ("-crf", "0"),
+    "mpeg4": ("-q:v", "2"),
+}
+
+# Rounding and chroma averaging as the definition says rather than as the CPU likes
+# best: without `bitexact` and `accurate_rnd`, swscale's result depends on the CPU.
+_SCALE_FLAGS = "area+accurate_rnd+full_chroma_int+full_chroma_inp+bitexact"
+_TO_BT709 = (
+    f"scale=out_color_matrix=bt709:out_range=limited:flags={_SCALE_FLAGS},"
+    "format=yuv420p"
+)
+_BT709_TAGS = (
+    *("-color_primaries", "bt709"),
+    *("-color_trc", "bt709"),
+    *("-colorspace", "bt709"),
+    *("-color_range", "tv"),
+)
+
+
+@dataclass(frozen=True)
+class EncoderSettings:
+    """How to encode, whatever the size and the rate.
+
+    Attributes:
+        codec: ffmpeg's name of the encoder.
+        pixel_format: of the encoded pixels: yuv420p, or one that holds all of rgb24.
+        muxer: ffmpeg's name of the kind of file.
+        encoding: the arguments between the input and the kind of file.
+    """
+
+    codec: str
+    pixel_format: str
+    muxer: str
+    encoding: tuple[str, ...]
+
+    @property
+    def decoded_format(self) -> str:
+        """The pixel format in which the finished file's frames are hashed."""
+        return "yuv420p" if self.pixel_format == "yuv420p" else "rgb24"
+
+    def arguments(
+        self, *, height: int, width: int, fps: Fraction, output: str
+    ) -> list[str]:
+        """Return ffmpeg's arguments for rgb24 frames from standard input to a file."""
+        return [
+            *self._to_encode(height, width, fps),
+            *(("-movflags", "+faststart") if self.muxer in _WITH_MOOV else ()),
+            *("-f", self.muxer, output),
+        ]
+
+    def trial_arguments(self, *, height: int, width: int, fps: Fraction) -> list[str]:
+        """Return the same but for a pipe, whose beginning cannot be rewritten."""
+        fragmented = ("-movflags", "+frag_keyframe+empty_moov")
+        return [
+            *self._to_encode(height, width, fps),
+            *(fragmented if self.muxer in _WITH_MOOV else ()),
+            *("-f", self.muxer, "pipe:1"),
+        ]
+
+    def _to_encode(self, height: int, width: int, fps: Fraction) -> list[str]:
+        return [
+            *("-hide_banner", "-loglevel", "error", "-nostdin", "-y"),
+            *("-f", "rawvideo", "-pixel_format", "rgb24"),
+            *("-video_size", f"{width}x{height}"),
+            *("-framerate", f"{fps.numerator}/{fps.denominator}"),
+            *("-i", "pipe:0"),
+            *self.encoding,
+        ]
+
+
+def encoder_settings(
+    *,
+    codec: str | None,
+    crf: float | None,
+    muxer: str,
+    encoder_arguments: Sequence[str] = (),
+) -> EncoderSettings:
+    """Return the settings that `VideoWriter`'s arguments mean.
+
+    Raises:
+        InvalidArgument: one of them cannot be.
+        UnknownName: ffmpeg has no such encoder.
+    """
+    codec = _check_codec(codec)
+    crf = _check_crf(crf)
+    help_text = _encoder_help(ffmpeg_executable(), codec)
+    pixel_format = _pixel_format(codec, help_text)
+    yuv = pixel_format == "yuv420p"
+    encoding = (
+        *("-an", "-map_metadata", "-1"),
+        *(("-vf", _TO_BT709) if yuv else ("-pix_fmt", pixel_format)),
+        *("-c:v", codec),
+        *_codec_arguments(codec, crf),
+        *_quality_arguments(codec, crf, help_text),
+        *("-threads", str(_ENCODER_THREADS)),
+        *("-fflags", "+bitexact", "-flags:v", "+bitexact"),
+        *(_BT709_TAGS if yuv else ()),
+        *_check_arguments(encoder_arguments),
+    )
+    return EncoderSettings(codec, pixel_format, muxer, encoding)
+
+
+@functools.lru_cache
+def try_encoding(executable: str, settings: EncoderSettings, fps: Fraction) -> None:
+    """Encode one small grey frame, so that what cannot work fails before any work.
+
+    Once for each combination; `executable` is a key of the cache.
+
+    Raises:
+        EncoderError: it cannot work.
+    """
+    side = 64
+    run_ffmpeg(
+        settings.trial_arguments(height=side, width=side, fps=fps),
+        standard_input=bytes([128]) * (side * side * 3),
+        what=f"ffmpeg cannot encode {fps} frames per second with {settings.codec} "
+        f"into a {settings.muxer} file: choose another codec, rate or kind of file.",
+    )
+
+
+def _check_crf(crf: float | None) -> float | None:
+    if crf is None:
+        return None
+    is_number = isinstance(crf, numbers.Real) and not isinstance(crf, bool)
+    if not is_number or not 0 <= crf <= _WORST_CRF:
+        raise InvalidArgument(
+            f"crf must be a number from 0 (largest) to {_WORST_CRF:g} (worst), got "
+            f"{crf!r}."
+        )
+    return float(crf)
+
+
+def _check_codec(codec: str | None) -> str:
+    if codec is None:
+        return _DEFAULT_CODEC
+    if not isinstance(codec, str):
+        raise InvalidArgument(
+            f"codec must be ffmpeg's name of an encoder, got {codec!r}."
+        )
+    return codec
+
+
+def _check_arguments(arguments: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(arguments, str) or not all(isinstance(a, str) for a in arguments):
+        raise InvalidArgument(
+            f"encoder_arguments must be a sequence of strings, got {arguments!r}."
+        )
+    return tuple(arguments)
+
+
+def _codec_arguments(codec: str, crf: float | None) -> tuple[str, ...]:
+    if codec not in ("libx264", "libx264rgb"):
+        return ()
+    # x264 calls lossless what truncates to 0, and no profile High has it.
+    lossless = crf is not None and int(crf) == 0
+    high = codec == "libx264" and not lossless
+    return (
+        *("-preset", "veryfast"),
+        *(("-profile:v", "high") if high else ()),
+        *("-x264-params", "cpu-independent=1"),
+    )
+
+
+def _quality_arguments(
+    codec: str, crf: float | None, help_text: str
+) -> tuple[str, ...]:
+    if crf is None:
+        return _QUALITY.get(codec, ())
+    if " -crf " not in help_text:
+        raise InvalidArgument(
+            f"The encoder {codec} knows no crf, got crf={crf:g}: leave it out, or use "
+            "codec='libx264'."
+        )
+    return ("-crf", f"{crf:g}")
+
+
+def _pixel_format(codec: str, help_text: str) -> str:
+    _, _, rest = help_text.partition("Supported pixel formats:")
+    supported = rest.partition("\n")[0].split()
+    wanted = _RGB_FORMATS if codec in _LOSSLESS_CODECS else ("yuv420p",)
+    for pixel_format in wanted:
+        if pixel_format in supported:
+            return pixel_format
+    raise InvalidArgument(
+        f"The encoder {codec} takes none of {', '.join(wanted)}, only "
+        f"{', '.join(supported) or 'unknown formats'}: use codec='libx264', or "
+        "codec='ffv1' for a lossless video."
+    )
+
+
+@functools.lru_cache
+def _encoder_help(executable: str, codec: str) -> str:
+    """Return what ffmpeg says about an encoder; `executable` is a key of the cache."""
+    available = video_encoders()
+    if codec not in available:
+        raise UnknownName(
+            "video encoder",
+            codec,
+            available,
+            hint=f"They are those of {executable}, {ffmpeg_version()}.",
+        )
+    shown = run_ffmpeg(["-hide_banner", "-h", f"encoder={codec}"]).stdout
+    return shown.decode("utf-8", errors="replace")

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finding and running ffmpeg."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mjrec.errors import EncoderError
+from mjrec.formats.ffmpeg import (
+    FfmpegProcess,
+    ffmpeg_executable,
+    ffmpeg_sha256,
+    ffmpeg_version,
+    run_ffmpeg,
+    video_encoders,
+)
+
+
+def script(path: Path, text: str) -> Path:
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+def test_the_binary_is_named_and_hashed() -> None:
+    """Version line and sha256 are those of the program that is run."""
+    path = ffmpeg_executable()
+    assert os.access(path, os.X_OK)
+    assert ffmpeg_version().startswith("ffmpeg version ")
+    assert ffmpeg_sha256() == hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    assert {"libx264", "ffv1"} <= set(video_encoders())
+
+
+def test_the_environment_variable_decides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """IMAGEIO_FFMPEG_EXE is the program, and facts of another are not kept for it."""
+    ffmpeg_version()
+    other = script(tmp_path / "other", "echo ffmpeg version ours")
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(other))
+    assert ffmpeg_executable() == str(other)
+    assert ffmpeg_version() == "ffmpeg version ours"
+    assert ffmpeg_sha256() == hashlib.sha256(other.read_bytes()).hexdigest()
+
+
+def test_a_program_that_is_not_there_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A wrong IMAGEIO_FFMPEG_EXE is an error with the variable and its value."""
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "nowhere"))
+    with pytest.raises(EncoderError, match=r"IMAGEIO_FFMPEG_EXE is '.*nowhere'"):
+        ffmpeg_executable()
+
+
+def test_a_program_that_cannot_be_started_is_an_encoder_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that is executable and no program gives one error of ours."""
+    broken = tmp_path / "broken"
+    broken.write_bytes(b"\0\0\0\0")
+    broken.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(broken))
+    with pytest.raises(EncoderError, match="could not be started"):
+        run_ffmpeg(["-version"])
+    with pytest.raises(EncoderError, match="could not be started"):
+        FfmpegProcess(["-version"], what="It failed.")
+
+
+def test_a_failure_has_command_status_and_the_end_of_stderr() -> None:
+    """What ffmpeg says about a missing file is in the error."""
+    with pytest.raises(EncoderError, match="No such file") as caught:
+        run_ffmpeg(["-hide_banner", "-i", "missing.mp4", "-f", "null", "-"])
+    assert caught.value.command[-1] == "-"
+    assert caught.value.returncode not in (0, None)
+
+
+def test_only_the_end_of_a_long_stderr_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A megabyte of complaints neither blocks the process nor fills the message."""
+    text = "head -c 1000000 /dev/zero | tr '\\0' x >&2; echo the reason >&2; exit 3"
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(script(tmp_path / "talker", text)))
+    process = FfmpegProcess([], what="It failed.")
+    with pytest.raises(EncoderError, match="the reason") as caught:
+        process.wait()
+    process.release()
+    assert caught.value.returncode == 3
+    assert len(caught.value.stderr) < 5000
+
+
+def test_a_process_that_dies_while_it_is_fed_is_one_error() -> None:
+    """Writing to a killed ffmpeg gives its signal, not a broken pipe."""
+    arguments = "-v error -f rawvideo -pixel_format gray -video_size 8x8 -i - -f null -"
+    process = FfmpegProcess(arguments.split(), what="It failed.", reads=True)
+    os.kill(process.pid, signal.SIGKILL)
+    with pytest.raises(EncoderError, match="It failed") as caught:
+        process.write(bytes(64 << 20))
+    process.release()
+    assert caught.value.returncode == -signal.SIGKILL
+
+
+def test_a_fork_does_not_keep_the_pipe_open() -> None:
+    """The encoder sees the end of its input although a forked child lives on."""
+    code = (
+        "import os, signal\n"
+        "from mjrec.formats.ffmpeg import FfmpegProcess\n"
+        "arguments = '-v error -f rawvideo -pixel_format gray -video_size 8x8 "
+        "-i - -f null -'\n"
+        "process = FfmpegProcess(arguments.split(), what='', reads=True)\n"
+        "child = os.fork()\n"
+        "if child == 0:\n"
+        "    signal.pause()\n"
+        "process.write(bytes(64))\n"
+        "process.end_input()\n"
+        "process.wait()\n"
+        "process.release()\n"
+        "os.kill(child, signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The `.framehash` file against ffmpeg's own."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjrec.errors import DirectoryNotWritable
+from mjrec.formats.ffmpeg import run_ffmpeg
+from mjrec.formats.frame_hashes import (
+    FrameHashFile,
+    frame_hash_line,
+    frame_hash_path,
+)
+from mjrec.frames import Frame
+
+
+def noise(count: int, height: int, width: int) -> Frame:
+    shape = (count, height, width, 3)
+    return np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "fps"),
+    [
+        (5, 8, Fraction(40)),
+        (7, 9, Fraction(30000, 1001)),
+        (600, 801, Fraction(1, 1000)),
+        (2, 2, Fraction(1000000, 33333)),
+    ],
+)
+def test_the_text_is_ffmpegs_own(
+    tmp_path: Path, height: int, width: int, fps: Fraction
+) -> None:
+    """Odd and even sizes, whole and broken rates: byte for byte ffmpeg's output."""
+    frames = noise(12, height, width)
+    file = FrameHashFile(tmp_path / "a.framehash", size=(height, width), fps=fps)
+    for frame in frames:
+        file.add(frame)
+    file.finish()
+    arguments = (
+        f"-v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i - "
+        "-fflags +bitexact -f framehash -"
+    )
+    theirs = run_ffmpeg(arguments.split(), standard_input=frames.tobytes()).stdout
+    assert (tmp_path / "a.framehash").read_bytes() == theirs
+
+
+def test_a_view_is_hashed_as_it_looks() -> None:
+    """A flipped view has the hash of the flipped picture, not of its memory."""
+    (frame,) = noise(1, 4, 6)
+    assert frame_hash_line(0, frame[::-1]) == frame_hash_line(0, frame[::-1].copy())
+    assert frame_hash_line(0, frame[::-1]) != frame_hash_line(0, frame)
+
+
+def test_it_has_its_name_only_when_finished(tmp_path: Path) -> None:
+    """Until finish there is nothing under the name; after abort nothing at all."""
+    path = frame_hash_path(tmp_path / "run.1.mp4")
+    assert path.name == "run.1.framehash"
+    file = FrameHashFile(path, size=(4, 6), fps=Fraction(1))
+    assert not path.exists()
+    file.abort()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_takes_nothing_is_one_error() -> None:
+    """What the system says comes with the directory's name."""
+    with pytest.raises(DirectoryNotWritable, match="/proc"):
+        FrameHashFile(Path("/proc/a.framehash"), size=(4, 6), fps=Fraction(1))
