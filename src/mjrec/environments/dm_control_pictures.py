@@ -79,20 +79,11 @@ class PhysicsPictures:
         self._height = height
         self._width = width
 
-    @property
-    def unwrapped(self) -> Any:
-        """The environment."""
-        return self._env
-
     def render(self) -> Any:
         """Return the picture of this moment, `(height, width, 3) uint8`."""
         return self._env.physics.render(
             height=self._height, width=self._width, camera_id=self._camera
         )
-
-    def control_timestep(self) -> float:
-        """Return the seconds of simulated time in a step."""
-        return float(self._env.control_timestep())
 
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""

@@ -79,16 +79,6 @@ class EnvironmentPictures:
         """The environment's render mode."""
         return self._env.render_mode
 
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """The environment's metadata."""
-        return self._env.metadata
-
-    @property
-    def unwrapped(self) -> gymnasium.Env[Any, Any]:
-        """The environment without its wrappers."""
-        return self._env.unwrapped
-
     def render(self) -> Any:
         """Return the picture of this moment, or the list of those not seen yet."""
         rendered: Any = self._env.render()

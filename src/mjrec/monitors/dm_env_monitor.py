@@ -12,7 +12,7 @@ import dm_env
 
 from ..environments.no_pictures import NoPictureSource
 from ..errors import InvalidArgument
-from ..recorder.clock import simulation_time
+from ..recorder.clock import declared_rate, simulation_time
 from ..recorder.exit_guard import ExitGuard
 from ..recorder.recorder import Recorder, RecorderOptions
 from .controls import MonitorControls
@@ -63,6 +63,7 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
             pictures=pictures,
             options=options,
             clock=functools.partial(simulation_time, env),
+            declared=functools.partial(declared_rate, env),
             facts=pictures.facts,
         )
         self._guard = ExitGuard(

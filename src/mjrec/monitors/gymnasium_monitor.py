@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from typing import Any, SupportsFloat
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import gymnasium_pictures
-from ..recorder.clock import simulation_time
+from ..recorder.clock import declared_rate, simulation_time
 from ..recorder.exit_guard import ExitGuard
 from ..recorder.recorder import Recorder, RecorderOptions
 from .controls import MonitorControls
@@ -59,11 +60,17 @@ class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
             pictures=pictures,
             options=options,
             clock=functools.partial(simulation_time, env),
+            declared=functools.partial(declared_rate, env),
             facts=pictures.facts,
         )
         self._guard = ExitGuard(
             self, functools.partial(_close, self._recorder, pictures, env)
         )
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The environment's own: one made from it again is not monitored."""
+        return self.env.spec
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -75,6 +75,7 @@ class Recorder:
         pictures: where the pictures come from.
         options: what was asked for.
         clock: returns the simulated time in seconds, or None.
+        declared: returns the rate to take where there is no simulated time.
         facts: returns more for the metadata of each video.
     """
 
@@ -86,6 +87,7 @@ class Recorder:
         pictures: PictureSource,
         options: RecorderOptions,
         clock: Callable[[], float | None] | None = None,
+        declared: Callable[[], Fraction] | None = None,
         facts: Callable[[], Mapping[str, Any]] | None = None,
     ) -> None:
         self._schedule = to_schedule(options.video_callable)
@@ -98,9 +100,11 @@ class Recorder:
         self._pictures = pictures
         self._options = options
         self._clock = clock
+        self._declared = declared
         self._facts = facts
         self._pid = os.getpid()
         self._videos = _Videos()
+        self._decision = (-1, False)
         self._place: OpenDirectory = open_directory(
             directory,
             force=options.force,
@@ -258,20 +262,26 @@ class Recorder:
         logger.info("Finished writing results. They are in %s.", self.directory)
 
     def _begin_video(self, episode_id: int) -> None:
-        wanted = bool(self._schedule(episode_id))
-        if wanted and episode_id not in self._videos.scheduled[-1:]:
-            self._videos.scheduled.append(episode_id)
         self.video_recorder = VideoRecorder(
             self._pictures,
             base_path=self.directory / video_prefix(self._place.infix, episode_id),
             metadata={"episode_id": episode_id},
-            enabled=wanted,
+            enabled=self._decide(episode_id),
             fps=self._options.fps,
             frame_hashes=True,
             clock=self._clock,
+            declared=self._declared,
             facts=self._facts,
         )
         self.video_recorder.capture_frame()
+
+    def _decide(self, episode_id: int) -> bool:
+        """Ask the schedule; only once for a number, which resets may share."""
+        if self._decision[0] != episode_id:
+            self._decision = (episode_id, bool(self._schedule(episode_id)))
+            if self._decision[1]:
+                self._videos.scheduled.append(episode_id)
+        return self._decision[1]
 
     def _journal_episode(self, *, terminated: bool, truncated: bool) -> None:
         stats = self.stats_recorder

@@ -224,10 +224,10 @@ def reward_to_float(reward: Any) -> float:
     """
     if type(reward) is float:
         return reward
-    try:
-        return float(np.asarray(reward, dtype=np.float64).item())
-    except (TypeError, ValueError):
+    array = np.asarray(reward)
+    if array.dtype.kind not in "biuf" or array.size != 1:
         raise InvalidArgument(
             f"A reward must be one number, got {reward!r}. An environment with several "
             "rewards needs a wrapper that makes one number of them."
-        ) from None
+        )
+    return float(array.item())

@@ -70,6 +70,7 @@ class VideoRecorder:
         fps: frames per second of the file, instead of real time.
         frame_hashes: also write the `.framehash` of an image video.
         clock: returns the simulated time in seconds, or None where there is none.
+        declared: returns the rate to take where there is no simulated time.
         facts: returns more for the metadata, asked for once, after the last frame.
 
     Raises:
@@ -95,6 +96,7 @@ class VideoRecorder:
         fps: float | Fraction | None = None,
         frame_hashes: bool = False,
         clock: Callable[[], float | None] | None = None,
+        declared: Callable[[], Fraction] | None = None,
         facts: Callable[[], Mapping[str, Any]] | None = None,
     ) -> None:
         self.env = env
@@ -105,6 +107,7 @@ class VideoRecorder:
         self.metadata = dict(metadata or {})
         self.ansi_mode = getattr(env, "render_mode", None) in _TEXT_MODES
         self._clock = clock or (lambda: simulation_time(env))
+        self._declared = declared or (lambda: declared_rate(env))
         self._facts = facts
         self._fps = None if fps is None else to_rate(fps)
         self._frame_hashes = frame_hashes
@@ -256,7 +259,7 @@ class VideoRecorder:
     def _real_time(self, frames: int) -> Fraction:
         if self._timestep is not None and frames:
             return rate_from_timestep(float(self._timestep)) * frames
-        return declared_rate(self.env)
+        return self._declared()
 
     def _open_writer(self, rate: Fraction) -> None:
         assert self.path is not None
@@ -290,7 +293,7 @@ class VideoRecorder:
 
     def _finish_writer(self) -> None:
         if self._waiting:
-            self._open_writer(self._fps or declared_rate(self.env))
+            self._open_writer(self._fps or self._declared())
         if self._writer is not None:
             self._writer.close()
 

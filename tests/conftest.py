@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the tests share: OpenGL's backend, small environments, small helpers."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+
+# Before anything imports mujoco, which reads it once.
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+_HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
+
+
+def pytest_report_header() -> list[str]:
+    """Say what the pictures come from."""
+    return [f"MUJOCO_GL={os.environ['MUJOCO_GL']}", f"dm_control: {_HAS_DM_CONTROL}"]
+
+
+class Corridor(gymnasium.Env[Any, Any]):
+    """Walks `length` steps and ends; draws its position. Needs no simulator."""
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  Gymnasium's own way
+        "render_modes": ["rgb_array", "ansi", "rgb_array_list"],
+        "render_fps": 10,
+    }
+    observation_space = gymnasium.spaces.Box(0, 1000, (1,), np.float64)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(
+        self,
+        length: int = 3,
+        render_mode: str | None = "rgb_array",
+        size: tuple[int, int] = (32, 48),
+    ) -> None:
+        self.length = length
+        self.render_mode = render_mode
+        self.size = size
+        self.position = 0
+        self.closed = 0
+        self.rendered = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.position = 0
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.position += 1
+        return self._observation(), 0.5, self.position >= self.length, False, {}
+
+    def render(self) -> Any:
+        self.rendered += 1
+        if self.render_mode == "ansi":
+            return "." * self.position + "o\n"
+        frame = np.zeros((*self.size, 3), np.uint8)
+        frame[:, : 4 * self.position + 4] = (200, 40, 10)
+        return [frame] if self.render_mode == "rgb_array_list" else frame
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def _observation(self) -> Any:
+        return np.array([self.position], np.float64)
+
+
+@pytest.fixture
+def corridor() -> Corridor:
+    """An environment of three steps that draws 48x32 pictures."""
+    return Corridor()
+
+
+@pytest.fixture
+def make_corridor() -> type[Corridor]:
+    """The class of `corridor`, for other arguments."""
+    return Corridor
+
+
+def run_episodes(env: Any, count: int, *, seed: int | None = None) -> None:
+    """Run whole episodes of a Gymnasium environment."""
+    for _ in range(count):
+        env.reset(seed=seed)
+        done = False
+        while not done:
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            done = terminated or truncated
+
+
+@pytest.fixture
+def run() -> Callable[..., None]:
+    """`run_episodes`."""
+    return run_episodes
+
+
+@pytest.fixture
+def names() -> Callable[[Path], list[str]]:
+    """Return the sorted names in a directory, hidden ones too."""
+    return lambda directory: sorted(p.name for p in Path(directory).iterdir())
+
+
+@pytest.fixture
+def halfcheetah() -> Iterator[Any]:
+    """A small HalfCheetah-v5 that can be drawn."""
+    env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=48)
+    yield env
+    env.close()

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import dm_env
+import numpy as np
+import pytest
+from absl.testing import absltest
+from dm_env import specs
+from dm_env import test_utils as dm_env_test_utils
+
+import mjrec
+from mjrec import InvalidArgument, NoPictures, ResetNotAllowed, UnknownName
+
+
+class Countdown(dm_env.Environment):  # type: ignore[misc]  # dm_env is untyped
+    """Counts `length` steps down; a discount of 0 ends the task."""
+
+    def __init__(self, length: int = 3, discount: float = 0.0) -> None:
+        self.length = length
+        self.discount = discount
+        self.left: int | None = None
+        self.closed = 0
+
+    def reset(self) -> dm_env.TimeStep:
+        self.left = self.length
+        return dm_env.restart(self._observation())
+
+    def step(self, action: Any) -> dm_env.TimeStep:
+        if not self.left:
+            return self.reset()
+        self.left -= 1
+        if self.left:
+            return dm_env.transition(0.5, self._observation())
+        return dm_env.truncation(0.5, self._observation(), self.discount)
+
+    def observation_spec(self) -> Any:
+        return specs.Array((1,), np.float64)
+
+    def action_spec(self) -> Any:
+        return specs.BoundedArray((1,), np.float64, -1, 1)
+
+    def close(self) -> None:
+        self.closed += 1
+
+    def _observation(self) -> Any:
+        return np.array([self.left], np.float64)
+
+
+@pytest.fixture
+def cheetah() -> Iterator[Any]:
+    """dm_control's cheetah-run, four steps long."""
+    suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
+    env = suite.load("cheetah", "run", task_kwargs={"random": 0, "time_limit": 0.04})
+    yield env
+    env.close()
+
+
+def stats_of(directory: Path) -> dict[str, Any]:
+    [path] = directory.glob("openaigym.episode_batch.*")
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
+
+
+def journal_of(directory: Path) -> list[dict[str, Any]]:
+    [path] = directory.glob("openaigym.episodes.*")
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def metadata_of(directory: Path, episode: int) -> dict[str, Any]:
+    [path] = directory.glob(f"*.video{episode:06d}.meta.json")
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
+
+
+def frames_in(directory: Path, episode: int) -> list[Any]:
+    [path] = directory.glob(f"*.video{episode:06d}.mp4")
+    with av.open(str(path)) as container:
+        return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+
+
+def zeros(env: Any) -> Any:
+    return np.zeros(env.action_spec().shape)
+
+
+@pytest.fixture
+def countdown(tmp_path: Path) -> Iterator[Any]:
+    """A monitor around a `Countdown`, without videos."""
+    with mjrec.Monitor(Countdown(), tmp_path, video_callable=False) as env:
+        yield env
+
+
+class ContractTest(dm_env_test_utils.EnvironmentTestMixin, absltest.TestCase):
+    """dm_env's own conformance test of the monitor."""
+
+    def make_object_under_test(self) -> Any:
+        directory = tempfile.TemporaryDirectory()
+        self.addCleanup(directory.cleanup)
+        return mjrec.Monitor(Countdown(), directory.name, video_callable=False)
+
+
+def test_step_before_reset_begins_an_episode(countdown: Any, tmp_path: Path) -> None:
+    """It is recorded as a reset, not as a step."""
+    assert countdown.step(zeros(countdown)).first()
+    assert countdown.get_total_steps() == 0
+    assert countdown.episode_id == 1
+
+
+def test_step_after_last_begins_the_next_episode(
+    countdown: Any, tmp_path: Path
+) -> None:
+    """The lengths are those of the episodes, without the resets."""
+    for _ in range(8):
+        countdown.step(zeros(countdown))
+    assert countdown.get_episode_lengths() == [3, 3]
+    assert countdown.get_episode_rewards() == [1.5, 1.5]
+
+
+def test_reset_is_allowed_at_any_time(countdown: Any, tmp_path: Path) -> None:
+    """The unfinished episode is no part of the statistics but has a number."""
+    countdown.reset()
+    countdown.step(zeros(countdown))
+    countdown.reset()
+    for _ in range(3):
+        countdown.step(zeros(countdown))
+    assert countdown.get_episode_lengths() == [3]
+    assert journal_of(tmp_path)[0]["episode_id"] == 1
+
+
+def test_early_reset_can_be_forbidden(tmp_path: Path) -> None:
+    """For those who want gym's rule."""
+    with mjrec.Monitor(
+        Countdown(), tmp_path, video_callable=False, allow_early_reset=False
+    ) as env:
+        env.reset()
+        env.step(zeros(env))
+        with pytest.raises(ResetNotAllowed):
+            env.reset()
+
+
+def test_environment_in_mid_episode_is_reset_first(tmp_path: Path) -> None:
+    """An environment that was used before it was wrapped begins anew."""
+    inner = Countdown()
+    inner.reset()
+    inner.step(np.zeros(1))
+    with mjrec.Monitor(inner, tmp_path, video_callable=False) as env:
+        assert env.step(zeros(env)).first()
+
+
+@pytest.mark.parametrize(("discount", "terminated"), [(0.0, True), (1.0, False)])
+def test_discount_tells_termination_from_truncation(
+    tmp_path: Path, discount: float, terminated: bool
+) -> None:
+    """A last step with discount 0 ends the task; another is a limit."""
+    with mjrec.Monitor(
+        Countdown(discount=discount), tmp_path, video_callable=False
+    ) as env:
+        for _ in range(4):
+            env.step(zeros(env))
+    [line] = journal_of(tmp_path)
+    assert (line["terminated"], line["truncated"]) == (terminated, not terminated)
+
+
+def test_environment_that_cannot_be_drawn_is_an_error(tmp_path: Path) -> None:
+    """It names the way out, and nothing is left."""
+    inner = Countdown()
+    with pytest.raises(NoPictures, match="video_callable=False"):
+        mjrec.Monitor(inner, tmp_path / "new")
+    with pytest.raises(InvalidArgument, match="no physics"):
+        mjrec.Monitor(inner, tmp_path / "new", camera=0)
+    assert not (tmp_path / "new").exists()
+    assert inner.closed == 0
+
+
+def test_close_closes_the_environment_once(tmp_path: Path) -> None:
+    """After that, calls go straight to it."""
+    inner = Countdown()
+    env = mjrec.Monitor(inner, tmp_path, video_callable=False)
+    env.reset()
+    env.close()
+    env.close()
+    assert inner.closed == 1
+    assert not env.step(zeros(env)).first()
+
+
+def test_what_the_environment_has_is_there(cheetah: Any, tmp_path: Path) -> None:
+    """Physics, task and control timestep can be used through the monitor."""
+    with mjrec.Monitor(cheetah, tmp_path) as env:
+        assert env.physics is cheetah.physics
+        assert env.control_timestep() == cheetah.control_timestep()
+        with pytest.raises(AttributeError, match="no_such_thing"):
+            _ = env.no_such_thing
+
+
+def test_records_dm_control(cheetah: Any, tmp_path: Path) -> None:
+    """Five frames of a four-step episode at the control timestep's rate."""
+    with mjrec.Monitor(
+        cheetah, tmp_path, width=64, height=48, env_id="dm_control/cheetah-run"
+    ) as env:
+        for _ in range(5):
+            env.step(zeros(env))
+    frames = frames_in(tmp_path, 0)
+    assert len(frames) == 5
+    assert frames[0].shape == (48, 64, 3)
+    assert frames[0].std() > 10
+    metadata = metadata_of(tmp_path, 0)
+    assert metadata["fps"] == "100"
+    assert metadata["playback_speed"] == 1.0
+    assert metadata["truncated"] is True
+    assert metadata["env_id"] == "dm_control/cheetah-run"
+    assert metadata["gl_renderer"]
+    assert metadata["camera"] == -1
+
+
+def test_pictures_are_those_of_physics_render(cheetah: Any, tmp_path: Path) -> None:
+    """Default size and camera; the frame hash is that of the same call."""
+    with mjrec.Monitor(cheetah, tmp_path) as env:
+        env.reset()
+        expected = hashlib.sha256(env.physics.render().tobytes()).hexdigest()
+    [path] = tmp_path.glob("*.framehash")
+    assert path.read_text().splitlines()[-1].endswith(expected)
+
+
+def test_camera_by_name(cheetah: Any, tmp_path: Path) -> None:
+    """A named camera is used and named; an unknown one lists the names there are."""
+    with pytest.raises(UnknownName, match="side"):
+        mjrec.Monitor(cheetah, tmp_path / "new", camera="top")
+    assert not (tmp_path / "new").exists()
+    with mjrec.Monitor(cheetah, tmp_path, camera="side", width=32, height=32) as env:
+        env.reset()
+    assert metadata_of(tmp_path, 0)["camera"] == "side"
+
+
+def test_frame_larger_than_the_offscreen_buffer(cheetah: Any, tmp_path: Path) -> None:
+    """It is drawn by a renderer of our own; the user's model stays as it was."""
+    buffer = cheetah.physics.model.vis.global_.offwidth
+    with mjrec.Monitor(cheetah, tmp_path, width=buffer + 32, height=32) as env:
+        env.reset()
+    assert frames_in(tmp_path, 0)[0].shape == (32, buffer + 32, 3)
+    assert frames_in(tmp_path, 0)[0].std() > 10
+    assert cheetah.physics.model.vis.global_.offwidth == buffer
+    assert metadata_of(tmp_path, 0)["pictures"] == "scene"
+
+
+def test_seed_is_what_the_user_said(cheetah: Any, tmp_path: Path) -> None:
+    """dm_env's reset takes no seed, so the monitor is told."""
+    with mjrec.Monitor(cheetah, tmp_path, video_callable=False) as env:
+        env.seed = 11
+        for _ in range(5):
+            env.step(zeros(env))
+    assert journal_of(tmp_path)[0]["seed"] == 11
