@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks of the dm_control suite by their names."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import dm_env
+import numpy as np
+from dm_control import suite
+
+from ..errors import EnvironmentNotMade, InvalidArgument, MissingDependency, UnknownName
+from .dm_env_episodes import StepLimit
+from .episode_seeds import EpisodeSeeds
+from .options import EnvironmentOptions
+
+__all__ = ["begin_episode", "make_dm_control", "step"]
+
+_ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
+
+
+def make_dm_control(
+    domain: str, task: str, options: EnvironmentOptions
+) -> dm_env.Environment:
+    """Return a task of the suite.
+
+    Camera and size are not the environment's but of each picture: whoever draws it
+    gives them. Episodes end after `max_steps`, or after 1000 steps where the task has
+    no time limit.
+
+    Args:
+        domain: for example `cheetah`.
+        task: for example `run`.
+        options: `kwargs` are those of `suite.load`, `{"task_kwargs": {...},
+            "environment_kwargs": {...}, "visualize_reward": true}`. `seed` seeds what
+            a task draws when it is made, such as the springs of `lqr`, unless
+            `task_kwargs` has a `random` of its own.
+
+    Raises:
+        UnknownName: there is no such domain or task, or argument.
+        MissingDependency: this dm_control does not work with this mujoco.
+        EnvironmentNotMade: making it failed otherwise; the cause is kept.
+    """
+    _check_name(domain, task)
+    arguments = _arguments(options.kwargs)
+    arguments["task_kwargs"] = {"random": options.seed, **arguments["task_kwargs"]}
+    try:
+        environment = suite.load(domain, task, **arguments)
+    except Exception as error:
+        raise _failure(f"dm_control/{domain}-{task}", error) from error
+    return _limited(environment, options)
+
+
+def begin_episode(env: dm_env.Environment, seeds: EpisodeSeeds) -> Any:
+    """Reset the environment, or a wrapper of it, to an episode's seeds.
+
+    dm_env's `reset` takes no seed. dm_control's tasks draw all their random numbers
+    from one `RandomState`, which is seeded in place, because what else holds it must
+    see the same. A monitor is told the seed, for its metadata.
+
+    Returns:
+        The first observation.
+
+    Raises:
+        InvalidArgument: the environment has no random state.
+    """
+    _random_state(env).seed(seeds.environment)
+    if not callable(getattr(env, "seed", print)):
+        env.seed = seeds.environment
+    return env.reset().observation
+
+
+def step(env: dm_env.Environment, action: Any) -> tuple[Any, bool]:
+    """Return the next observation, and whether it is the episode's last."""
+    timestep = env.step(action)
+    return timestep.observation, timestep.last()
+
+
+def _check_name(domain: str, task: str) -> None:
+    if domain not in suite.TASKS_BY_DOMAIN:
+        raise UnknownName(
+            "dm_control domain",
+            domain,
+            suite.TASKS_BY_DOMAIN,
+            hint="An environment is named dm_control/<domain>-<task>.",
+        )
+    tasks = suite.TASKS_BY_DOMAIN[domain]
+    if task not in tasks:
+        raise UnknownName(f"task of dm_control's {domain}", task, tasks)
+
+
+def _arguments(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    for name in kwargs:
+        if name not in _ARGUMENTS:
+            raise UnknownName(
+                "argument of a dm_control environment",
+                name,
+                _ARGUMENTS,
+                hint='For example {"task_kwargs": {"time_limit": 5}}.',
+            )
+    # suite.load takes None for both, and so may the person who asks.
+    return {**kwargs, "task_kwargs": kwargs.get("task_kwargs") or {}}
+
+
+def _failure(name: str, error: Exception) -> Exception:
+    # dm_control 1.0.50 reads fields of MuJoCo's structures that mujoco 4 lacks.
+    if re.search(r"Mj(Model|Data)\b.* has no attribute", str(error)):
+        dm_control, mujoco = map(importlib.metadata.version, ("dm-control", "mujoco"))
+        return MissingDependency(
+            "a mujoco that it knows (below version 4)",
+            purpose=f"{name}: dm_control {dm_control} does not work with mujoco "
+            f"{mujoco} ({error}) and",
+            install='pip install "mujoco<4"',
+        )
+    return EnvironmentNotMade(name, f"{type(error).__name__}: {error}")
+
+
+def _limited(
+    environment: dm_env.Environment, options: EnvironmentOptions
+) -> dm_env.Environment:
+    # Nothing public tells the limit that time_limit and control_timestep make.
+    own = getattr(environment, "_step_limit", math.inf)
+    limit = options.limit(own)
+    return environment if limit >= own else StepLimit(environment, limit)
+
+
+def _random_state(env: dm_env.Environment) -> np.random.RandomState:
+    """Return what the suite's tasks, and composer's environments, draw from."""
+    for holder, name in ((getattr(env, "task", None), "random"), (env, "random_state")):
+        state = getattr(holder, name, None)
+        if isinstance(state, np.random.RandomState):
+            return state
+    raise InvalidArgument(
+        f"{type(env).__name__} cannot be seeded: it has neither task.random nor "
+        "random_state, as dm_control's environments have."
+    )

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a name to an environment of whichever framework the name means."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..errors import MissingDependency
+from .episode_seeds import EpisodeSeeds
+from .names import (
+    DmControlName,
+    EnvironmentName,
+    GymnasiumName,
+    MjcfName,
+    parse_environment_name,
+)
+from .options import EnvironmentOptions
+
+__all__ = ["NamedEnvironment", "environment_from_name"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedEnvironment:
+    """An environment, and how its episodes are run whatever its framework.
+
+    Attributes:
+        environment: a `gymnasium.Env` or a `dm_env.Environment`.
+        env_id: its name in recordings.
+        begin_episode: resets the environment, or a wrapper of it such as a monitor, to
+            an episode's seeds and returns the first observation.
+        step: takes the same and an action, and returns the next observation and
+            whether it is the episode's last.
+        view: `camera`, `height` and `width` as far as the monitor is to be given
+            them; empty where the environment itself shows what was asked for.
+    """
+
+    environment: Any
+    env_id: str
+    begin_episode: Callable[[Any, EpisodeSeeds], Any]
+    step: Callable[[Any, Any], tuple[Any, bool]]
+    view: dict[str, Any] = field(default_factory=dict)
+
+
+def environment_from_name(
+    name: str | EnvironmentName, options: EnvironmentOptions | None = None
+) -> NamedEnvironment:
+    """Return the environment that `name` means.
+
+    Frameworks are loaded only when one of their environments is asked for: choose the
+    GL backend before.
+
+    Args:
+        name: see `parse_environment_name`.
+        options: how it is made; the defaults, if None.
+
+    Raises:
+        UnknownName, InvalidArgument: the name, or an option, means nothing.
+        NoPictures: there is nothing to record of it.
+        MissingDependency: the framework is not installed, or something else is not.
+        EnvironmentNotMade, UnreadableFile: making it failed; the cause is kept.
+    """
+    if isinstance(name, str):
+        name = parse_environment_name(name)
+    options = options or EnvironmentOptions()
+    match name:
+        case GymnasiumName(env_id):
+            return _gymnasium(env_id, options)
+        case DmControlName():
+            return _dm_control(name, options)
+        case MjcfName():
+            return _mjcf(name, options)
+
+
+def _gymnasium(env_id: str, options: EnvironmentOptions) -> NamedEnvironment:
+    module = _module("gymnasium_environments")
+    environment = module.make_gymnasium(env_id, options)
+    return NamedEnvironment(
+        environment=environment,
+        env_id=environment.spec.id,
+        begin_episode=module.begin_episode,
+        step=module.step,
+    )
+
+
+def _mjcf(name: MjcfName, options: EnvironmentOptions) -> NamedEnvironment:
+    environment = _module("mjcf_environments").make_mjcf(name.path, options)
+    module = _module("gymnasium_environments")
+    return NamedEnvironment(
+        environment=environment,
+        env_id=environment.spec.id,
+        begin_episode=module.begin_episode,
+        step=module.step,
+    )
+
+
+def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnvironment:
+    try:
+        module = _module("dm_control_environments")
+    except ModuleNotFoundError as error:
+        if error.name not in ("dm_control", "dm_env"):
+            raise
+        raise MissingDependency(
+            "dm_control", purpose=str(name), install='pip install "mjrec[dm-control]"'
+        ) from error
+    environment = module.make_dm_control(name.domain, name.task, options)
+    return NamedEnvironment(
+        environment=environment,
+        env_id=str(name),
+        begin_episode=module.begin_episode,
+        step=module.step,
+        view=_dm_control_view(environment, options),
+    )
+
+
+def _dm_control_view(environment: Any, options: EnvironmentOptions) -> dict[str, Any]:
+    if not options.pictures:
+        return {}
+    model = environment.physics.model
+    if options.camera is None:
+        camera = _module("default_camera").default_camera(model)
+    else:
+        camera = options.camera
+        cameras = importlib.import_module("..simulation.cameras", __package__)
+        cameras.resolve_camera(model, camera)
+    return {"camera": camera, **options.size}
+
+
+def _module(name: str) -> Any:
+    # Each of these imports a framework, and a name asks for one of them.
+    return importlib.import_module(f".{name}", __package__)

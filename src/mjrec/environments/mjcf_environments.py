@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An MJCF file as a Gymnasium environment."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import TimeLimit
+from numpy.typing import NDArray
+
+from ..errors import InvalidArgument, NoPictures
+from ..frames import Frame, check_size
+from ..simulation.cameras import resolve_camera
+from ..simulation.mjcf import MjcfSimulation
+from ..simulation.renderer import SceneRenderer
+from .default_camera import default_camera
+from .options import EnvironmentOptions
+
+__all__ = ["MjcfEnvironment", "make_mjcf"]
+
+_SIDE = 480
+
+
+def make_mjcf(path: Path, options: EnvironmentOptions) -> gymnasium.Env[Any, Any]:
+    """Return the environment of an MJCF file; episodes end after `max_steps`.
+
+    Args:
+        path: of the file.
+        options: `kwargs` must be empty: all there is to say stands in the file.
+
+    Raises:
+        UnreadableFile: MuJoCo refuses the file.
+        UnknownName: the model has no such camera.
+        InvalidArgument: a camera number or argument that cannot be.
+    """
+    if options.kwargs:
+        raise InvalidArgument(
+            f"An MJCF file takes no more arguments, got {dict(options.kwargs)}: all "
+            "there is to say about the simulation stands in the file."
+        )
+    environment = MjcfEnvironment(
+        path,
+        render_mode="rgb_array" if options.pictures else None,
+        camera=options.camera,
+        **options.size,
+    )
+    return TimeLimit(environment, options.limit(None))
+
+
+class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
+    """Simulates an MJCF model, driven by its controls.
+
+    An observation is `[qpos, qvel, act]`, `(nq + nv + na,) float64`. An action is
+    `ctrl`, `(nu,) float64`, within the actuators' ranges; MuJoCo clamps what is
+    outside, and a model without actuators takes actions of shape `(0,)`. A step
+    advances the simulation to the next sixtieth of a second, see `MjcfSimulation`.
+    Every reset is the model's initial state, whatever the seed: nothing here is random.
+    Rewards are 0. An episode is terminated only where the simulation becomes unstable;
+    `info["unstable"]` then says why, and the last picture and observation are those
+    before it happened.
+
+    `metadata["render_fps"]` is the frame rate, 60 unless the timestep is longer than
+    1/60 of a second, and `control_timestep()` is one over it. The model and its data
+    are `simulation.model` and `simulation.data`: they are not attributes of the
+    environment itself, because the time between two frames, measured by the data's
+    clock, is by up to one timestep longer or shorter than a frame lasts.
+
+    Args:
+        path: of the MJCF file.
+        render_mode: `"rgb_array"`, or None for no pictures and no OpenGL.
+        camera: a name or number; None is the camera that tracks the robot, else the
+            first, else the free one.
+        height: of the pictures, in pixels.
+        width: likewise.
+
+    Raises:
+        UnreadableFile: MuJoCo refuses the file.
+        UnknownName: the model has no such camera.
+        InvalidArgument: a camera, size or render mode that cannot be.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  Gymnasium's own declaration
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        render_mode: str | None = None,
+        camera: str | int | None = None,
+        height: int = _SIDE,
+        width: int = _SIDE,
+    ) -> None:
+        self._renderer: SceneRenderer | None = None
+        if render_mode not in (None, "rgb_array"):
+            raise InvalidArgument(
+                f'render_mode must be "rgb_array" or None, got {render_mode!r}.'
+            )
+        self.render_mode = render_mode
+        self._size = check_size(height, width)
+        self.simulation = MjcfSimulation(Path(path))
+        model = self.simulation.model
+        self.camera = default_camera(model) if camera is None else camera
+        resolve_camera(model, self.camera)
+        self.metadata = {**self.metadata, "render_fps": _plain(self._frame_rate)}
+        self.spec = _spec(Path(path))
+        self.observation_space = gymnasium.spaces.Box(
+            -np.inf, np.inf, (model.nq + model.nv + model.na,), np.float64
+        )
+        low, high = self.simulation.control_ranges().T
+        self.action_space = gymnasium.spaces.Box(low, high, (model.nu,), np.float64)
+
+    def control_timestep(self) -> float:
+        """Return the seconds of simulated time that a frame lasts."""
+        return float(1 / self._frame_rate)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float64], dict[str, Any]]:
+        """Go to the model's initial state; `options` are not used."""
+        super().reset(seed=seed)
+        self.simulation.reset()
+        return self.simulation.state(), {}
+
+    def step(
+        self, action: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
+        """Simulate one frame.
+
+        Raises:
+            InvalidArgument: the action has another shape, or is not finite.
+        """
+        trouble = self.simulation.advance(self._checked(action))
+        info = {} if trouble is None else {"unstable": trouble}
+        return self.simulation.state(), 0.0, trouble is not None, False, info
+
+    def render(self) -> Frame:
+        """Return the picture of this moment, `(height, width, 3) uint8`.
+
+        Raises:
+            NoPictures: the render mode is None.
+            GLError: no OpenGL backend works here.
+        """
+        if self.render_mode is None:
+            raise NoPictures(
+                'Make the environment with render_mode="rgb_array" to render it.'
+            )
+        if self._renderer is None:
+            height, width = self._size
+            self._renderer = SceneRenderer(
+                self.simulation.model, height=height, width=width, camera=self.camera
+            )
+        return self._renderer.render(self.simulation.data)
+
+    def close(self) -> None:
+        """Close the renderer; idempotent."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    @property
+    def _frame_rate(self) -> Fraction:
+        return self.simulation.frame_rate
+
+    def _checked(self, action: Any) -> NDArray[np.float64]:
+        ctrl = np.asarray(action, dtype=np.float64)
+        shape = self.action_space.shape
+        if ctrl.shape != shape or not np.isfinite(ctrl).all():
+            raise InvalidArgument(
+                f"An action must be {shape} finite numbers, got {action!r}."
+            )
+        return ctrl
+
+
+def _plain(rate: Fraction) -> int | float:
+    return rate.numerator if rate.denominator == 1 else float(rate)
+
+
+def _spec(path: Path) -> EnvSpec:
+    """Return what names the environment in recordings: `mjcf/<file name>`.
+
+    It is not registered: nobody makes an environment from a name in a recording.
+    """
+    # What Gymnasium's syntax of ids lacks.
+    name = re.sub(r"[^\w.-]", "_", path.stem)
+    return EnvSpec(
+        id=f"mjcf/{name}",
+        entry_point=f"{__name__}:{MjcfEnvironment.__name__}",
+        kwargs={"path": str(path)},
+    )

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A model from an MJCF file, simulated from frame to frame."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import UnreadableFile
+from ..rates import MAX_DENOMINATOR
+
+__all__ = ["FRAME_RATE", "MjcfSimulation", "load_mjcf"]
+
+FRAME_RATE = Fraction(60)
+
+_INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_BAD_STATES = {
+    int(mujoco.mjtWarning.mjWARN_BADQPOS): "position",
+    int(mujoco.mjtWarning.mjWARN_BADQVEL): "velocity",
+    int(mujoco.mjtWarning.mjWARN_BADQACC): "acceleration",
+}
+
+
+def load_mjcf(path: Path) -> mujoco.MjModel:
+    """Return the compiled model of an MJCF file.
+
+    Raises:
+        UnreadableFile: it is not there, or MuJoCo refuses it, with MuJoCo's reason.
+    """
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        reason = " ".join(str(error).split())
+        raise UnreadableFile(path, reason.rstrip(".")) from error
+
+
+class MjcfSimulation:
+    """Simulates a model by whole physics steps, 60 frames to the simulated second.
+
+    After frame k the simulation is where whole steps bring it nearest to k/60 seconds:
+    with a timestep of 0.01 the frames are 2, 1, 2, 2, 1, 2 ... steps apart, never more
+    than half a step off, and no error adds up. Where the timestep is longer than 1/60
+    of a second, each frame is one step and the rate is one over the timestep.
+
+    Args:
+        path: of the MJCF file.
+
+    Attributes:
+        model: the `mujoco.MjModel`.
+        data: its `mujoco.MjData`.
+        frame_rate: frames in a simulated second.
+
+    Raises:
+        UnreadableFile: MuJoCo refuses the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.model = load_mjcf(path)
+        self.data = mujoco.MjData(self.model)
+        self._timestep = _exact_timestep(self.model)
+        self.frame_rate = min(FRAME_RATE, 1 / self._timestep)
+        self._before = np.empty(mujoco.mj_stateSize(self.model, _INTEGRATION))
+        self.reset()
+
+    def reset(self) -> None:
+        """Go to the model's initial state: `mj_resetData`, no keyframe."""
+        self._frames = 0
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
+
+    def advance(self, ctrl: NDArray[np.float64]) -> str | None:
+        """Simulate until the next frame.
+
+        Where the simulation becomes unstable MuJoCo starts it anew in the middle of a
+        step. That is undone: the simulation stays at the last frame that was sound.
+
+        Args:
+            ctrl: the control of the actuators, `(nu,) float64`; MuJoCo clamps it into
+                the actuators' ranges.
+
+        Returns:
+            What went wrong; None if nothing did.
+        """
+        mujoco.mj_getState(self.model, self.data, self._before, _INTEGRATION)
+        self.data.ctrl[:] = ctrl
+        mujoco.mj_step(self.model, self.data, nstep=self._steps_to_next_frame())
+        self._frames += 1
+        trouble = self._trouble()
+        if trouble is not None:
+            mujoco.mj_setState(self.model, self.data, self._before, _INTEGRATION)
+            mujoco.mj_forward(self.model, self.data)
+        return trouble
+
+    def state(self) -> NDArray[np.float64]:
+        """Return positions, velocities and activations, `(nq + nv + na,) float64`."""
+        return np.concatenate([self.data.qpos, self.data.qvel, self.data.act])
+
+    def control_ranges(self) -> NDArray[np.float64]:
+        """Return the lowest and highest control of each actuator, `(nu, 2) float64`.
+
+        An actuator without limits has infinite ones.
+        """
+        limited = self.model.actuator_ctrllimited.astype(bool)[:, np.newaxis]
+        endless = np.array([-np.inf, np.inf])
+        return np.where(limited, self.model.actuator_ctrlrange, endless)
+
+    def _steps_to_next_frame(self) -> int:
+        return self._steps_until(self._frames + 1) - self._steps_until(self._frames)
+
+    def _steps_until(self, frame: int) -> int:
+        return math.floor(frame / (self.frame_rate * self._timestep) + Fraction(1, 2))
+
+    def _trouble(self) -> str | None:
+        # Starting anew clears older counts, so one of these is set after any bad step.
+        for warning, quantity in _BAD_STATES.items():
+            if self.data.warning[warning].number:
+                index = self.data.warning[warning].lastinfo
+                return (
+                    "the simulation became unstable: a NaN, infinite or huge "
+                    f"{quantity} at index {index}"
+                )
+        return None
+
+
+def _exact_timestep(model: mujoco.MjModel) -> Fraction:
+    """Return the timestep that the author wrote: 0.0166667 means 1/60."""
+    exact = Fraction(model.opt.timestep)
+    return exact.limit_denominator(MAX_DENOMINATOR) or exact
