@@ -319,12 +319,15 @@ def _glfw_without_display(failure: _Failure) -> Diagnosis | None:
         return None
     display = failure.environ.get("DISPLAY", "")
     state = f"cannot open {display}" if display else "DISPLAY is not set"
+    chosen = (
+        ""
+        if failure.environ.get("MUJOCO_GL")
+        else " Without MUJOCO_GL, mujoco, Gymnasium and dm_control choose GLFW."
+    )
     return Diagnosis(
-        f"GLFW needs a display, and there is none ({state}). Without MUJOCO_GL, "
-        "mujoco, Gymnasium and dm_control all choose GLFW.",
-        "Set MUJOCO_GL=egl before anything imports mujoco, or bring a virtual "
-        "display:"
-        f"{_commands('xvfb-run -a <your command>')}",
+        f"GLFW needs a display, and there is none ({state}).{chosen}",
+        "Set MUJOCO_GL to egl or osmesa before anything imports mujoco, or bring a "
+        f"virtual display:{_commands('xvfb-run -a <your command>')}",
     )
 
 
@@ -393,7 +396,7 @@ def _window_buffer(failure: _Failure) -> Diagnosis | None:
 
 
 def _no_access(failure: _Failure) -> Diagnosis | None:
-    found = failure.search(r"(/dev/(?:dri|nvidia)\S*?)[:'\"]? ?.*Permission denied")
+    found = failure.search(r"(/dev/(?:dri|nvidia)[\w/]*).*Permission denied")
     if not found:
         return None
     return Diagnosis(
@@ -422,6 +425,17 @@ def _hang(failure: _Failure) -> Diagnosis | None:
         "The driver hangs: no picture came in time.",
         "Try another backend or device. With several processes on one GPU, start "
         "fewer; never fork a process that has drawn.",
+    )
+
+
+def _crash(failure: _Failure) -> Diagnosis | None:
+    found = failure.search(r"^The driver crashed \((\w+)\)")
+    if not found:
+        return None
+    return Diagnosis(
+        f"The driver crashed ({found[1]}).",
+        "Update the driver, or use another backend. Where it crashed:"
+        f"{_commands('mjrec doctor --json')}",
     )
 
 
@@ -479,5 +493,6 @@ _KNOWN: tuple[Callable[[_Failure], Diagnosis | None], ...] = (
     _no_access,
     _wrong_picture,
     _hang,
+    _crash,
     _noise_at_exit,
 )

@@ -91,16 +91,20 @@ class Probe:
         if not files:
             return ""
         what = self.gl_renderer or self.backend
-        if self.backend == "osmesa":
-            advice = "OSMesa always does; EGL can use the GPU."
-        else:
-            advice = (
-                "The GPU's EGL driver is missing: in a container, start it with "
-                "NVIDIA_DRIVER_CAPABILITIES=all (NVIDIA) or --device /dev/dri."
-            )
         return (
             f"{self.backend} draws on the CPU ({what}) though there is a GPU "
-            f"({', '.join(files)}). {advice}"
+            f"({', '.join(files)}). {self._way_to_the_gpu(files)}"
+        )
+
+    def _way_to_the_gpu(self, files: list[str]) -> str:
+        closed = [file for file in files if not os.access(file, os.R_OK | os.W_OK)]
+        if self.backend == "osmesa":
+            return "OSMesa always does; EGL can use the GPU."
+        if closed:
+            return f"This user may not open {closed[0]}: add it to the group of that."
+        return (
+            "EGL finds no driver for it, or MUJOCO_EGL_DEVICE_ID names another device. "
+            "A container with an NVIDIA GPU needs NVIDIA_DRIVER_CAPABILITIES=all."
         )
 
 

@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a recording needs from a machine, and whether it is there."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from .errors import EncoderError, Error, MissingDependency
+from .formats.ffmpeg import ffmpeg_executable, ffmpeg_version, run_ffmpeg
+from .gl import BACKENDS, Diagnosis, Probe, choose, diagnose, probe
+from .gl.backends import environment_for, platforms_contradict
+from .machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
+
+__all__ = [
+    "Cpus",
+    "Ffmpeg",
+    "MachineReport",
+    "Package",
+    "examine_machine",
+]
+
+# A distribution, the module by which it is tried, and what to run if it is missing.
+_PACKAGES = (
+    ("mjrec", "", ""),
+    ("mujoco", "mujoco", "python -m pip install mujoco"),
+    (
+        "gymnasium",
+        "gymnasium.envs.mujoco.mujoco_env",
+        "python -m pip install gymnasium",
+    ),
+    ("dm_control", "dm_control.suite", 'python -m pip install "mjrec[dm-control]"'),
+    ("numpy", "", ""),
+)
+_IMPORT_TIMEOUT = 120
+_SIDE = 64
+
+
+@dataclass(frozen=True)
+class Package:
+    """A Python package.
+
+    Attributes:
+        name: its name.
+        version: None where it is not installed.
+        works: whether it can be imported; None where that was not tried.
+        cause: why it does not work.
+        fix: what to do about it, or how to install it.
+    """
+
+    name: str
+    version: str | None
+    works: bool | None = None
+    cause: str = ""
+    fix: str = ""
+
+
+@dataclass(frozen=True)
+class Ffmpeg:
+    """The ffmpeg that videos are written with.
+
+    Attributes:
+        path: where it is; None where there is none.
+        version: its first line about itself.
+        encodes: whether it made H.264 out of a picture just now.
+        cause: why it did not.
+        fix: what to do about it.
+    """
+
+    path: str | None
+    version: str = ""
+    encodes: bool = False
+    cause: str = ""
+    fix: str = ""
+
+
+@dataclass(frozen=True)
+class Cpus:
+    """The CPUs.
+
+    Attributes:
+        usable: how many this process can keep busy.
+        present: how many the machine has.
+        allowed: how many the process may run on (its affinity).
+        quota: how many the cgroup grants; None where nothing limits them.
+    """
+
+    usable: int
+    present: int | None
+    allowed: int
+    quota: float | None
+
+
+@dataclass(frozen=True)
+class MachineReport:
+    """What `mjrec doctor` shows.
+
+    Attributes:
+        can_render: whether a recording that starts now gets pictures.
+        backend: the backend that `use_gl` would choose; None where it would raise.
+        reason: where that choice comes from, or the error.
+        backends: each backend, tried.
+        problems: what is wrong with the environment variables or odd about the
+            choice, though mjrec may get along with it.
+        gpu_device_files: the GPUs that the kernel shows.
+        ffmpeg: the encoder.
+        packages: what is installed.
+        cpus: the CPUs.
+        python: the interpreter's version.
+        platform: the operating system and the processor.
+    """
+
+    can_render: bool
+    backend: str | None
+    reason: str
+    backends: tuple[Probe, ...]
+    problems: tuple[Diagnosis, ...]
+    gpu_device_files: tuple[str, ...]
+    ffmpeg: Ffmpeg
+    packages: tuple[Package, ...]
+    cpus: Cpus
+    python: str
+    platform: str
+
+
+def examine_machine() -> MachineReport:
+    """Try everything that a recording needs, which takes some seconds.
+
+    Nothing is imported or changed in this process.
+    """
+    probes = {backend: probe(backend, measure=True) for backend in BACKENDS}
+    chosen, reason = _choice()
+    return MachineReport(
+        can_render=chosen is not None,
+        backend=chosen,
+        reason=reason,
+        backends=tuple(probes.values()),
+        problems=tuple(_problems(chosen, probes)),
+        gpu_device_files=tuple(gpu_device_files()),
+        ffmpeg=_examine_ffmpeg(),
+        packages=tuple(_examine_package(*package) for package in _PACKAGES),
+        cpus=_examine_cpus(),
+        python=platform.python_version(),
+        platform=platform.platform(),
+    )
+
+
+def _choice() -> tuple[str | None, str]:
+    try:
+        choice = choose()
+    except Error as error:
+        return None, str(error)
+    return choice.backend, choice.reason
+
+
+def _problems(chosen: str | None, probes: dict[str, Probe]) -> Iterator[Diagnosis]:
+    if chosen is None:
+        yield from _better_choice(probes)
+        return
+    yield from _spelling(chosen)
+    if not os.environ.get("MUJOCO_GL") and not probes["glfw"].renders:
+        yield Diagnosis(
+            "MUJOCO_GL is not set. mjrec gets along without; other programs choose "
+            "GLFW then, which does not render here.",
+            f"For other programs:\n  export MUJOCO_GL={chosen}",
+        )
+    if probes[chosen].warning():
+        yield Diagnosis(probes[chosen].warning(), "")
+
+
+def _better_choice(probes: dict[str, Probe]) -> Iterator[Diagnosis]:
+    """Yield a way out where a backend renders and MUJOCO_GL forbids it."""
+    rendering = [name for name, tried in probes.items() if tried.renders]
+    if rendering:
+        yield Diagnosis(
+            f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} keeps mjrec from using "
+            f"{rendering[0]}, which renders here.",
+            f"Name that one:\n  export MUJOCO_GL={rendering[0]}",
+        )
+
+
+def _spelling(chosen: str) -> Iterator[Diagnosis]:
+    """Yield what mjrec puts right for itself and other programs do not."""
+    named = os.environ.get("MUJOCO_GL", "")
+    if platforms_contradict(os.environ, chosen):
+        yield Diagnosis(
+            f"PYOPENGL_PLATFORM={os.environ['PYOPENGL_PLATFORM']} contradicts "
+            f"{chosen}. mjrec puts it right; in other programs mujoco then has no "
+            "renderer.",
+            "Take the variable away:\n  unset PYOPENGL_PLATFORM",
+        )
+    if named not in ("", chosen):
+        yield Diagnosis(
+            f"MUJOCO_GL={named} is not how Gymnasium and dm_control spell a backend. "
+            "mjrec puts it right; other programs may fail.",
+            f"Spell it so:\n  export MUJOCO_GL={chosen}",
+        )
+
+
+def _examine_cpus() -> Cpus:
+    return Cpus(
+        usable=usable_cpus(),
+        present=os.cpu_count(),
+        allowed=len(os.sched_getaffinity(0)),
+        quota=cgroup_cpu_quota(),
+    )
+
+
+def _examine_ffmpeg() -> Ffmpeg:
+    try:
+        path = ffmpeg_executable()
+    except (MissingDependency, EncoderError) as error:
+        return Ffmpeg(None, cause=str(error), fix=_OTHER_FFMPEG)
+    try:
+        version = ffmpeg_version()
+        _encode_a_frame()
+    except EncoderError as error:
+        return Ffmpeg(path, cause=_first_of(error), fix=_OTHER_FFMPEG)
+    return Ffmpeg(path, version, encodes=True)
+
+
+_OTHER_FFMPEG = (
+    "Install the one that comes with imageio-ffmpeg, or name another:\n"
+    "  python -m pip install --force-reinstall imageio-ffmpeg\n"
+    "  export IMAGEIO_FFMPEG_EXE=/path/to/ffmpeg"
+)
+
+
+def _encode_a_frame() -> None:
+    """Make a video of one grey picture.
+
+    Raises:
+        EncoderError: ffmpeg failed.
+    """
+    picture = bytes([128]) * (3 * _SIDE * _SIDE)
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{_SIDE}x{_SIDE}"]
+    coded = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-f", "h264"]
+    arguments = ["-v", "error", *raw, "-i", "pipe:0", *coded, "pipe:1"]
+    done = run_ffmpeg(arguments, standard_input=picture)
+    if not done.stdout:
+        raise EncoderError(
+            "ffmpeg made no video out of a picture.",
+            command=done.args,
+            returncode=done.returncode,
+            stderr=done.stderr.decode(errors="replace"),
+        )
+
+
+def _first_of(error: EncoderError) -> str:
+    said = error.stderr.strip().splitlines()
+    return said[-1] if said else str(error)
+
+
+def _examine_package(name: str, module: str, install: str) -> Package:
+    try:
+        version = importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return Package(name, None, fix=f"To install it:\n  {install}")
+    if not module:
+        return Package(name, version)
+    failure = _import_in_child(module)
+    if failure is None:
+        return Package(name, version, works=True)
+    known = diagnose(failure, environ=_WITHOUT_GL)
+    last = failure.strip().splitlines()[-1:] or ["It ended without a word."]
+    found = known or Diagnosis(last[0], f"Install it anew:\n  {install}")
+    return Package(name, version, works=False, cause=found.cause, fix=found.fix)
+
+
+# Whether something can be imported is another question than whether it can draw.
+_WITHOUT_GL = {"MUJOCO_GL": "off"}
+
+
+def _import_in_child(module: str) -> str | None:
+    """Return what went wrong when `module` was imported; None if nothing did."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", f"import {module}"],
+            env={**environment_for("egl", os.environ), **_WITHOUT_GL},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_IMPORT_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"The import did not end within {_IMPORT_TIMEOUT} seconds."
+    if done.returncode == 0:
+        return None
+    said = done.stderr.decode(errors="replace")
+    return said or f"The import ended with status {done.returncode}."
