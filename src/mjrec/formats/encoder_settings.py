@@ -51,9 +51,12 @@ _QUALITY = {
 # Rounding and chroma averaging as the definition says rather than as the CPU likes
 # best: without `bitexact` and `accurate_rnd`, swscale's result depends on the CPU.
 _SCALE_FLAGS = "area+accurate_rnd+full_chroma_int+full_chroma_inp+bitexact"
+# The tags are set on the frames: ffmpeg 8 and later take those of the frames over
+# `-color_primaries` and `-color_trc` given for the encoder, and write "unknown".
 _TO_BT709 = (
     f"scale=out_color_matrix=bt709:out_range=limited:flags={_SCALE_FLAGS},"
-    "format=yuv420p"
+    "format=yuv420p,setparams=range=limited:color_primaries=bt709:color_trc=bt709:"
+    "colorspace=bt709"
 )
 _BT709_TAGS = (
     *("-color_primaries", "bt709"),

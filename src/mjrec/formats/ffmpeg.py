@@ -27,6 +27,7 @@ from ..frames import Frame
 
 __all__ = [
     "FfmpegProcess",
+    "every_frame_arguments",
     "ffmpeg_executable",
     "ffmpeg_sha256",
     "ffmpeg_version",
@@ -88,6 +89,15 @@ def ffmpeg_sha256() -> str:
 def video_encoders() -> list[str]:
     """Return the names of the video encoders that this ffmpeg has."""
     return list(_video_encoders(*_identity(ffmpeg_executable())))
+
+
+def every_frame_arguments() -> tuple[str, ...]:
+    """Return the output arguments for each decoded frame, none dropped or repeated.
+
+    Left alone, ffmpeg makes the rate of raw output even, and so hides what a file
+    lacks or doubles.
+    """
+    return _every_frame_arguments(*_identity(ffmpeg_executable()))
 
 
 def run_ffmpeg(
@@ -302,6 +312,16 @@ def _video_encoders(executable: str, size: int, modified: int) -> tuple[str, ...
     listing = _text(run_ffmpeg(["-hide_banner", "-encoders"]).stdout)
     _, _, table = listing.partition("------\n")
     return tuple(re.findall(r"^ *V\S* +(\S+)", table, re.MULTILINE))
+
+
+@functools.lru_cache
+def _every_frame_arguments(
+    executable: str, size: int, modified: int
+) -> tuple[str, ...]:
+    # 5.1 brought the first, 9 took the second away.
+    options = _text(run_ffmpeg(["-hide_banner", "-h", "long"]).stdout)
+    name = "-fps_mode" if "-fps_mode" in options else "-vsync"
+    return name, "passthrough"
 
 
 def _not_started(command: Sequence[str], error: OSError) -> EncoderError:

@@ -12,6 +12,7 @@ import hashlib
 import inspect
 import itertools
 import os
+import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -42,6 +43,7 @@ from .encoder_settings import (
 )
 from .ffmpeg import (
     FfmpegProcess,
+    every_frame_arguments,
     ffmpeg_executable,
     ffmpeg_sha256,
     ffmpeg_version,
@@ -385,7 +387,6 @@ class _Encoding:
             self.temporary,
             pixel_format=self._settings.decoded_format,
             size=self._padded,
-            fps=self._fps,
         )
         if frame_count != self._encoded:
             raise FrameCountError(
@@ -435,24 +436,23 @@ def _check_path(path: str | os.PathLike[str]) -> Path:
     parent = checked.absolute().parent
     if not parent.is_dir():
         raise DirectoryNotWritable(parent, "it does not exist")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise DirectoryNotWritable(parent, "permission denied")
+    try:
+        # The permissions alone do not tell: root may all, and a disk may be read-only.
+        tempfile.TemporaryFile(dir=parent).close()
+    except OSError as error:
+        raise DirectoryNotWritable(parent, error) from error
     # Absolute, so that a change of the working directory moves nothing.
     return checked.absolute()
 
 
 def _decode(
-    video: Path, *, pixel_format: str, size: tuple[int, int], fps: Fraction
+    video: Path, *, pixel_format: str, size: tuple[int, int]
 ) -> tuple[int, str]:
     """Return how many frames a file holds and the sha256 of all of them."""
-    # New timestamps, one tick after the other: with those of the file, ffmpeg would
-    # drop or repeat frames to make the rate even, and hide what is to be found.
-    tick = f"settb={fps.denominator}/{fps.numerator},setpts=N"
     process = FfmpegProcess(
         [
             *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
-            *("-i", _as_file(video), "-map", "0:v:0", "-vf", tick),
-            *("-r", f"{fps.numerator}/{fps.denominator}"),
+            *("-i", _as_file(video), "-map", "0:v:0", *every_frame_arguments()),
             *("-f", "rawvideo", "-pix_fmt", pixel_format, "pipe:1"),
         ],
         what=f"The finished video {video} cannot be decoded.",
