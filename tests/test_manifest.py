@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The manifest is gym's with one key more, and cannot point outside its directory."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mjrec.errors import UnreadableFile
+from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
+
+MANIFEST = Manifest(
+    stats="s.stats.json",
+    videos=(("a.mp4", "a.meta.json"), ("b.mp4", "b.meta.json")),
+    env_info={"gym_version": "mjrec-1", "env_id": "Hopper-v5"},
+    mjrec={"format": 1, "pending": []},
+)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "openaigym.manifest.0.1.manifest.json"
+
+
+def test_it_comes_back_as_it_was(path: Path) -> None:
+    """What is read is what was written."""
+    write_manifest(path, MANIFEST)
+    assert read_manifest(path) == MANIFEST
+
+
+def test_keys_are_in_gyms_order_with_ours_last(path: Path) -> None:
+    """A person finds what gym wrote where gym wrote it."""
+    write_manifest(path, MANIFEST)
+    assert list(json.loads(path.read_text())) == [
+        "stats",
+        "videos",
+        "env_info",
+        "mjrec",
+    ]
+
+
+def test_without_our_key_the_text_is_gyms(path: Path) -> None:
+    """Nothing stands for a missing key."""
+    write_manifest(path, Manifest("s", (("a", "b"),), {"gym_version": "0.21.0"}, None))
+    assert path.read_text() == (
+        '{"stats": "s", "videos": [["a", "b"]], "env_info": {"gym_version": "0.21.0"}}'
+    )
+    assert read_manifest(path).mjrec is None
+
+
+def test_keys_of_later_versions_are_ignored(path: Path) -> None:
+    """Gym 0.1.2 to 0.4.10 wrote `seeds`."""
+    content = {"stats": "s", "videos": [], "env_info": {}, "seeds": [1]}
+    path.write_text(json.dumps(content))
+    assert read_manifest(path) == Manifest("s", (), {}, None)
+
+
+BAD_NAMES = ["../s", "a/b", "/etc/passwd", "..", ".", "", "a\\b", "a\0b"]
+
+
+@pytest.mark.parametrize("name", BAD_NAMES)
+def test_a_name_outside_the_directory_is_refused(path: Path, name: str) -> None:
+    """As statistics, video or metadata, when reading and when writing."""
+    for manifest in (
+        {"stats": name, "videos": []},
+        {"stats": "s", "videos": [[name, "m"]]},
+        {"stats": "s", "videos": [["v", name]]},
+    ):
+        path.write_text(json.dumps({**manifest, "env_info": {}}))
+        with pytest.raises(UnreadableFile, match="not the name of a file"):
+            read_manifest(path)
+    path.unlink()
+    with pytest.raises(ValueError, match="not the name of a file"):
+        write_manifest(path, Manifest(name, (), {}, None))
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ('{"stats": "s", "videos": []', "not whole JSON"),
+        ("null", "an object belongs there, not null"),
+        ('{"videos": [], "env_info": {}}', "it has no 'stats'"),
+        ('{"stats": "s", "env_info": {}}', "it has no 'videos'"),
+        ('{"stats": "s", "videos": []}', "it has no 'env_info'"),
+        ('{"stats": 1, "videos": [], "env_info": {}}', "a text belongs there"),
+        ('{"stats": "s", "videos": ["ab"], "env_info": {}}', "a list belongs there"),
+        ('{"stats": "s", "videos": [["a"]], "env_info": {}}', "not 1 names"),
+        ('{"stats": "s", "videos": [], "env_info": []}', "an object belongs there"),
+        ('{"stats": "s", "videos": [], "env_info": {}, "mjrec": 1}', "'mjrec'"),
+    ],
+)
+def test_a_damaged_file_is_named_with_the_reason(
+    path: Path, content: str, reason: str
+) -> None:
+    """Each kind of damage is one clear error."""
+    path.write_text(content)
+    with pytest.raises(UnreadableFile, match=reason) as caught:
+        read_manifest(path)
+    assert caught.value.path == path
