@@ -534,18 +534,24 @@ def save_video(
         episode_trigger = capped_cubic_video_schedule
     folder = _make_directory(Path(video_folder))
     if step_trigger is not None:
-        frames = list(frames)
+        frames = held = _hold(frames)
     if episode_trigger is not None and episode_trigger(episode_index):
         path = folder / f"{name_prefix}-episode-{episode_index}.mp4"
         _write_video(itertools.islice(frames, video_length), path, kwargs)
     if step_trigger is not None:
-        held = list(frames)
         # The first frame is the reset's.
         for step, first in enumerate(range(1, len(held)), start=step_starting_index):
             if step_trigger(step):
                 last = None if video_length is None else first + video_length
                 path = folder / f"{name_prefix}-step-{step}.mp4"
                 _write_video(held[first:last], path, kwargs)
+
+
+def _hold(frames: Iterable[Frame]) -> Sequence[Frame]:
+    if isinstance(frames, Sequence | np.ndarray):
+        return list(frames)
+    # Copies: a generator may fill the same array again and again.
+    return [np.array(frame) for frame in frames]
 
 
 def _write_video(frames: Iterable[Frame], path: Path, options: dict[str, Any]) -> None:
