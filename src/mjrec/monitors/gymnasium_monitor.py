@@ -67,8 +67,9 @@ class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
             self, functools.partial(_close, self._recorder, pictures, env)
         )
 
+    # Gymnasium's own wrappers override the attribute by a property too.
     @property
-    def spec(self) -> EnvSpec | None:
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
         """The environment's own: one made from it again is not monitored."""
         return self.env.spec
 

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: a module for each command, each over one library call."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Sequence
+
+import tyro
+
+from ..errors import Error
+from .doctor import doctor
+from .list_episodes import list_episodes
+from .record import record
+
+__all__ = ["main"]
+
+_COMMANDS: dict[str, Callable[..., int]] = {
+    "record": record,
+    "list": list_episodes,
+    "doctor": doctor,
+}
+
+_FAILED = 1
+_INTERRUPTED = 130  # what shells say of a process that Ctrl-C ended
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit status.
+
+    0 is success, 1 an error with one message on stderr, 2 (as `SystemExit`) a command
+    line that cannot be understood, 130 an interruption. An error that is not one of
+    ours keeps its traceback.
+
+    Args:
+        argv: the arguments; those of the process, if None.
+    """
+    # Only what mjrec says: MuJoCo's remarks on other people's models are not news here.
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    logging.getLogger("mjrec").addHandler(handler)
+    logging.getLogger("absl").setLevel(logging.ERROR)
+    try:
+        status: int = tyro.extras.subcommand_cli_from_dict(
+            _COMMANDS,
+            prog="mjrec",
+            description="A headless MuJoCo recorder.",
+            args=argv,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    except Error as error:
+        # The one place where an error becomes text and a number.
+        print(f"mjrec: {error}", file=sys.stderr)  # noqa: T201
+        return _FAILED
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    return status

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec list`: the recorded episodes of a directory."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import rich.box
+import rich.console
+import rich.markup
+import rich.table
+import tyro
+
+from .. import json_text
+from ..results import Episode, iter_episodes
+
+__all__ = ["episode_table", "list_episodes"]
+
+
+def list_episodes(
+    directory: tyro.conf.Positional[Path],
+    /,
+    *,
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """List the recorded episodes of a monitor directory.
+
+    Args:
+        directory: the monitor directory.
+        as_json: print one JSON object a line and episode, instead of a table.
+    """
+    episodes = iter_episodes(directory)
+    if as_json:
+        for episode in episodes:
+            sys.stdout.write(json_text.dumps(_fields(episode)) + "\n")
+        return 0
+    rich.console.Console().print(episode_table(episodes))
+    return 0
+
+
+def episode_table(episodes: Iterator[Episode]) -> rich.table.Table:
+    """Return a table with a row for each episode."""
+    table = rich.table.Table(box=rich.box.SIMPLE_HEAD)
+    for name in ("episode", "steps", "return"):
+        table.add_column(name, justify="right")
+    for name in ("ended", "video"):
+        table.add_column(name, overflow="fold")
+    for episode in episodes:
+        table.add_row(
+            str(episode.episode_id),
+            str(episode.length),
+            f"{episode.reward:.6g}",
+            _end(episode),
+            "" if episode.video is None else rich.markup.escape(episode.video.name),
+        )
+    return table
+
+
+def _end(episode: Episode) -> str:
+    if episode.terminated is None:
+        return ""
+    return "terminated" if episode.terminated else "truncated"
+
+
+def _fields(episode: Episode) -> dict[str, object]:
+    fields = {f.name: getattr(episode, f.name) for f in dataclasses.fields(episode)}
+    return {
+        name: value.name if isinstance(value, Path) else value
+        for name, value in fields.items()
+    }

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec record`: episodes of an environment into a monitor directory."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import secrets
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import rich.console
+import tyro
+
+from .. import json_text
+from ..errors import InvalidArgument
+from ..frames import check_size
+from ..sessions import Session, SessionEpisode, record_session
+from .progress import EpisodeProgress
+
+__all__ = ["record"]
+
+_INTERRUPTED = 130
+
+
+def record(
+    env: tyro.conf.Positional[str],
+    /,
+    *,
+    out: Path,
+    episodes: int = 1,
+    max_steps: int | None = None,
+    policy: str = "random",
+    seed: int | None = None,
+    schedule: str = "cubic",
+    force: bool = False,
+    resume: bool = False,
+    camera: str | None = None,
+    size: str | None = None,
+    fps: float | None = None,
+    env_kwargs: str = "{}",
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """Record episodes of an environment.
+
+    Args:
+        env: a Gymnasium id (HalfCheetah-v5), dm_control/<domain>-<task>
+            (dm_control/humanoid-run) or the path of an MJCF file.
+        out: the monitor directory.
+        episodes: how many to record.
+        max_steps: ends an episode as truncated; 1000 where the environment itself has
+            no limit.
+        policy: random, zero, or module:name. A class is built with the environment, a
+            function is the policy, module:name() is called with the environment and
+            returns the policy.
+        seed: S; episode i starts from NumPy's SeedSequence([S, i]). A fresh one, which
+            is printed, if it is not given.
+        schedule: which episodes get a video: cubic (0, 1, 8, 27 ... and every 1000th),
+            all, none, every:N or at:0,5,9.
+        force: delete the recordings that are in the directory.
+        resume: add to the recordings that are in the directory.
+        camera: name or number; the model's tracking camera, where there is one, if it
+            is not given.
+        size: of the videos, WIDTHxHEIGHT in pixels.
+        fps: frames per second written into the videos; real time, if not given.
+        env_kwargs: more arguments for the environment, as a JSON object.
+        as_json: print one JSON object at the end, and nothing else.
+    """
+    height, width = _size(size)
+    if seed is None:
+        seed = secrets.randbits(31)
+    session = Session(
+        environment=env,
+        directory=out,
+        episodes=episodes,
+        max_steps=max_steps,
+        policy=policy,
+        seed=seed,
+        schedule=schedule,
+        force=force,
+        resume=resume,
+        camera=_camera(camera),
+        height=height,
+        width=width,
+        fps=fps,
+        env_kwargs=_kwargs(env_kwargs),
+    )
+    console = rich.console.Console(quiet=as_json)
+    recorded, interrupted = _run(session, console)
+    if as_json:
+        _print_json(session, recorded, interrupted=interrupted)
+    else:
+        _print_summary(session, console, recorded, interrupted=interrupted)
+    return _INTERRUPTED if interrupted else 0
+
+
+def _run(
+    session: Session, console: rich.console.Console
+) -> tuple[list[SessionEpisode], bool]:
+    """Return the recorded episodes, and whether Ctrl-C ended them early."""
+    recorded: list[SessionEpisode] = []
+    progress = EpisodeProgress(
+        console, title=session.environment, episodes=session.episodes
+    )
+    with (
+        progress,
+        contextlib.closing(record_session(session, on_step=progress.step)) as run,
+    ):
+        try:
+            for episode in run:
+                recorded.append(episode)
+                progress.episode(episode)
+        except KeyboardInterrupt:
+            return recorded, True
+    return recorded, False
+
+
+def _print_summary(
+    session: Session,
+    console: rich.console.Console,
+    recorded: list[SessionEpisode],
+    *,
+    interrupted: bool,
+) -> None:
+    if interrupted:
+        console.print("Interrupted. What was recorded so far is complete:")
+    videos = [episode.video.name for episode in recorded if episode.video]
+    shown = session.directory.absolute()
+    lines = [
+        f"{len(recorded)} episodes of {session.environment}, seed {session.seed}, in",
+        f"  {shown}",
+        f"{len(videos)} videos" + (":" if videos else ""),
+        *(f"  {name}" for name in videos),
+    ]
+    # Names must survive copying, so no line is folded.
+    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+
+
+def _print_json(
+    session: Session, recorded: list[SessionEpisode], *, interrupted: bool
+) -> None:
+    summary = {
+        "directory": str(session.directory.absolute()),
+        "environment": session.environment,
+        "seed": session.seed,
+        "interrupted": interrupted,
+        "episodes": [
+            {
+                "episode_id": episode.episode_id,
+                "length": episode.length,
+                "reward": episode.reward,
+                "video": episode.video.name if episode.video else None,
+            }
+            for episode in recorded
+        ],
+    }
+    sys.stdout.write(json_text.dumps(summary) + "\n")
+
+
+def _size(text: str | None) -> tuple[int | None, int | None]:
+    """Return `(height, width)` of WIDTHxHEIGHT."""
+    if text is None:
+        return None, None
+    match = re.fullmatch(r"(\d+)x(\d+)", text.strip(), re.ASCII | re.IGNORECASE)
+    if match is None:
+        raise InvalidArgument(
+            f"--size must be WIDTHxHEIGHT in pixels, such as 640x480, got {text!r}."
+        )
+    return check_size(int(match[2]), int(match[1]))
+
+
+def _kwargs(text: str) -> dict[str, Any]:
+    try:
+        kwargs = json.loads(text)
+    except ValueError as error:
+        raise InvalidArgument(
+            f"--env-kwargs must be a JSON object, got {text!r}: {error}."
+        ) from None
+    if not isinstance(kwargs, dict):
+        raise InvalidArgument(f"--env-kwargs must be a JSON object, got {text!r}.")
+    return kwargs
+
+
+def _camera(text: str | None) -> str | int | None:
+    """Return a camera's number, if `text` is a whole number, else its name."""
+    if text is not None and re.fullmatch(r"-?\d+", text, re.ASCII):
+        return int(text)
+    return text

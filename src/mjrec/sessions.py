@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording session: so many episodes of a named environment, under a policy.
+
+This is what `mjrec record` does. Episode i of a session with the seed S starts from
+`SeedSequence([S, i])` (`environments.episode_seeds` has the recipe), so any episode
+can be recorded again without those before it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .environments.episode_seeds import EpisodeSeeds, episode_seeds
+from .environments.from_name import NamedEnvironment, environment_from_name
+from .environments.names import parse_environment_name
+from .environments.options import EnvironmentOptions
+from .environments.policies import (
+    Policy,
+    load_policy,
+    working_directory_importable,
+)
+from .errors import GLError, InvalidArgument
+from .gl import use_gl
+from .monitors import Monitor
+from .rates import to_rate
+from .schedules import disable_videos, schedule_from_text
+
+if TYPE_CHECKING:
+    from .monitors.dm_env_monitor import DmEnvMonitor
+    from .monitors.gymnasium_monitor import GymnasiumMonitor
+
+__all__ = ["Session", "SessionEpisode", "record_session"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """What is to be recorded.
+
+    Attributes:
+        environment: a Gymnasium id, `dm_control/<domain>-<task>`, or the path of an
+            MJCF file.
+        directory: the monitor directory.
+        seed: of the session, a whole number from 0 to 2**32 - 1.
+        episodes: how many.
+        max_steps: ends an episode as truncated; None is the environment's own limit,
+            and 1000 where it has none.
+        policy: `random`, `zero` or `module:name`.
+        schedule: which episodes get a video: `cubic`, `all`, `none`, `every:N` or
+            `at:0,5,9`.
+        force: delete the recordings that are in the directory.
+        resume: add to the recordings that are in the directory.
+        camera: a name or number; None is the model's tracking camera where there is
+            one.
+        height: of the videos, in pixels; None is the environment's own.
+        width: likewise.
+        fps: the rate written into the videos; None is real time.
+        env_kwargs: more arguments for the environment.
+    """
+
+    environment: str
+    directory: Path
+    seed: int
+    episodes: int = 1
+    max_steps: int | None = None
+    policy: str = "random"
+    schedule: str = "cubic"
+    force: bool = False
+    resume: bool = False
+    camera: str | int | None = None
+    height: int | None = None
+    width: int | None = None
+    fps: float | None = None
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SessionEpisode:
+    """An episode that was recorded.
+
+    Attributes:
+        episode_id: its number.
+        length: number of steps.
+        reward: sum of the rewards.
+        video: its video, where the schedule chose it.
+    """
+
+    episode_id: int
+    length: int
+    reward: float
+    video: Path | None
+
+
+def record_session(
+    session: Session, *, on_step: Callable[[], None] = lambda: None
+) -> Generator[SessionEpisode, None, None]:
+    """Record a session, and yield each episode as it ends.
+
+    The recordings are closed when the iterator ends, is closed, or raises; so close
+    it, best with `contextlib.closing`.
+
+    Args:
+        session: what is to be recorded.
+        on_step: called after every step.
+
+    Raises:
+        Error: the environment, policy, schedule, camera or directory cannot be; what
+            they are is checked before anything is written.
+    """
+    _check(session)
+    schedule = schedule_from_text(session.schedule)
+    with contextlib.ExitStack() as stack:
+        named = _environment(session, pictures=schedule is not disable_videos)
+        closing = stack.enter_context(contextlib.ExitStack())
+        closing.callback(named.environment.close)
+        policy = load_policy(session.policy, named.environment)
+        monitor = Monitor(
+            named.environment,
+            session.directory,
+            schedule,
+            force=session.force,
+            resume=session.resume,
+            fps=session.fps,
+            env_id=named.env_id,
+            **named.view,
+        )
+        # From here on the monitor closes the environment.
+        closing.pop_all()
+        stack.callback(monitor.close)
+        for _ in range(session.episodes):
+            seeds = episode_seeds(session.seed, monitor.episode_id)
+            _run_episode(named, monitor, policy, seeds, on_step)
+            yield _recorded(monitor)
+
+
+def _check(session: Session) -> None:
+    """Check what can be checked before anything is imported or made."""
+    if session.episodes < 1:
+        raise InvalidArgument(
+            f"episodes must be a positive whole number, got {session.episodes}."
+        )
+    if session.fps is not None:
+        to_rate(session.fps)
+    parse_environment_name(session.environment)
+    episode_seeds(session.seed, 0)
+
+
+def _environment(session: Session, *, pictures: bool) -> NamedEnvironment:
+    no_gl = _choose_gl() if pictures else None
+    named = environment_from_name(
+        session.environment,
+        EnvironmentOptions(
+            camera=session.camera,
+            height=session.height,
+            width=session.width,
+            max_steps=session.max_steps,
+            pictures=pictures,
+            seed=session.seed,
+            kwargs=session.env_kwargs,
+        ),
+    )
+    if no_gl is not None and "mujoco" in sys.modules:
+        named.environment.close()
+        raise no_gl
+    return named
+
+
+def _choose_gl() -> GLError | None:
+    """Choose a backend; return why there is none, which may not matter.
+
+    A text environment, or one that draws by itself, needs no OpenGL, and only the
+    environment tells which it is.
+    """
+    try:
+        use_gl()
+    except GLError as error:
+        return error
+    return None
+
+
+def _run_episode(
+    named: NamedEnvironment,
+    monitor: GymnasiumMonitor | DmEnvMonitor,
+    policy: Policy,
+    seeds: EpisodeSeeds,
+    on_step: Callable[[], None],
+) -> None:
+    with working_directory_importable():
+        policy.reset(seeds)
+        observation = named.begin_episode(monitor, seeds)
+        done = False
+        while not done:
+            observation, done = named.step(monitor, policy(observation))
+            on_step()
+
+
+def _recorded(monitor: GymnasiumMonitor | DmEnvMonitor) -> SessionEpisode:
+    video = monitor.video_recorder
+    recorded = video is not None and video.functional and not video.empty
+    return SessionEpisode(
+        episode_id=monitor.episode_id - 1,
+        length=monitor.stats_recorder.episode_lengths[-1],
+        reward=monitor.stats_recorder.episode_rewards[-1],
+        video=Path(str(video.path)) if video is not None and recorded else None,
+    )
