@@ -97,9 +97,10 @@ def test_detecting_manifests_takes_exact_names_in_order(tmp_path: Path) -> None:
 
 def test_detecting_manifests_among_given_names(tmp_path: Path) -> None:
     """`files` stands for the listing of the directory."""
-    names = ["x", "openaigym.manifest.0.7.manifest.json"]
-    assert mjrec.detect_training_manifests(tmp_path, files=names) == [
-        str(tmp_path / names[1])
+    late, early = (f"openaigym.manifest.{i}.7.manifest.json" for i in (1, 0))
+    assert mjrec.detect_training_manifests(tmp_path, files=[late, "x", early]) == [
+        str(tmp_path / early),
+        str(tmp_path / late),
     ]
 
 

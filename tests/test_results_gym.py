@@ -127,7 +127,8 @@ def make_gym_environment(home: Path) -> None:
     # That setuptools wants a class which Python 3.12 took away, and never uses it.
     (packages,) = home.glob("lib/python*/site-packages")
     (packages / "old_setuptools.pth").write_text(
-        "import pkgutil; pkgutil.ImpImporter = getattr(pkgutil, 'ImpImporter', type)\n"
+        "import pkgutil; pkgutil.ImpImporter = "
+        "getattr(pkgutil, 'ImpImporter', type('ImpImporter', (), {}))\n"
     )
     numpy = "numpy<2" if sys.version_info < (3, 13) else "numpy<3"
     run(*pip, "--only-binary=numpy", "--no-build-isolation", "gym==0.21.0", numpy)
