@@ -21,6 +21,9 @@ from ..results import Episode, iter_episodes
 __all__ = ["episode_table", "list_episodes"]
 
 
+_LOG_WIDTH = 160
+
+
 def list_episodes(
     directory: tyro.conf.Positional[Path],
     /,
@@ -38,13 +41,19 @@ def list_episodes(
         for episode in episodes:
             sys.stdout.write(json_text.dumps(_fields(episode)) + "\n")
         return 0
-    rich.console.Console().print(episode_table(episodes))
+    console = rich.console.Console()
+    if not console.is_terminal:
+        # A log has no width, and a folded name cannot be copied.
+        console = rich.console.Console(width=_LOG_WIDTH)
+    console.print(episode_table(episodes))
     return 0
 
 
 def episode_table(episodes: Iterator[Episode]) -> rich.table.Table:
     """Return a table with a row for each episode."""
-    table = rich.table.Table(box=rich.box.SIMPLE_HEAD)
+    table = rich.table.Table(
+        box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+    )
     for name in ("episode", "steps", "return"):
         table.add_column(name, justify="right")
     for name in ("ended", "video"):

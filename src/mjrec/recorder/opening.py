@@ -196,8 +196,9 @@ def _highest_episode_id(file: Path) -> int:
         if not isinstance(next_id, int):
             raise UnreadableFile(file, "its mjrec.next_episode_id is no whole number")
         return next_id - 1
-    # Gym's own: its numbers count the resets and begin at 0.
-    return len(read_stats_file(file.with_name(manifest.stats)).timestamps) - 1
+    # Gym's own: its numbers count the resets, each of which has a type, from 0.
+    stats = read_stats_file(file.with_name(manifest.stats))
+    return max(len(stats.timestamps), len(stats.episode_types or ())) - 1
 
 
 def _claim(

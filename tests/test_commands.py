@@ -1,0 +1,364 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+
+from mjrec import load_results
+from mjrec.commands import main
+
+PENDULUM = """
+<mujoco>
+  <worldbody>
+    <camera name="front" pos="0 -2 0" xyaxes="1 0 0 0 0 1"/>
+    <light pos="0 -1 2"/>
+    <body>
+      <joint type="hinge" axis="0 1 0" ref="90"/>
+      <geom type="capsule" size="0.05" fromto="0 0 0 0.5 0 0" rgba="1 0 0 1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+POLICY = """
+import numpy as np
+
+def calm(observation):
+    return np.zeros(6)
+
+class Built:
+    def __init__(self, env):
+        self.shape = env.action_space.shape
+
+    def reset(self, seed):
+        print("policy seed", seed)
+
+    def __call__(self, observation):
+        return np.zeros(self.shape)
+"""
+
+
+@pytest.fixture
+def mjrec(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Run the command; returns the exit status and what it printed."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        status = main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return run
+
+
+def frames_in(directory: Path, episode: int) -> list[Any]:
+    [path] = directory.glob(f"*.video{episode:06d}.mp4")
+    with av.open(str(path)) as container:
+        return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+
+
+def metadata_of(directory: Path, episode: int) -> dict[str, Any]:
+    [path] = directory.glob(f"*.video{episode:06d}.meta.json")
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
+
+
+def results_of(directory: Path) -> dict[str, Any]:
+    results = load_results(directory)
+    assert results is not None
+    return results
+
+
+CHEETAH = ("record", "HalfCheetah-v5", "--size", "64x48", "--max-steps", 3)
+
+
+def test_record_gymnasium(mjrec: Any, tmp_path: Path) -> None:
+    """Ten short episodes: videos of 0, 1 and 8, statistics of all, a line for each."""
+    status, out, _ = mjrec(*CHEETAH, "--out", tmp_path, "--episodes", 10, "--seed", 0)
+    assert status == 0
+    assert "episode 9 (10/10): 3 steps" in out
+    assert "video000008.mp4" in out
+    results = results_of(tmp_path)
+    assert results["episode_lengths"] == [3] * 10
+    assert [Path(video).name[-10:] for video, _ in results["videos"]] == [
+        "000000.mp4",
+        "000001.mp4",
+        "000008.mp4",
+    ]
+    assert metadata_of(tmp_path, 0)["camera"] == "track"
+    assert frames_in(tmp_path, 0)[0].shape == (48, 64, 3)
+
+
+@pytest.mark.dm_control
+def test_record_dm_control(mjrec: Any, tmp_path: Path) -> None:
+    """The environment is named in the recordings, and its robot is in the picture."""
+    status, _, _ = mjrec(
+        *("record", "dm_control/humanoid-run", "--out", tmp_path, "--size", "64x48"),
+        *("--max-steps", 2, "--seed", 0),
+    )
+    assert status == 0
+    assert results_of(tmp_path)["env_info"]["env_id"] == "dm_control/humanoid-run"
+    metadata = metadata_of(tmp_path, 0)
+    assert metadata["fps"] == "40"
+    assert metadata["frame_count"] == 3
+    assert metadata["truncated"] is True
+    frame = frames_in(tmp_path, 0)[0].astype(int)
+    # The humanoid is orange, the floor blue.
+    assert (frame[..., 0] > frame[..., 2] + 40).sum() > 20
+
+
+def test_record_mjcf_file(mjrec: Any, tmp_path: Path) -> None:
+    """A model file is simulated and recorded at 60 frames a second."""
+    model = tmp_path / "pendulum.xml"
+    model.write_text(PENDULUM)
+    status, _, _ = mjrec(
+        *("record", model, "--out", tmp_path / "out", "--max-steps", 6),
+        *("--size", "64x48", "--seed", 0),
+    )
+    assert status == 0
+    assert metadata_of(tmp_path / "out", 0)["fps"] == "60"
+    frames = frames_in(tmp_path / "out", 0)
+    assert len(frames) == 7
+    assert (frames[0] != frames[-1]).any()
+
+
+def test_text_environment(mjrec: Any, tmp_path: Path) -> None:
+    """An environment that draws text gives an asciicast, without any OpenGL."""
+    status, _, err = mjrec(
+        *("record", "FrozenLake-v1", "--out", tmp_path, "--seed", 0),
+        *("--env-kwargs", '{"render_mode": "ansi"}'),
+    )
+    assert (status, err) == (0, "")
+    [[cast, _]] = results_of(tmp_path)["videos"]
+    assert json.loads(Path(cast).read_text())["version"] == 1
+
+
+def test_same_seed_gives_the_same_pictures(mjrec: Any, tmp_path: Path) -> None:
+    """Two runs with one seed agree frame by frame, and another seed does not."""
+    hashes = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        out = tmp_path / name
+        mjrec(*CHEETAH, "--out", out, "--seed", seed, "--episodes", 2)
+        hashes.append([p.read_text() for p in sorted(out.glob("*.framehash"))])
+    assert hashes[0] == hashes[1]
+    assert hashes[0] != hashes[2]
+    assert hashes[0][0] != hashes[0][1]
+
+
+def test_resume_goes_on_where_it_stopped(mjrec: Any, tmp_path: Path) -> None:
+    """Episode 1 of a resumed run is episode 1 of an uninterrupted one."""
+    for out, runs in (("whole", [2]), ("parts", [1, 1])):
+        for episodes in runs:
+            mjrec(
+                *(*CHEETAH, "--out", tmp_path / out, "--seed", 3, "--resume"),
+                *("--episodes", episodes),
+            )
+    whole, parts = results_of(tmp_path / "whole"), results_of(tmp_path / "parts")
+    assert whole["episode_rewards"] == parts["episode_rewards"]
+    assert metadata_of(tmp_path / "parts", 1)["episode_id"] == 1
+
+
+def test_fps_and_schedule(mjrec: Any, tmp_path: Path) -> None:
+    """The rate is written as asked, and the schedule is the one named."""
+    mjrec(
+        *(*CHEETAH, "--out", tmp_path, "--seed", 0, "--episodes", 3),
+        *("--schedule", "at:1", "--fps", 12.5),
+    )
+    assert [p.name[-10:] for p in tmp_path.glob("*.mp4")] == ["000001.mp4"]
+    assert metadata_of(tmp_path, 1)["fps"] == "25/2"
+
+
+@pytest.mark.parametrize("policy", ["zero", "calm_policy:calm", "calm_policy:Built"])
+def test_policies(
+    mjrec: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str
+) -> None:
+    """A built-in, a function and a class of the working directory act alike."""
+    (tmp_path / "calm_policy.py").write_text(POLICY)
+    monkeypatch.chdir(tmp_path)
+    status, out, _ = mjrec(
+        *(*CHEETAH, "--out", "out", "--seed", 0, "--policy", policy),
+        *("--schedule", "none"),
+    )
+    assert status == 0
+    assert ("policy seed" in out) == policy.endswith("Built")
+    assert results_of(tmp_path / "out")["episode_rewards"] == [
+        pytest.approx(0.0, abs=0.5)
+    ]
+
+
+def test_json_is_the_only_output(mjrec: Any, tmp_path: Path) -> None:
+    """One object with what a script wants to know."""
+    _, out, _ = mjrec(*CHEETAH, "--out", tmp_path, "--seed", 5, "--json")
+    summary = json.loads(out)
+    assert summary["seed"] == 5
+    assert summary["interrupted"] is False
+    [episode] = summary["episodes"]
+    assert episode["length"] == 3
+    assert (tmp_path / episode["video"]).exists()
+
+
+def test_seed_that_was_drawn_is_said(mjrec: Any, tmp_path: Path) -> None:
+    """So that the run can be repeated."""
+    _, out, _ = mjrec(*CHEETAH, "--out", tmp_path / "a", "--json")
+    seed = json.loads(out)["seed"]
+    _, again, _ = mjrec(*CHEETAH, "--out", tmp_path / "b", "--json", "--seed", seed)
+    rewards = [json.loads(text)["episodes"][0]["reward"] for text in (out, again)]
+    assert rewards[0] == rewards[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["Nope-v1"], ["Nope-v1", "Hopper-v5"]),
+        (["HalfCheetah-v5", "--camera", "side"], ["side", "track"]),
+        (["HalfCheetah-v5", "--schedule", "some"], ["some", "every:N"]),
+        (["HalfCheetah-v5", "--policy", "greedy"], ["greedy", "random"]),
+        (["HalfCheetah-v5", "--policy", "no_such:x"], ["no_such"]),
+        (["HalfCheetah-v5", "--size", "0x48"], ["width", "0"]),
+        (["HalfCheetah-v5", "--size", "big"], ["big", "640x480"]),
+        (["HalfCheetah-v5", "--size", "-4x4"], ["-4x4"]),
+        (["HalfCheetah-v5", "--fps", "0"], ["fps", "0"]),
+        (["HalfCheetah-v5", "--fps", "nan"], ["fps", "nan"]),
+        (["HalfCheetah-v5", "--episodes", "0"], ["episodes", "0"]),
+        (["HalfCheetah-v5", "--max-steps", "0"], ["max_steps", "0"]),
+        (["HalfCheetah-v5", "--seed", "-1"], ["seed", "-1"]),
+        (["HalfCheetah-v5", "--env-kwargs", "[1]"], ["JSON object", "[1]"]),
+        (["HalfCheetah-v5", "--env-kwargs", "{"], ["JSON object"]),
+        (["HalfCheetah-v5", "--env-kwargs", '{"no": 1}'], ["HalfCheetah-v5", "no"]),
+        (["no_such.xml"], ["no_such.xml"]),
+    ],
+)
+def test_bad_input_is_one_clear_error(
+    mjrec: Any, tmp_path: Path, arguments: list[str], said: list[str]
+) -> None:
+    """It says what was asked and what there is, and leaves nothing behind."""
+    status, _, err = mjrec("record", *arguments, "--out", tmp_path / "out")
+    assert status == 1
+    assert err.startswith("mjrec: ")
+    for words in said:
+        assert words in err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.dm_control
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("dm_control/cheetah-fly", "There are: run"),
+        ("dm_control/chetah-run", "cheetah"),
+        ("dm_control/cheetah", "<domain>-<task>"),
+    ],
+)
+def test_unknown_dm_control_names(
+    mjrec: Any, tmp_path: Path, name: str, said: str
+) -> None:
+    """Domains and tasks that there are, are listed."""
+    status, _, err = mjrec("record", name, "--out", tmp_path / "out")
+    assert status == 1
+    assert said in err
+
+
+def test_existing_recordings_need_force_or_resume(mjrec: Any, tmp_path: Path) -> None:
+    """The error names both; force replaces."""
+    mjrec(*CHEETAH, "--out", tmp_path, "--seed", 0, "--schedule", "none")
+    status, _, err = mjrec(*CHEETAH, "--out", tmp_path, "--seed", 0)
+    assert status == 1
+    assert "--resume" in err
+    assert "--force" in err
+    status, _, _ = mjrec(
+        *(*CHEETAH, "--out", tmp_path, "--seed", 0, "--force"),
+        *("--schedule", "none", "--episodes", 2),
+    )
+    assert status == 0
+    assert len(results_of(tmp_path)["episode_lengths"]) == 2
+
+
+def test_wrong_usage_is_status_2(mjrec: Any) -> None:
+    """As every command line has it."""
+    with pytest.raises(SystemExit) as left:
+        mjrec("record", "HalfCheetah-v5", "--no-such-option")
+    assert left.value.code == 2
+
+
+def test_list_shows_every_episode(mjrec: Any, tmp_path: Path) -> None:
+    """A row each, with the video's name whole."""
+    mjrec(
+        *CHEETAH, "--out", tmp_path, "--seed", 0, "--episodes", 2, "--schedule", "at:1"
+    )
+    status, out, _ = mjrec("list", tmp_path)
+    assert status == 0
+    assert out.count("truncated") == 2
+    assert next(tmp_path.glob("*.mp4")).name in out
+
+
+def test_list_json_is_a_line_for_each_episode(mjrec: Any, tmp_path: Path) -> None:
+    """For scripts: numbers, seeds, file names."""
+    mjrec(*CHEETAH, "--out", tmp_path, "--seed", 0, "--episodes", 2)
+    _, out, _ = mjrec("list", tmp_path, "--json")
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert [line["episode_id"] for line in lines] == [0, 1]
+    assert lines[0]["video"].endswith("video000000.mp4")
+    assert isinstance(lines[0]["seed"], int)
+
+
+def test_list_of_nothing_is_an_error(mjrec: Any, tmp_path: Path) -> None:
+    """The directory is named."""
+    status, _, err = mjrec("list", tmp_path / "nothing")
+    assert status == 1
+    assert "nothing" in err
+
+
+def _start(tmp_path: Path, **streams: Any) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [
+            *(sys.executable, "-m", "mjrec", "record", "HalfCheetah-v5"),
+            *("--out", str(tmp_path), "--size", "64x48", "--seed", "0"),
+            *("--episodes", "10000", "--max-steps", "20"),
+        ],
+        **streams,
+    )
+
+
+def test_ctrl_c_keeps_everything_so_far(tmp_path: Path) -> None:
+    """Status 130; episodes, manifest and videos are whole, and nothing is pending."""
+    process = _start(tmp_path, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert b"episode 0" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b"Interrupted" in out
+    results = results_of(tmp_path)
+    assert results["episode_lengths"]
+    assert set(results["episode_lengths"]) == {20}
+    assert len(frames_in(tmp_path, 0)) == 21
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+
+
+def test_terminal_shows_a_bar(tmp_path: Path) -> None:
+    """On a terminal there is a progress bar with episodes and steps."""
+    reader, terminal = pty.openpty()
+    process = _start(tmp_path, stdout=terminal, stderr=terminal)
+    os.close(terminal)
+    shown = b""
+    while b"1/10000 episodes" not in shown:
+        shown += os.read(reader, 65536)
+    process.send_signal(signal.SIGINT)
+    while True:
+        try:
+            shown += os.read(reader, 65536)
+        except OSError:  # Linux says so when the other end is closed.
+            break
+    assert process.wait(60) == 130
+    os.close(reader)
+    assert b"steps" in shown
+    assert b"HalfCheetah-v5" in shown

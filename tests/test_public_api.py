@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import ast
+import importlib
+import pkgutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import mjrec
+from mjrec import errors
+
+PACKAGE = Path(mjrec.__file__).parent
+
+# From the bottom up. A module may import from its own row and from those below.
+ROWS = (
+    {
+        *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
+        *("worker_thread", "gl", "machine"),
+    },
+    {"formats"},
+    {"results"},
+    {"simulation"},
+    {"recorder"},
+    {"environments"},
+    {"monitors"},
+    {"sessions", "machine_report"},
+    {"commands"},
+)
+
+# The frameworks and programs that only one row, or one file, may import.
+CONFINED = {
+    "mujoco": {"simulation"},
+    "OpenGL": {"simulation"},
+    "gymnasium": {"environments", "monitors"},
+    "dm_env": {"environments", "monitors"},
+    "dm_control": {"environments"},
+    "imageio_ffmpeg": {"formats"},
+    "tyro": {"commands"},
+    "rich": {"commands"},
+}
+
+HEAVY = ("mujoco", "gymnasium", "dm_control", "dm_env", "OpenGL", "imageio_ffmpeg")
+
+
+def modules() -> Iterator[tuple[str, Path]]:
+    """Yield each module's dotted name below the package, and its file."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        name = ".".join(part for part in parts if part != "__init__")
+        if name not in ("", "__main__"):
+            yield name, path
+
+
+MODULES = list(modules())
+
+
+def imports(name: str, path: Path) -> Iterator[str]:
+    """Yield what a module imports, ours as `mjrec.<name>`, also inside functions."""
+    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield node.module or ""
+        elif isinstance(node, ast.ImportFrom):
+            base = ["mjrec", *package[: len(package) - node.level + 1]]
+            module = [*base, *filter(None, [node.module])]
+            for alias in node.names:
+                yield ".".join([*module, alias.name] if not node.module else module)
+
+
+def row(name: str) -> int:
+    """Return the number of the row that a module belongs to."""
+    return next(i for i, names in enumerate(ROWS) if name.split(".")[0] in names)
+
+
+@pytest.mark.parametrize(("name", "path"), MODULES, ids=[n for n, _ in MODULES])
+def test_module_imports_only_from_rows_below(name: str, path: Path) -> None:
+    """The layers of the design hold; every module has a row."""
+    above = [
+        imported
+        for imported in imports(name, path)
+        if imported.startswith("mjrec.")
+        and row(imported.removeprefix("mjrec.")) > row(name)
+    ]
+    assert not above
+
+
+@pytest.mark.parametrize(("name", "path"), MODULES, ids=[n for n, _ in MODULES])
+def test_frameworks_stay_in_their_rows(name: str, path: Path) -> None:
+    """Only the row that is for a framework imports it."""
+    strays = [
+        imported
+        for imported in imports(name, path)
+        for framework, allowed in CONFINED.items()
+        if imported.split(".")[0] == framework and name.split(".")[0] not in allowed
+    ]
+    assert not strays
+
+
+def test_no_import_cycles() -> None:
+    """No module imports itself by way of others."""
+    known = dict(modules())
+    graph = {
+        name: {
+            imported.removeprefix("mjrec.")
+            for imported in imports(name, path)
+            if imported.removeprefix("mjrec.") in known
+            # A package's own modules are loaded by it.
+            and not imported.removeprefix("mjrec.").startswith(f"{name}.")
+        }
+        - {name}
+        for name, path in known.items()
+    }
+
+    def visit(name: str, trail: tuple[str, ...]) -> None:
+        assert name not in trail, " -> ".join([*trail, name])
+        if name not in done:
+            for imported in graph[name]:
+                visit(imported, (*trail, name))
+            done.add(name)
+
+    done: set[str] = set()
+    for name in graph:
+        visit(name, ())
+
+
+def test_all_names_exist_and_are_sorted() -> None:
+    """`__all__` is the public surface, and each name can be had."""
+    assert mjrec.__all__ == sorted(mjrec.__all__)
+    for name in mjrec.__all__:
+        assert getattr(mjrec, name) is not None
+
+
+def test_every_error_is_public_and_an_error() -> None:
+    """The subclasses of Error are names of the package."""
+    for name in errors.__all__:
+        assert getattr(mjrec, name) is getattr(errors, name)
+        assert issubclass(getattr(errors, name), mjrec.Error)
+    drawn = errors.__doc__ or ""
+    assert all(name in drawn for name in errors.__all__)
+
+
+def _run(code: str) -> str:
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout
+
+
+def test_import_is_inert() -> None:
+    """No simulator, no OpenGL, no ffmpeg, and the environment stays as it is."""
+    assert _run(
+        "import os, sys; before = dict(os.environ); import mjrec; "
+        f"print([m for m in {HEAVY} if m in sys.modules], before == os.environ)"
+    ).split() == ["[]", "True"]
+
+
+def test_read_half_needs_no_simulator() -> None:
+    """Results are read on a machine without mujoco, OpenGL or ffmpeg."""
+    assert _run(
+        "import sys; "
+        f"sys.modules.update(dict.fromkeys({HEAVY})); "
+        "import mjrec; mjrec.load_results, mjrec.iter_episodes, mjrec.write_archive; "
+        "mjrec.StatsRecorder, mjrec.capped_cubic_video_schedule; print('read')"
+    ).split() == ["read"]
+
+
+def test_no_module_hides_a_public_name() -> None:
+    """After every submodule was imported, every public name is still what it was."""
+    before = {name: getattr(mjrec, name) for name in mjrec.__all__}
+    for module in pkgutil.walk_packages(mjrec.__path__, "mjrec."):
+        if module.name != "mjrec.__main__":
+            try:
+                importlib.import_module(module.name)
+            except ModuleNotFoundError as error:
+                # Without the extra there is no dm_control to hide anything.
+                assert error.name in ("dm_control", "dm_env")
+    assert {name: getattr(mjrec, name) for name in mjrec.__all__} == before
+
+
+def test_version_is_the_packages() -> None:
+    """The one in pyproject.toml."""
+    from importlib.metadata import version
+
+    assert mjrec.__version__ == version("mjrec")
+    assert "__version__" in dir(mjrec)
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = mjrec.no_such_name
