@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import math
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +11,8 @@ import dm_env
 import numpy as np
 from dm_control import suite
 
-from ..errors import EnvironmentNotMade, InvalidArgument, MissingDependency, UnknownName
+from ..errors import InvalidArgument, UnknownName
+from .dm_control_failures import dm_control_failure
 from .dm_env_episodes import StepLimit
 from .episode_seeds import EpisodeSeeds
 from .options import EnvironmentOptions
@@ -51,7 +50,7 @@ def make_dm_control(
     try:
         environment = suite.load(domain, task, **arguments)
     except Exception as error:
-        raise _failure(f"dm_control/{domain}-{task}", error) from error
+        raise dm_control_failure(f"dm_control/{domain}-{task}", error) from error
     return _limited(environment, options)
 
 
@@ -104,19 +103,6 @@ def _arguments(kwargs: Mapping[str, Any]) -> dict[str, Any]:
             )
     # suite.load takes None for both, and so may the person who asks.
     return {**kwargs, "task_kwargs": kwargs.get("task_kwargs") or {}}
-
-
-def _failure(name: str, error: Exception) -> Exception:
-    # dm_control 1.0.50 reads fields of MuJoCo's structures that mujoco 4 lacks.
-    if re.search(r"Mj(Model|Data)\b.* has no attribute", str(error)):
-        dm_control, mujoco = map(importlib.metadata.version, ("dm-control", "mujoco"))
-        return MissingDependency(
-            "a mujoco that it knows (below version 4)",
-            purpose=f"{name}: dm_control {dm_control} does not work with mujoco "
-            f"{mujoco} ({error}) and",
-            install='pip install "mujoco<4"',
-        )
-    return EnvironmentNotMade(name, f"{type(error).__name__}: {error}")
 
 
 def _limited(

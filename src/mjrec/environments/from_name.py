@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..errors import MissingDependency
+from .dm_control_failures import dm_control_failure
 from .episode_seeds import EpisodeSeeds
 from .names import (
     DmControlName,
@@ -99,12 +99,8 @@ def _mjcf(name: MjcfName, options: EnvironmentOptions) -> NamedEnvironment:
 def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnvironment:
     try:
         module = _module("dm_control_environments")
-    except ModuleNotFoundError as error:
-        if error.name not in ("dm_control", "dm_env"):
-            raise
-        raise MissingDependency(
-            "dm_control", purpose=str(name), install='pip install "mjrec[dm-control]"'
-        ) from error
+    except Exception as error:
+        raise dm_control_failure(str(name), error) from error
     environment = module.make_dm_control(name.domain, name.task, options)
     return NamedEnvironment(
         environment=environment,

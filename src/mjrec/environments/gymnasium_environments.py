@@ -23,6 +23,7 @@ from ..errors import (
 )
 from .episode_seeds import EpisodeSeeds
 from .options import EnvironmentOptions
+from .working_directory import working_directory_importable
 
 __all__ = ["begin_episode", "make_gymnasium", "step"]
 
@@ -64,15 +65,10 @@ def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[An
         MissingDependency: something that it needs is not installed.
         EnvironmentNotMade: making it failed otherwise; the cause is kept.
     """
-    spec = _spec(env_id)
-    kwargs = dict(options.kwargs)
-    # gymnasium.make's own word for the limit.
-    own_limit = kwargs.pop("max_episode_steps", None) or spec.max_episode_steps
-    kwargs["max_episode_steps"] = options.limit(own_limit)
-    if not options.pictures:
-        return _make(spec, kwargs)
-    kwargs["render_mode"] = _render_mode(spec, kwargs)
-    return _make_drawn(spec, kwargs, options)
+    # The module of `module:Id` may lie in the working directory, as a policy's may.
+    here = working_directory_importable() if ":" in env_id else contextlib.nullcontext()
+    with here:
+        return _make_known(_spec(env_id), options)
 
 
 def begin_episode(env: gymnasium.Env[Any, Any], seeds: EpisodeSeeds) -> Any:
@@ -92,6 +88,30 @@ def step(env: gymnasium.Env[Any, Any], action: Any) -> tuple[Any, bool]:
     """Return the next observation, and whether it is the episode's last."""
     observation, _, terminated, truncated, _ = env.step(action)
     return observation, bool(terminated or truncated)
+
+
+def _make_known(
+    spec: registration.EnvSpec, options: EnvironmentOptions
+) -> gymnasium.Env[Any, Any]:
+    kwargs = dict(options.kwargs)
+    kwargs["max_episode_steps"] = options.limit(_own_limit(spec, kwargs))
+    if not options.pictures:
+        return _make(spec, kwargs)
+    kwargs["render_mode"] = _render_mode(spec, kwargs)
+    return _make_drawn(spec, kwargs, options)
+
+
+def _own_limit(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> int | None:
+    # gymnasium.make's own word for the limit, -1 for none.
+    limit = kwargs.get("max_episode_steps", spec.max_episode_steps)
+    if limit in (None, -1):
+        return None
+    if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
+        raise InvalidArgument(
+            "max_episode_steps must be a positive whole number, or -1 for no limit, "
+            f"got {limit!r}."
+        )
+    return limit
 
 
 def _spec(env_id: str) -> registration.EnvSpec:

@@ -30,6 +30,7 @@ import numpy as np
 
 from ..errors import Error, PolicyError, UnknownName
 from .episode_seeds import EpisodeSeeds
+from .working_directory import working_directory_importable
 
 __all__ = ["Actions", "Policy", "load_policy", "working_directory_importable"]
 
@@ -93,19 +94,6 @@ def load_policy(text: str, environment: Any) -> Policy:
     with working_directory_importable():
         chosen = _chosen(text, environment)
     return _ForeignPolicy(text, _chooser(text, chosen), actions)
-
-
-@contextlib.contextmanager
-def working_directory_importable() -> Iterator[None]:
-    """Let modules in the working directory be imported, before installed ones."""
-    directory = str(Path.cwd())
-    sys.path.insert(0, directory)
-    try:
-        yield
-    finally:
-        # What was imported may have changed the list itself.
-        if directory in sys.path:
-            sys.path.remove(directory)
 
 
 class _RandomPolicy:

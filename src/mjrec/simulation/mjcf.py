@@ -18,6 +18,9 @@ __all__ = ["FRAME_RATE", "MjcfSimulation", "load_mjcf"]
 
 FRAME_RATE = Fraction(60)
 
+# Authors write five digits of a timestep that is one over a whole number.
+_ROUNDING = Fraction(1, 10**5)
+
 _INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _BAD_STATES = {
     int(mujoco.mjtWarning.mjWARN_BADQPOS): "position",
@@ -62,7 +65,7 @@ class MjcfSimulation:
     def __init__(self, path: Path) -> None:
         self.model = load_mjcf(path)
         self.data = mujoco.MjData(self.model)
-        self._timestep = _exact_timestep(self.model)
+        self._timestep = _meant_timestep(self.model)
         self.frame_rate = min(FRAME_RATE, 1 / self._timestep)
         self._before = np.empty(mujoco.mj_stateSize(self.model, _INTEGRATION))
         self.reset()
@@ -127,7 +130,10 @@ class MjcfSimulation:
         return None
 
 
-def _exact_timestep(model: mujoco.MjModel) -> Fraction:
-    """Return the timestep that the author wrote: 0.0166667 means 1/60."""
+def _meant_timestep(model: mujoco.MjModel) -> Fraction:
+    """Return the timestep that the author meant: 0.0166667 is 1/60, 0.01 is 1/100."""
     exact = Fraction(model.opt.timestep)
+    steps_a_second = round(1 / exact)
+    if abs(exact * steps_a_second - 1) < _ROUNDING:
+        return Fraction(1, steps_a_second)
     return exact.limit_denominator(MAX_DENOMINATOR) or exact

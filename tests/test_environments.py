@@ -1,0 +1,470 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From names to environments; Gymnasium's."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import mjrec
+from mjrec.environments.episode_seeds import EpisodeSeeds, episode_seeds
+from mjrec.environments.from_name import NamedEnvironment, environment_from_name
+from mjrec.environments.gymnasium_environments import make_gymnasium
+from mjrec.environments.names import (
+    DmControlName,
+    GymnasiumName,
+    MjcfName,
+    parse_environment_name,
+)
+from mjrec.environments.options import EnvironmentOptions
+from mjrec.environments.policies import load_policy
+
+BALL = """
+<mujoco><worldbody><body><joint name="j" type="slide"/><geom size=".1"/></body>
+</worldbody><actuator><motor joint="j" ctrllimited="true" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(params=["HalfCheetah-v5", "dm_control/cheetah-run", "ball.xml"])
+def named(request: pytest.FixtureRequest, tmp_path: Path) -> NamedEnvironment:
+    """An environment of each kind."""
+    name = request.param
+    if name.endswith(".xml"):
+        path = tmp_path / name
+        path.write_text(BALL)
+        name = str(path)
+    elif name.startswith("dm_control/"):
+        pytest.importorskip("dm_control")
+    return environment_from_name(name, EnvironmentOptions(pictures=False))
+
+
+def trajectory(
+    named: NamedEnvironment, seeds: EpisodeSeeds, *, steps: int = 10
+) -> bytes:
+    """Return the observations of an episode's first steps under random actions."""
+    policy = load_policy("random", named.environment)
+    policy.reset(seeds)
+    observations = [named.begin_episode(named.environment, seeds)]
+    for _ in range(steps):
+        observation, _ = named.step(named.environment, policy(observations[-1]))
+        observations.append(observation)
+    parts = [o.values() if isinstance(o, dict) else [o] for o in observations]
+    return b"".join(np.asarray(part).tobytes() for row in parts for part in row)
+
+
+def test_an_episode_depends_on_its_seeds_alone(named: NamedEnvironment) -> None:
+    """Neither on the episodes before it nor on how these ended."""
+    first = trajectory(named, episode_seeds(5, 3))
+    trajectory(named, episode_seeds(5, 4), steps=33)
+    assert trajectory(named, episode_seeds(5, 3)) == first
+    assert trajectory(named, episode_seeds(5, 4)) != first
+    assert trajectory(named, episode_seeds(6, 3)) != first
+    named.environment.close()
+
+
+def test_the_environments_seed_and_the_actions_seed_differ() -> None:
+    """Each stream changes what it is for, and nothing else."""
+    named = environment_from_name("HalfCheetah-v5", EnvironmentOptions(pictures=False))
+    seeds = EpisodeSeeds(environment=1, actions=2, policy=3)
+    same_start = EpisodeSeeds(environment=1, actions=4, policy=3)
+    begun = [named.begin_episode(named.environment, s) for s in (seeds, same_start)]
+    assert np.array_equal(*begun)
+    assert trajectory(named, seeds) != trajectory(named, same_start)
+
+
+def test_a_policy_of_the_users_may_draw_from_the_action_space() -> None:
+    """That stream is the episode's too."""
+    named = environment_from_name("HalfCheetah-v5", EnvironmentOptions(pictures=False))
+    drawn = []
+    for _ in range(2):
+        named.begin_episode(named.environment, episode_seeds(0, 7))
+        drawn.append(named.environment.action_space.sample())
+    assert np.array_equal(*drawn)
+
+
+def test_importing_the_package_loads_no_framework() -> None:
+    """Neither do names, seeds, options, and the way from a name."""
+    code = (
+        "import sys\n"
+        "import mjrec.environments.from_name, mjrec.environments.policies\n"
+        "loaded = {'gymnasium', 'dm_control', 'dm_env', 'mujoco'} & set(sys.modules)\n"
+        "assert not loaded, loaded\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("HalfCheetah-v5", GymnasiumName("HalfCheetah-v5")),
+        ("my_envs:Robot-v0", GymnasiumName("my_envs:Robot-v0")),
+        ("phys2d/CartPole-v1", GymnasiumName("phys2d/CartPole-v1")),
+        ("dm_control/humanoid-run", DmControlName("humanoid", "run")),
+        ("dm_control/ball_in_cup-catch", DmControlName("ball_in_cup", "catch")),
+        ("dm_control/humanoid_CMU-run", DmControlName("humanoid_CMU", "run")),
+        (
+            "dm_control/humanoid-run_pure_state",
+            DmControlName("humanoid", "run_pure_state"),
+        ),
+    ],
+)
+def test_names_mean_what_they_say(text: str, name: object) -> None:
+    """And are written as they were read."""
+    assert parse_environment_name(text) == name
+    assert str(name) == text
+
+
+@pytest.mark.parametrize("file_name", ["a robot.xml", "robot.mjcf", "ROBOT.XML"])
+def test_a_file_is_named_by_its_path(tmp_path: Path, file_name: str) -> None:
+    """Its name's end says that it is an MJCF file."""
+    path = tmp_path / file_name
+    path.write_text("<mujoco/>")
+    assert parse_environment_name(str(path)) == MjcfName(path)
+
+
+def test_a_file_that_is_not_there_is_a_missing_file(tmp_path: Path) -> None:
+    """And no unknown Gymnasium environment; the files that are there are named."""
+    (tmp_path / "robot.xml").write_text("<mujoco/>")
+    with pytest.raises(mjrec.UnknownName, match=r"MJCF file .*There are: .*robot.xml"):
+        parse_environment_name(str(tmp_path / "robto.xml"))
+    with pytest.raises(mjrec.UnknownName, match="There are none"):
+        parse_environment_name(str(tmp_path / "nowhere" / "robot.xml"))
+
+
+def test_names_that_cannot_be_say_what_can(tmp_path: Path) -> None:
+    """Nothing, half a name, a file of another kind."""
+    with pytest.raises(mjrec.InvalidArgument, match="needs a name"):
+        parse_environment_name(" ")
+    for text in ("dm_control/cheetah", "dm_control/-run", "dm_control/"):
+        with pytest.raises(mjrec.InvalidArgument, match="dm_control/<domain>-<task>"):
+            parse_environment_name(text)
+    path = tmp_path / "robot.txt"
+    path.write_text("<mujoco/>")
+    with pytest.raises(mjrec.InvalidArgument, match=r"\.xml or \.mjcf"):
+        parse_environment_name(str(path))
+
+
+@pytest.mark.parametrize("bad", [0, -1, 1.5, True, "5"])
+def test_max_steps_is_a_positive_whole_number(bad: Any) -> None:
+    """Checked before anything is made."""
+    with pytest.raises(mjrec.InvalidArgument, match="max_steps"):
+        EnvironmentOptions(max_steps=bad)
+
+
+@pytest.mark.parametrize("bad", [0, -1, 1.5, True])
+def test_a_size_is_checked_at_once(bad: Any) -> None:
+    """Also where only one side is given."""
+    for side in ("height", "width"):
+        with pytest.raises(mjrec.InvalidArgument, match=side):
+            EnvironmentOptions(**{side: bad})
+
+
+def test_the_smaller_limit_wins() -> None:
+    """The environment's own, what is asked for, and 1000 where there is neither."""
+    assert EnvironmentOptions().limit(None) == 1000
+    assert EnvironmentOptions().limit(float("inf")) == 1000
+    assert EnvironmentOptions().limit(5000) == 5000
+    assert EnvironmentOptions(max_steps=7).limit(50) == 7
+    assert EnvironmentOptions(max_steps=70).limit(50) == 50
+    assert EnvironmentOptions(max_steps=7000).limit(None) == 7000
+
+
+def steps_of(env: gymnasium.Env[Any, Any]) -> int:
+    env.reset(seed=0)
+    steps = 0
+    while True:
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        steps += 1
+        if terminated or truncated:
+            assert truncated
+            return steps
+
+
+def test_max_steps_truncates() -> None:
+    """Such an episode is over, and it was not the task that ended it."""
+    env = make_gymnasium(
+        "HalfCheetah-v5", EnvironmentOptions(max_steps=5, pictures=False)
+    )
+    assert steps_of(env) == 5
+
+
+@pytest.fixture
+def register() -> Any:
+    """Register environments for one test."""
+    before = set(gymnasium.registry)
+
+    def register_environment(env_id: str, entry_point: Any, **kwargs: Any) -> None:
+        gymnasium.register(env_id, entry_point, **kwargs)
+
+    yield register_environment
+    for env_id in set(gymnasium.registry) - before:
+        del gymnasium.registry[env_id]
+
+
+@pytest.mark.parametrize(
+    ("own", "asked", "expected"), [(None, None, 1000), (None, 3, 3), (4, 9, 4)]
+)
+def test_limits_of_other_environments(
+    register: Any, make_corridor: Any, own: Any, asked: Any, expected: int
+) -> None:
+    """1000 where an environment has none; its own where that is smaller."""
+    register("Endless-v0", make_corridor, max_episode_steps=own)
+    options = EnvironmentOptions(max_steps=asked, kwargs={"length": 10**6})
+    assert steps_of(make_gymnasium("Endless-v0", options)) == expected
+
+
+@pytest.mark.parametrize(("own", "expected"), [(6, 6), (-1, 1000)])
+def test_gymnasiums_own_word_for_the_limit(own: int, expected: int) -> None:
+    """`max_episode_steps` replaces the registered limit, and -1 is none."""
+    options = EnvironmentOptions(pictures=False, kwargs={"max_episode_steps": own})
+    env = make_gymnasium("HalfCheetah-v5", options)
+    assert env.spec is not None
+    assert env.spec.max_episode_steps == expected
+    with pytest.raises(mjrec.InvalidArgument, match="max_episode_steps"):
+        make_gymnasium(
+            "HalfCheetah-v5", EnvironmentOptions(kwargs={"max_episode_steps": 1.5})
+        )
+
+
+def camera_of(env: gymnasium.Env[Any, Any]) -> int:
+    return int(env.unwrapped.mujoco_renderer.camera_id)  # type: ignore[attr-defined]  # a MujocoEnv
+
+
+def robot_pixels(camera: int | None) -> int:
+    """Return how much of the robot is seen thirty metres from where it began."""
+    options = EnvironmentOptions(camera=camera, height=48, width=64)
+    env = make_gymnasium("HalfCheetah-v5", options)
+    env.reset(seed=0)
+    # Where Gymnasium's free camera looks is settled at the first picture.
+    env.render()
+    simulated: Any = env.unwrapped
+    simulated.data.qpos[0] = 30
+    simulated.set_state(simulated.data.qpos, simulated.data.qvel)
+    picture = np.asarray(env.render()).astype(int)
+    env.close()
+    assert picture.shape == (48, 64, 3)
+    # Its colour; the ground is green and the sky is grey.
+    red, green, blue = (picture[..., channel] for channel in range(3))
+    return int(((red - blue > 60) & (red > green)).sum())
+
+
+def test_pictures_follow_the_robot_unless_asked_otherwise() -> None:
+    """Gymnasium 1.4's default camera stays where it is; -1 asks for that one."""
+    assert robot_pixels(None) > 15
+    assert robot_pixels(-1) == 0
+
+
+def test_the_spec_says_which_camera_shows() -> None:
+    """The environment can be made again from it."""
+    env = make_gymnasium("HalfCheetah-v5", EnvironmentOptions())
+    assert env.spec is not None
+    assert env.spec.kwargs["camera_name"] == "track"
+    assert camera_of(env) == 0
+    env.close()
+
+
+def test_an_environments_own_camera_argument_stays() -> None:
+    """What --env-kwargs says about the view is what the person wants."""
+    view = {"default_camera_config": {"distance": 9.0}}
+    env = make_gymnasium("HalfCheetah-v5", EnvironmentOptions(kwargs=view))
+    assert "camera_name" not in (env.spec.kwargs if env.spec else {})
+    with pytest.raises(mjrec.InvalidArgument, match="given twice"):
+        make_gymnasium("HalfCheetah-v5", EnvironmentOptions(camera=0, kwargs=view))
+    with pytest.raises(mjrec.InvalidArgument, match=r"width .* given twice"):
+        make_gymnasium(
+            "HalfCheetah-v5", EnvironmentOptions(width=9, kwargs={"width": 8})
+        )
+
+
+def test_an_unknown_camera_names_those_there_are() -> None:
+    """Before any episode begins."""
+    with pytest.raises(mjrec.UnknownName, match=r"'nose'.*track"):
+        make_gymnasium("HalfCheetah-v5", EnvironmentOptions(camera="nose"))
+    with pytest.raises(mjrec.InvalidArgument, match="camera number 3"):
+        make_gymnasium("HalfCheetah-v5", EnvironmentOptions(camera=3))
+
+
+def test_a_mujoco_environment_that_takes_no_camera_is_given_one(register: Any) -> None:
+    """Gymnasium-Robotics' take none; their renderer has one all the same."""
+    from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
+
+    class NoCamera(HalfCheetahEnv):
+        def __init__(
+            self, render_mode: Any = None, width: int = 48, height: int = 48
+        ) -> None:
+            super().__init__(render_mode=render_mode, width=width, height=height)
+
+    register("NoCamera-v0", NoCamera)
+    env = make_gymnasium("NoCamera-v0", EnvironmentOptions())
+    assert camera_of(env) == 0
+    env.close()
+
+
+def test_without_pictures_nothing_is_asked_about_pictures() -> None:
+    """No render mode, no camera: an environment that only counts."""
+    env = make_gymnasium("HalfCheetah-v5", EnvironmentOptions(pictures=False))
+    assert env.render_mode is None
+    env = make_gymnasium("CartPole-v1", EnvironmentOptions(pictures=False))
+    assert env.render_mode is None
+
+
+def test_text_environments_give_text(register: Any, make_corridor: Any) -> None:
+    """Where the environment has nothing else, or where text is asked for."""
+
+    class OnlyText(make_corridor):  # type: ignore[misc]  # a class from a fixture
+        metadata = {"render_modes": ["human", "ansi"], "render_fps": 10}  # noqa: RUF012  Gymnasium's own way
+
+    register("OnlyText-v0", OnlyText)
+    assert make_gymnasium("OnlyText-v0", EnvironmentOptions()).render_mode == "ansi"
+    asked = EnvironmentOptions(kwargs={"render_mode": "ansi"})
+    env = make_gymnasium("FrozenLake-v1", asked)
+    env.reset(seed=0)
+    assert "FHFH" in str(env.render())
+
+
+def test_an_environment_without_pictures_says_what_it_has(
+    register: Any, make_corridor: Any
+) -> None:
+    """The modes there are, the modes it takes, and the way out."""
+
+    class OnlyWindow(make_corridor):  # type: ignore[misc]  # a class from a fixture
+        metadata = {"render_modes": ["human"], "render_fps": 10}  # noqa: RUF012  Gymnasium's own way
+
+    register("OnlyWindow-v0", OnlyWindow)
+    with pytest.raises(mjrec.NoPictures, match=r"\['human'\].*rgb_array.*none"):
+        make_gymnasium("OnlyWindow-v0", EnvironmentOptions())
+    for mode in ("human", None):
+        with pytest.raises(mjrec.NoPictures, match="asked for"):
+            make_gymnasium(
+                "HalfCheetah-v5", EnvironmentOptions(kwargs={"render_mode": mode})
+            )
+    with pytest.raises(mjrec.UnknownName, match=r"render mode .*'rgb'.*rgb_array"):
+        make_gymnasium(
+            "HalfCheetah-v5", EnvironmentOptions(kwargs={"render_mode": "rgb"})
+        )
+
+
+def test_a_function_may_make_the_environment(register: Any, make_corridor: Any) -> None:
+    """Its render modes are known only when it has been called."""
+    register("Made-v0", lambda render_mode=None: make_corridor(render_mode=render_mode))
+    env = make_gymnasium("Made-v0", EnvironmentOptions())
+    assert env.render_mode == "rgb_array"
+    register("Blind-v0", lambda render_mode=None: make_corridor(render_mode=None))
+    with pytest.raises(mjrec.NoPictures, match="took no render mode"):
+        make_gymnasium("Blind-v0", EnvironmentOptions())
+
+
+def test_cameras_and_sizes_are_for_mujoco(register: Any, make_corridor: Any) -> None:
+    """Another environment draws what it draws."""
+    register("Corridor-v0", make_corridor)
+    with pytest.raises(mjrec.InvalidArgument, match="Corridor-v0 has no cameras"):
+        make_gymnasium("Corridor-v0", EnvironmentOptions(camera="track"))
+    with pytest.raises(mjrec.InvalidArgument, match="Corridor-v0 takes no size"):
+        make_gymnasium("Corridor-v0", EnvironmentOptions(height=10, width=10))
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheeta-v5", "HalfCheetah-v9", "halfcheetah"])
+def test_an_unknown_environment_names_its_like(env_id: str) -> None:
+    """Nobody remembers every version."""
+    with pytest.raises(mjrec.UnknownName, match="HalfCheetah-v5"):
+        make_gymnasium(env_id, EnvironmentOptions())
+
+
+def test_an_environment_unlike_any_says_how_names_are_made() -> None:
+    """Malformed ids too."""
+    for env_id in ("no such thing!", "zzz", "zzz-v0", "zz/zzz-v0"):
+        with pytest.raises(mjrec.UnknownName, match=r"colon.*dm_control/<domain>"):
+            make_gymnasium(env_id, EnvironmentOptions())
+
+
+def test_without_a_version_the_latest_is_meant() -> None:
+    """As for gymnasium.make, without its warning."""
+    env = make_gymnasium("HalfCheetah", EnvironmentOptions(pictures=False))
+    assert env.spec is not None
+    assert env.spec.id == "HalfCheetah-v5"
+
+
+def test_a_bad_argument_is_one_error_with_its_cause() -> None:
+    """What was made, what it said, and the exception for those who look."""
+    with pytest.raises(mjrec.EnvironmentNotMade, match=r"HalfCheetah-v5.*'foo'") as e:
+        make_gymnasium("HalfCheetah-v5", EnvironmentOptions(kwargs={"foo": 1}))
+    assert isinstance(e.value.__cause__, TypeError)
+
+
+def test_what_a_constructor_raises_is_one_error_with_its_cause(register: Any) -> None:
+    """Whatever third-party code raises."""
+
+    def broken(**kwargs: Any) -> Any:
+        raise ZeroDivisionError("the reason")
+
+    register("Broken-v0", broken)
+    with pytest.raises(mjrec.EnvironmentNotMade, match=r"ZeroDivision.*reason") as e:
+        make_gymnasium("Broken-v0", EnvironmentOptions())
+    assert isinstance(e.value.__cause__, ZeroDivisionError)
+
+
+def test_what_is_not_installed_is_named_with_its_command(register: Any) -> None:
+    """Gymnasium's own message has the command between backticks."""
+
+    def missing(**kwargs: Any) -> Any:
+        try:
+            import no_such_engine
+        except ImportError as error:
+            raise gymnasium.error.DependencyNotInstalled(
+                "No engine, run `pip install swig` and then `pip install engine`"
+            ) from error
+        return no_such_engine
+
+    register("Missing-v0", missing)
+    with pytest.raises(
+        mjrec.MissingDependency,
+        match=r"Missing-v0 needs no_such_engine.*install swig && pip install engine",
+    ):
+        make_gymnasium("Missing-v0", EnvironmentOptions())
+
+
+@pytest.mark.parametrize(
+    ("env_id", "extra"),
+    [("CartPole-v1", "classic-control"), ("FrozenLake-v1", "toy-text")],
+)
+def test_without_pygame_drawing_is_refused_before_the_first_episode(
+    env_id: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The line to run; and text, where the environment has it."""
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(mjrec.MissingDependency, match=rf"gymnasium\[{extra}\]") as e:
+        make_gymnasium(env_id, EnvironmentOptions())
+    assert ("ansi" in str(e.value)) == (env_id == "FrozenLake-v1")
+
+
+def test_a_module_that_registers_lies_in_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Any
+) -> None:
+    """`module:Id` imports it first; that it fails is one error."""
+    (tmp_path / "mjrec_test_envs.py").write_text(
+        "import gymnasium\n"
+        "class Env(gymnasium.Env):\n"
+        "    metadata = {'render_modes': ['ansi']}\n"
+        "    action_space = observation_space = gymnasium.spaces.Discrete(1)\n"
+        "    def __init__(self, render_mode=None):\n"
+        "        self.render_mode = render_mode\n"
+        "gymnasium.register('Local-v0', 'mjrec_test_envs:Env')\n"
+    )
+    (tmp_path / "mjrec_test_broken.py").write_text("1 / 0\n")
+    monkeypatch.chdir(tmp_path)
+    path = list(sys.path)
+    env = make_gymnasium("mjrec_test_envs:Local-v0", EnvironmentOptions())
+    assert env.render_mode == "ansi"
+    with pytest.raises(mjrec.EnvironmentNotMade, match="ZeroDivisionError"):
+        make_gymnasium("mjrec_test_broken:Local-v0", EnvironmentOptions())
+    with pytest.raises(mjrec.EnvironmentNotMade, match="no_such_module"):
+        make_gymnasium("no_such_module:Local-v0", EnvironmentOptions())
+    assert sys.path == path

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""dm_control's environments by their names, and dm_env's limit of steps."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjrec
+from mjrec.environments.episode_seeds import episode_seeds
+from mjrec.environments.from_name import environment_from_name
+from mjrec.environments.options import EnvironmentOptions
+
+dm_env = pytest.importorskip("dm_env")
+pytest.importorskip("dm_control")
+
+from absl.testing import absltest  # noqa: E402  after importorskip
+from dm_env import specs, test_utils  # noqa: E402  after importorskip
+
+from mjrec.environments.dm_control_environments import (  # noqa: E402  likewise
+    begin_episode,
+    make_dm_control,
+)
+from mjrec.environments.dm_env_episodes import (  # noqa: E402  likewise
+    StepLimit,
+    is_terminated,
+    is_truncated,
+)
+
+
+class Countdown(dm_env.Environment):  # type: ignore[misc]  # untyped
+    """Ends by itself after `length` steps, with a discount of 0."""
+
+    def __init__(self, length: int, discount: float = 0.5) -> None:
+        self._length = length
+        self._discount = discount
+        self._left = 0
+        self.closed = False
+        self.physics = "a physics"
+
+    def reset(self) -> Any:
+        self._left = self._length
+        return dm_env.restart(np.zeros(1))
+
+    def step(self, action: Any) -> Any:
+        if not self._left:
+            return self.reset()
+        self._left -= 1
+        if not self._left:
+            return dm_env.termination(1.0, np.zeros(1))
+        return dm_env.transition(1.0, np.ones(1), self._discount)
+
+    def observation_spec(self) -> Any:
+        return specs.Array((1,), np.float64)
+
+    def action_spec(self) -> Any:
+        return specs.BoundedArray((1,), np.float64, -1, 1)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class StepLimitContract(test_utils.EnvironmentTestMixin, absltest.TestCase):  # type: ignore[misc]  # untyped
+    """dm_env's own checks of an environment."""
+
+    def make_object_under_test(self) -> Any:
+        return StepLimit(Countdown(100), 3)
+
+
+def test_the_last_step_is_truncated_and_counts() -> None:
+    """It keeps reward, observation and discount; the next step begins an episode."""
+    env = StepLimit(Countdown(100), 3)
+    assert env.step(None).first()
+    steps = [env.step(None) for _ in range(3)]
+    assert [step.last() for step in steps] == [False, False, True]
+    assert (steps[2].reward, steps[2].discount) == (1.0, 0.5)
+    assert is_truncated(steps[2])
+    assert not is_terminated(steps[2])
+    assert env.step(None).first()
+
+
+def test_an_end_of_the_tasks_own_stays_one() -> None:
+    """Also when it falls on the limit."""
+    env = StepLimit(Countdown(3), 3)
+    env.reset()
+    for _ in range(2):
+        assert not is_terminated(env.step(None))
+    last = env.step(None)
+    assert is_terminated(last)
+    assert not is_truncated(last)
+
+
+def test_everything_else_is_the_environments_own() -> None:
+    """Monitors look for the physics."""
+    inner = Countdown(3)
+    env = StepLimit(inner, 2)
+    assert env.physics == "a physics"
+    assert not hasattr(env, "no_such_thing")
+    env.close()
+    assert inner.closed
+
+
+def test_a_task_is_made_with_its_own_limit() -> None:
+    """All but lqr have one; max_steps lowers it; lqr gets 1000."""
+    env = make_dm_control("ball_in_cup", "catch", EnvironmentOptions())
+    assert not isinstance(env, StepLimit)
+    assert env.control_timestep() == 0.02
+    limited = make_dm_control("ball_in_cup", "catch", EnvironmentOptions(max_steps=4))
+    begin_episode(limited, episode_seeds(0, 0))
+    action = np.zeros(2)
+    steps = [limited.step(action) for _ in range(4)]
+    assert [step.last() for step in steps] == [False, False, False, True]
+    assert is_truncated(steps[-1])
+    endless = make_dm_control("lqr", "lqr_2_1", EnvironmentOptions())
+    assert isinstance(endless, StepLimit)
+
+
+def test_the_last_step_of_a_suite_task_is_truncated() -> None:
+    """dm_control says discount 1 at its time limit."""
+    kwargs = {"task_kwargs": {"time_limit": 0.1}}
+    env = make_dm_control("ball_in_cup", "catch", EnvironmentOptions(kwargs=kwargs))
+    env.reset()
+    for _ in range(5):
+        step = env.step(np.zeros(2))
+    assert is_truncated(step)
+
+
+def test_the_run_seeds_what_is_drawn_when_a_task_is_made() -> None:
+    """The springs of lqr are part of its model."""
+
+    def springs(seed: int, **kwargs: Any) -> list[float]:
+        options = EnvironmentOptions(seed=seed, kwargs=kwargs)
+        env = make_dm_control("lqr", "lqr_2_1", options)
+        return list(env.physics.model.jnt_stiffness)
+
+    assert springs(1) == springs(1) != springs(2)
+    assert springs(1, task_kwargs={"random": 2}) == springs(2)
+
+
+def test_a_monitor_is_told_the_seed(tmp_path: Path) -> None:
+    """dm_env's reset takes none that it could see."""
+    env = make_dm_control("ball_in_cup", "catch", EnvironmentOptions())
+    with mjrec.Monitor(env, tmp_path, video_callable=False, env_id="x") as monitor:
+        begin_episode(monitor, episode_seeds(0, 0))
+        assert monitor.seed == episode_seeds(0, 0).environment
+
+
+def test_what_has_no_random_state_cannot_be_seeded() -> None:
+    """A run that cannot be repeated must not look as if it could."""
+    with pytest.raises(mjrec.InvalidArgument, match="Countdown cannot be seeded"):
+        begin_episode(Countdown(3), episode_seeds(0, 0))
+
+
+def test_arguments_reach_the_task_and_the_environment() -> None:
+    """In suite.load's own form; another is an error that shows it."""
+    kwargs = {
+        "task_kwargs": {"time_limit": 1},
+        "environment_kwargs": {"flat_observation": True},
+        "visualize_reward": True,
+    }
+    env = make_dm_control("cheetah", "run", EnvironmentOptions(kwargs=kwargs))
+    assert list(env.reset().observation) == ["observations"]
+    assert env.task.visualize_reward
+    with pytest.raises(mjrec.UnknownName, match=r"'time_limit'.*task_kwargs"):
+        make_dm_control("cheetah", "run", EnvironmentOptions(kwargs={"time_limit": 1}))
+    with pytest.raises(mjrec.EnvironmentNotMade, match=r"cheetah-run.*'q'") as e:
+        make_dm_control(
+            "cheetah", "run", EnvironmentOptions(kwargs={"task_kwargs": {"q": 1}})
+        )
+    assert isinstance(e.value.__cause__, TypeError)
+
+
+def test_unknown_names_list_those_there_are() -> None:
+    """Domains first, then the domain's tasks."""
+    with pytest.raises(mjrec.UnknownName, match=r"domain 'cheeta'.*cheetah.*walker"):
+        environment_from_name("dm_control/cheeta-run")
+    with pytest.raises(mjrec.UnknownName, match=r"'sit'.*stand, walk, run"):
+        environment_from_name("dm_control/humanoid-sit")
+
+
+@pytest.mark.parametrize(
+    ("name", "camera"),
+    [
+        ("dm_control/cheetah-run", "side"),
+        ("dm_control/ball_in_cup-catch", "cam0"),
+        ("dm_control/swimmer-swimmer6", "tracking1"),
+    ],
+)
+def test_the_view_follows_the_robot(name: str, camera: str) -> None:
+    """Or is the model's first camera; the monitor is given it, and the size."""
+    named = environment_from_name(name, EnvironmentOptions(height=48, width=64))
+    assert named.env_id == name
+    assert named.view == {"camera": camera, "height": 48, "width": 64}
+
+
+def test_a_camera_that_is_asked_for_is_checked() -> None:
+    """Before any episode begins; without pictures there is no view."""
+    named = environment_from_name(
+        "dm_control/cheetah-run", EnvironmentOptions(camera="back")
+    )
+    assert named.view == {"camera": "back"}
+    with pytest.raises(mjrec.UnknownName, match=r"'nose'.*side, back"):
+        environment_from_name(
+            "dm_control/cheetah-run", EnvironmentOptions(camera="nose")
+        )
+    named = environment_from_name(
+        "dm_control/cheetah-run", EnvironmentOptions(pictures=False)
+    )
+    assert named.view == {}
+
+
+def error_with_dm_control(package: Path, suite: str) -> str:
+    """Return what is said of a task where `dm_control.suite` is `suite`."""
+    (package / "dm_control").mkdir(parents=True)
+    (package / "dm_control" / "__init__.py").touch()
+    (package / "dm_control" / "suite.py").write_text(suite)
+    code = (
+        "import mjrec.environments.from_name as f\n"
+        "try: f.environment_from_name('dm_control/cheetah-run')\n"
+        "except Exception as error: print(type(error).__name__, error)\n"
+    )
+    env = {**os.environ, "PYTHONPATH": str(package)}
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        env=env,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return run.stdout
+
+
+def test_without_dm_control_the_line_to_run_is_named(tmp_path: Path) -> None:
+    """`mjrec[dm-control]`, which holds the right mujoco too."""
+    suite = "raise ModuleNotFoundError('No module', name='dm_control')"
+    said = error_with_dm_control(tmp_path, suite)
+    assert said.startswith("MissingDependency dm_control/cheetah-run needs dm_control")
+    assert 'pip install "mjrec[dm-control]"' in said
+
+
+@pytest.mark.parametrize("where", ["import", "load"])
+def test_a_mujoco_that_dm_control_does_not_know_names_the_fix(
+    tmp_path: Path, where: str
+) -> None:
+    """What dm_control 1.0.50 does with mujoco 4.0."""
+    failure = (
+        "raise AttributeError(\"'MjModel' object has no attribute 'flex_vertedge'\")"
+    )
+    suite = (
+        failure
+        if where == "import"
+        else "TASKS_BY_DOMAIN = {'cheetah': ['run']}\n"
+        f"def load(*args, **kwargs):\n    {failure}\n"
+    )
+    said = error_with_dm_control(tmp_path, suite)
+    assert said.startswith("MissingDependency dm_control/cheetah-run")
+    assert 'pip install "mujoco<4"' in said
+    assert "flex_vertedge" in said

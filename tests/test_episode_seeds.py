@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The seeds of an episode."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import mjrec
+from mjrec.environments.episode_seeds import EpisodeSeeds, episode_seeds
+
+
+def test_seeds_can_be_redone_by_hand() -> None:
+    """The recipe in the module's docstring gives the same numbers."""
+    words = np.random.SeedSequence([12, 34]).generate_state(3)
+    by_hand = [int(word) >> 1 for word in words]
+    assert list(dataclasses.astuple(episode_seeds(12, 34))) == by_hand
+
+
+def test_seeds_stay_what_they_were() -> None:
+    """Recordings of other years must be repeatable: the numbers are part of them."""
+    assert episode_seeds(0, 0) == EpisodeSeeds(
+        environment=1484405855, actions=1838574579, policy=372825380
+    )
+    assert episode_seeds(0, 1) == EpisodeSeeds(
+        environment=1982462498, actions=679461430, policy=1947452081
+    )
+
+
+def test_every_seed_of_a_run_is_another() -> None:
+    """Neither streams nor episodes nor runs share a seed."""
+    seeds = [
+        value
+        for run in range(10)
+        for episode in range(100)
+        for value in dataclasses.astuple(episode_seeds(run, episode))
+    ]
+    assert len(set(seeds)) == len(seeds)
+
+
+def test_seeds_are_valid_for_every_generator() -> None:
+    """NumPy's old generator, its new one and Gymnasium's take them."""
+    for episode in range(1000):
+        values = dataclasses.astuple(episode_seeds(2**32 - 1, episode))
+        assert all(type(value) is int and 0 <= value < 2**31 for value in values)
+    np.random.RandomState(values[0])
+
+
+def test_numpy_integers_are_numbers() -> None:
+    """A seed out of an array means what the Python number means."""
+    assert episode_seeds(np.int64(3), np.uint8(4)) == episode_seeds(3, 4)
+
+
+@pytest.mark.parametrize("bad", [-1, 2**32, 1.0, True, None, "1"])
+def test_what_is_no_seed_is_refused(bad: object) -> None:
+    """The message names the argument and says what it may be."""
+    with pytest.raises(mjrec.InvalidArgument, match=r"seed must be .*4294967295"):
+        episode_seeds(bad, 0)  # type: ignore[arg-type]  # is the point
+    with pytest.raises(mjrec.InvalidArgument, match="episode must be"):
+        episode_seeds(0, bad)  # type: ignore[arg-type]  # is the point
