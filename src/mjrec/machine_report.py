@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from .errors import EncoderError, Error, MissingDependency
 from .formats.ffmpeg import ffmpeg_executable, ffmpeg_version, run_ffmpeg
 from .gl import BACKENDS, Diagnosis, Probe, choose, diagnose, probe
-from .gl.backends import environment_for, platforms_contradict
+from .gl.backends import platforms_contradict
 from .machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
 
 __all__ = [
@@ -25,19 +25,26 @@ __all__ = [
     "examine_machine",
 ]
 
-# A distribution, the module by which it is tried, and what to run if it is missing.
+# A distribution, a program that uses it as a recording does but draws nothing, and what
+# to run if it is missing.
 _PACKAGES = (
     ("mjrec", "", ""),
-    ("mujoco", "mujoco", "python -m pip install mujoco"),
+    ("mujoco", "import mujoco", "python -m pip install mujoco"),
     (
         "gymnasium",
-        "gymnasium.envs.mujoco.mujoco_env",
+        "import gymnasium; gymnasium.make('InvertedPendulum-v5').reset()",
         "python -m pip install gymnasium",
     ),
-    ("dm_control", "dm_control.suite", 'python -m pip install "mjrec[dm-control]"'),
+    (
+        "dm_control",
+        # Importing is not enough: dm_control 1.0.50 fails at the first task if MuJoCo
+        # is too new for it.
+        "from dm_control import suite; suite.load('pendulum', 'swingup').reset()",
+        'python -m pip install "mjrec[dm-control]"',
+    ),
     ("numpy", "", ""),
 )
-_IMPORT_TIMEOUT = 120
+_PROGRAM_TIMEOUT = 120
 _SIDE = 64
 
 
@@ -48,7 +55,7 @@ class Package:
     Attributes:
         name: its name.
         version: None where it is not installed.
-        works: whether it can be imported; None where that was not tried.
+        works: whether its simplest task can be made; None where that was not tried.
         cause: why it does not work.
         fix: what to do about it, or how to install it.
     """
@@ -256,40 +263,41 @@ def _first_of(error: EncoderError) -> str:
     return said[-1] if said else str(error)
 
 
-def _examine_package(name: str, module: str, install: str) -> Package:
+def _examine_package(name: str, program: str, install: str) -> Package:
     try:
         version = importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return Package(name, None, fix=f"To install it:\n  {install}")
-    if not module:
+    if not program:
         return Package(name, version)
-    failure = _import_in_child(module)
+    failure = _run_in_child(program)
     if failure is None:
         return Package(name, version, works=True)
     known = diagnose(failure, environ=_WITHOUT_GL)
-    last = failure.strip().splitlines()[-1:] or ["It ended without a word."]
-    found = known or Diagnosis(last[0], f"Install it anew:\n  {install}")
+    found = known or Diagnosis(
+        failure.strip().splitlines()[-1], f"Install it anew:\n  {install}"
+    )
     return Package(name, version, works=False, cause=found.cause, fix=found.fix)
 
 
-# Whether something can be imported is another question than whether it can draw.
+# Whether a package works is another question than whether it can draw.
 _WITHOUT_GL = {"MUJOCO_GL": "off"}
 
 
-def _import_in_child(module: str) -> str | None:
-    """Return what went wrong when `module` was imported; None if nothing did."""
+def _run_in_child(program: str) -> str | None:
+    """Return what went wrong when `program` ran; None if nothing did."""
     try:
         done = subprocess.run(
-            [sys.executable, "-P", "-c", f"import {module}"],
-            env={**environment_for("egl", os.environ), **_WITHOUT_GL},
+            [sys.executable, "-P", "-c", program],
+            env={**os.environ, **_WITHOUT_GL},
             stdin=subprocess.DEVNULL,
             capture_output=True,
-            timeout=_IMPORT_TIMEOUT,
+            timeout=_PROGRAM_TIMEOUT,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return f"The import did not end within {_IMPORT_TIMEOUT} seconds."
+        return f"It did not end within {_PROGRAM_TIMEOUT} seconds."
     if done.returncode == 0:
         return None
-    said = done.stderr.decode(errors="replace")
-    return said or f"The import ended with status {done.returncode}."
+    said = done.stderr.decode(errors="replace").strip()
+    return said or f"It ended with status {done.returncode}."

@@ -25,9 +25,9 @@ _DEEPER = 14
 def doctor(*, json: bool = False) -> int:
     """Show whether this machine can record, and what to do if it cannot.
 
-    Tries each OpenGL backend with a real picture, ffmpeg with a real video, and the
-    packages by importing them; each in a process of its own. The exit status is 0 if
-    a recording would get pictures, else 1.
+    Tries each OpenGL backend with a real picture, ffmpeg with a real video, and each
+    package with its simplest task, all in processes of their own. The exit status is 0
+    if a recording would get pictures, else 1.
 
     Args:
         json: print one JSON object instead.

@@ -407,12 +407,12 @@ def _no_access(failure: _Failure) -> Diagnosis | None:
 
 
 def _missing_package(failure: _Failure) -> Diagnosis | None:
-    found = failure.search(r"No module named '(mujoco|OpenGL|glfw)\b")
+    found = failure.search(r"No module named '(\w+)")
     if not found:
         return None
-    package = {"OpenGL": "pyopengl"}.get(found[1], found[1])
+    package = {"OpenGL": "pyopengl", "dm_control": "dm-control"}.get(found[1], found[1])
     return Diagnosis(
-        f"The Python package {package} is not installed.",
+        f"The Python package {found[1]} is not installed.",
         f"Run:{_commands(f'python -m pip install {package}')}",
     )
 

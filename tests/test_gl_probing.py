@@ -1,0 +1,374 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each known failure is brought about, in a child process, and explained."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjrec.gl import Probe, probe, probing
+from mjrec.gl.probing import probe_environment
+from mjrec.simulation import gl_probe
+
+_EGL_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
+
+
+def probe_with(backend: str, **variables: str) -> Probe:
+    """Probe with the test's environment, free of what chooses OpenGL, and these."""
+    chosen = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
+    screen = ("DISPLAY", "WAYLAND_DISPLAY", "XDG_SESSION_TYPE")
+    environ = {k: v for k, v in os.environ.items() if k not in chosen + screen}
+    return probe_environment({**environ, "MUJOCO_GL": backend, **variables})
+
+
+def python_that_starts_with(folder: Path, code: str) -> dict[str, str]:
+    """Return the variables that make every Python run `code` first."""
+    (folder / "sitecustomize.py").write_text(code)
+    return {"PYTHONPATH": str(folder)}
+
+
+def test_egl_renders_and_says_with_what() -> None:
+    """A real picture, its speed, OpenGL's words and EGL's devices."""
+    answer = probe("egl", measure=True)
+    assert answer.renders, f"{answer.cause}\n{answer.fix}\n{answer.output}"
+    assert answer.gl_renderer
+    assert answer.gl_vendor
+    assert answer.gl_version[0].isdigit()
+    assert answer.frames_per_second is not None
+    assert answer.frames_per_second > 0
+    assert [device.index for device in answer.devices] == [*range(len(answer.devices))]
+    assert sum(device.in_use for device in answer.devices) == 1
+
+
+def test_osmesa_renders() -> None:
+    """A real picture by OSMesa, where its library can be had."""
+    answer = probe("osmesa")
+    if not answer.renders:
+        pytest.skip(f"{answer.cause} {answer.fix}")
+    assert answer.software
+
+
+def test_a_measured_answer_is_kept() -> None:
+    """The second question is answered without another child process."""
+    first = probe("egl", measure=True)
+    assert probe("egl") is first
+    assert probe("egl", measure=True) is first
+
+
+def test_another_environment_is_another_question(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An answer is not used again after a variable has changed."""
+    assert probe("egl").renders
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "99")
+    assert not probe("egl").renders
+
+
+def test_glfw_without_a_display() -> None:
+    """The missing DISPLAY is named."""
+    answer = probe_with("glfw")
+    assert not answer.renders
+    assert "DISPLAY is not set" in answer.cause
+    assert "MUJOCO_GL to egl" in answer.fix
+    assert "xvfb-run" in answer.fix
+
+
+def test_glfw_with_a_display_that_does_not_answer() -> None:
+    """The display that was tried is named."""
+    assert "cannot open :77" in probe_with("glfw", DISPLAY=":77").cause
+
+
+@pytest.mark.parametrize(
+    ("backend", "platform"), [("egl", "osmesa"), ("osmesa", "egl"), ("egl", "glx")]
+)
+def test_pyopengl_platform_against_mujoco_gl(backend: str, platform: str) -> None:
+    """Both variables are named, and the one to take away."""
+    answer = probe_with(backend, PYOPENGL_PLATFORM=platform)
+    assert not answer.renders
+    assert f"PYOPENGL_PLATFORM ({platform}) contradicts" in answer.cause
+    assert f"({backend})" in answer.cause
+    assert "unset PYOPENGL_PLATFORM" in answer.fix
+
+
+def test_device_number_out_of_range() -> None:
+    """The number asked for and those there are."""
+    answer = probe_with("egl", MUJOCO_EGL_DEVICE_ID="99")
+    assert "MUJOCO_EGL_DEVICE_ID=99, and EGL sees" in answer.cause
+    assert "Set MUJOCO_EGL_DEVICE_ID to" in answer.fix
+
+
+def test_device_that_is_no_number() -> None:
+    """The variable behind `invalid literal for int()` is named."""
+    answer = probe_with("egl", MUJOCO_EGL_DEVICE_ID="abc")
+    assert answer.cause == "MUJOCO_EGL_DEVICE_ID=abc is not a whole number."
+
+
+def test_rendering_turned_off() -> None:
+    """MUJOCO_GL=off shows as a missing attribute otherwise."""
+    assert "MUJOCO_GL=off turns rendering off" in probe_with("off").cause
+
+
+def test_name_of_no_backend() -> None:
+    """What mujoco says of a misspelt name is explained."""
+    assert "MUJOCO_GL=nonsense is not a backend" in probe_with("nonsense").cause
+
+
+def test_variable_that_hides_the_drivers() -> None:
+    """The variable is the cause, not a missing package."""
+    answer = probe_with("egl", __EGL_VENDOR_LIBRARY_FILENAMES="/nonexistent")
+    assert "only in __EGL_VENDOR_LIBRARY_FILENAMES (/nonexistent)" in answer.cause
+    assert "unset __EGL_VENDOR_LIBRARY_FILENAMES" in answer.fix
+
+
+def test_vendor_file_of_a_library_that_is_missing(tmp_path: Path) -> None:
+    """Both the file and the library that it names are named."""
+    file = tmp_path / "50_gone.json"
+    icd = {"file_format_version": "1.0.0", "ICD": {"library_path": "libgone.so.0"}}
+    file.write_text(json.dumps(icd))
+    answer = probe_with("egl", __EGL_VENDOR_LIBRARY_FILENAMES=str(file))
+    assert f"libgone.so.0, named in {file}, cannot be loaded" in answer.cause
+
+
+@pytest.mark.parametrize(
+    ("backend", "library"), [("egl", "libEGL.so"), ("osmesa", "libOSMesa.so")]
+)
+def test_damaged_library(backend: str, library: str, tmp_path: Path) -> None:
+    """A library that is there and broken is told from one that is missing."""
+    # PyOpenGL tries every number.
+    for name in [library, *(f"{library}.{number}" for number in range(10))]:
+        (tmp_path / name).touch()
+    answer = probe_with(backend, LD_LIBRARY_PATH=str(tmp_path))
+    assert "library is there and cannot be loaded" in answer.cause
+    assert "file too short" in answer.cause
+
+
+def test_crash_of_the_driver(tmp_path: Path) -> None:
+    """A crash ends the child only, and is an answer."""
+    variables = python_that_starts_with(tmp_path, "import ctypes; ctypes.string_at(0)")
+    answer = probe_with("egl", **variables)
+    assert "The driver crashed (SIGSEGV)" in answer.cause
+
+
+def test_hang_ends_with_where_it_hangs() -> None:
+    """The child ends itself, and the traceback of its wait is kept."""
+    answer = probe_environment({**os.environ, "MUJOCO_GL": "egl"}, timeout=0.02)
+    assert "The driver hangs" in answer.cause
+    assert "most recent call first" in answer.output
+
+
+def test_hang_that_no_traceback_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A child that is deaf to its own clock is killed."""
+    monkeypatch.setattr(probing, "_GRACE", 0.2)
+    variables = python_that_starts_with(tmp_path, "import signal; signal.pause()")
+    environ = {**os.environ, "MUJOCO_GL": "egl", **variables}
+    answer = probe_environment(environ, timeout=0.2)
+    assert "The driver hangs" in answer.cause
+    assert "no answer within 0.2 seconds" in answer.output
+
+
+def test_unknown_failure_keeps_its_words(tmp_path: Path) -> None:
+    """What nobody has explained yet is shown as it was said."""
+    code = "raise SystemExit('the moon is in the wrong quarter')"
+    answer = probe_with("egl", **python_that_starts_with(tmp_path, code))
+    assert "the moon is in the wrong quarter" in answer.cause
+    assert answer.fix == ""
+
+
+def test_software_on_a_machine_with_a_gpu_is_odd(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A GPU that is not used is named; without one there is nothing to say."""
+    software = Probe("egl", renders=True, gl_renderer="llvmpipe (LLVM 15)")
+    hardware = Probe("egl", renders=True, gl_renderer="NVIDIA H200/PCIe/SSE2")
+    assert software.software
+    assert not hardware.software
+    monkeypatch.setattr(probing, "gpu_device_files", list)
+    assert software.warning() == ""
+    device = tmp_path / "nvidia0"
+    device.touch()
+    monkeypatch.setattr(probing, "gpu_device_files", lambda: [str(device)])
+    assert "llvmpipe (LLVM 15)" in software.warning()
+    assert str(device) in software.warning()
+    assert "NVIDIA_DRIVER_CAPABILITIES" in software.warning()
+    assert hardware.warning() == ""
+
+
+# --- What a picture must show -------------------------------------------------------
+
+
+def scene_picture() -> np.ndarray:
+    """What the probe's scene looks like, roughly."""
+    picture = np.full((480, 480, 3), 60, np.uint8)
+    picture[250:350, 50:160] = (255, 0, 0)
+    picture[250:350, 320:430] = (0, 0, 255)
+    picture[125:210, 200:280] = (0, 255, 0)
+    return picture
+
+
+def test_a_good_picture_passes() -> None:
+    """The three colours are in their places."""
+    gl_probe.check_picture(scene_picture())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (np.zeros_like, r"Every pixel of the picture is \(0, 0, 0\)"),
+        (lambda p: np.full_like(p, 200), "Every pixel"),
+        (lambda p: p[:, ::-1], "red on the left"),
+        (lambda p: p[::-1], "red on the left"),
+        (lambda p: p[..., ::-1], "red on the left"),
+        (lambda p: np.random.default_rng(0).integers(0, 255, p.shape), "on the left"),
+    ],
+    ids=["black", "constant", "mirrored", "upside-down", "BGR", "noise"],
+)
+def test_a_bad_picture_is_found_out(spoil: object, said: str) -> None:
+    """A context that works and a picture that is wrong is a failure."""
+    assert callable(spoil)
+    with pytest.raises(gl_probe.WrongPicture, match=said):
+        gl_probe.check_picture(spoil(scene_picture()))
+
+
+# --- Libraries that are not there ---------------------------------------------------
+#
+# In a mount namespace of its own, the system's library directory is one of links to
+# all that is in it but what is hidden.
+
+_LIBRARIES = Path("/usr/lib", sysconfig.get_config_var("MULTIARCH") or "nowhere")
+_VENDORS = "/usr/share/glvnd/egl_vendor.d"
+_HIDE = r"""
+set -e
+libraries=$1 place=$2 vendors=$3 hidden=$4 added=$5
+shift 5
+mkdir "$place/all" "$place/view" "$place/empty"
+mount --rbind "$libraries" "$place/all"
+cd "$place/view"
+ls -A "$place/all" | while read -r name; do
+  for pattern in $hidden; do
+    case $name in $pattern) continue 2;; esac
+  done
+  printf '%s\0' "$place/all/$name"
+done | xargs -0 ln -s -t .
+[ -z "$added" ] || touch "$added"
+mount --bind "$place/view" "$libraries"
+[ -z "$vendors" ] || mount --bind "$place/empty" "$vendors"
+cd /
+exec "$@"
+"""
+_PROBE = """
+import dataclasses, json, sys
+from mjrec.gl import probe
+print(json.dumps(dataclasses.asdict(probe(sys.argv[1]))))
+"""
+
+
+@pytest.fixture(scope="module")
+def namespaces() -> str:
+    """`unshare`, where this user may have mount namespaces."""
+    unshare = shutil.which("unshare")
+    if unshare is None:
+        pytest.skip("hiding a library takes `unshare`, which is not installed")
+    tried = subprocess.run(
+        [unshare, "-Urm", "mount", "--bind", "/usr", "/usr"],
+        capture_output=True,
+        check=False,
+    )
+    if tried.returncode != 0:
+        said = tried.stderr.decode().strip()
+        pytest.skip(f"hiding a library takes a mount namespace: {said}")
+    if not (_LIBRARIES / "libEGL.so.1").exists():
+        pytest.skip(f"libEGL.so.1 is not in {_LIBRARIES}, where it could be hidden")
+    return unshare
+
+
+@pytest.mark.parametrize(
+    ("backend", "hidden", "added", "vendors", "causes", "fix"),
+    [
+        (
+            "egl",
+            "libEGL.so*",
+            "",
+            "",
+            ["EGL's library, libEGL.so.1, is not installed."],
+            _EGL_PACKAGES,
+        ),
+        (
+            "egl",
+            "libEGL_mesa.so*",
+            "",
+            "",
+            ["libEGL_mesa.so.0, named in"],
+            _EGL_PACKAGES,
+        ),
+        ("egl", "", "", _VENDORS, ["no driver for it"], _EGL_PACKAGES),
+        (
+            "egl",
+            # Mesa's drivers; since 24.2 they are one library that EGL's needs.
+            "dri libgallium-*",
+            "",
+            "",
+            ["Mesa's driver swrast is not installed", "libEGL_mesa.so.0, named in"],
+            _EGL_PACKAGES,
+        ),
+        (
+            "osmesa",
+            "libOSMesa.so*",
+            "",
+            "",
+            ["OSMesa's library, libOSMesa.so.8, is not installed."],
+            "libosmesa6 libgl1",
+        ),
+        (
+            "osmesa",
+            "libOSMesa.so*",
+            "libgallium-25.1.3-1.so",
+            "",
+            ["Mesa 25.1.3 has no OSMesa"],
+            "set MUJOCO_GL=egl",
+        ),
+    ],
+    ids=[
+        "libEGL",
+        "EGL driver's library",
+        "EGL vendor file",
+        "Mesa's drivers",
+        "libOSMesa",
+        "OSMesa since Mesa 25.1",
+    ],
+)
+def test_missing_library(
+    namespaces: str,
+    backend: str,
+    hidden: str,
+    added: str,
+    vendors: str,
+    causes: list[str],
+    fix: str,
+    tmp_path: Path,
+) -> None:
+    """What is missing is named, and the packages that bring it."""
+    hide = [str(_LIBRARIES), str(tmp_path), vendors, hidden, added]
+    done = subprocess.run(
+        [
+            *[namespaces, "-Urm", "bash", "-c", _HIDE, "hide", *hide],
+            *[sys.executable, "-P", "-c", _PROBE, backend],
+        ],
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    answer = json.loads(done.stdout)
+    assert not answer["renders"]
+    assert any(cause in answer["cause"] for cause in causes), answer
+    assert fix in answer["fix"]
