@@ -22,7 +22,9 @@ __all__ = [
     "Ffmpeg",
     "MachineReport",
     "Package",
+    "examine_ffmpeg",
     "examine_machine",
+    "examine_package",
 ]
 
 # A distribution, a program that uses it as a recording does but draws nothing, and what
@@ -149,8 +151,8 @@ def examine_machine() -> MachineReport:
         backends=tuple(probes.values()),
         problems=tuple(_problems(chosen, probes)),
         gpu_device_files=tuple(gpu_device_files()),
-        ffmpeg=_examine_ffmpeg(),
-        packages=tuple(_examine_package(*package) for package in _PACKAGES),
+        ffmpeg=examine_ffmpeg(),
+        packages=tuple(examine_package(*package) for package in _PACKAGES),
         cpus=_examine_cpus(),
         python=platform.python_version(),
         platform=platform.platform(),
@@ -218,16 +220,18 @@ def _examine_cpus() -> Cpus:
     )
 
 
-def _examine_ffmpeg() -> Ffmpeg:
+def examine_ffmpeg() -> Ffmpeg:
+    """Find ffmpeg and encode a picture with it."""
     try:
         path = ffmpeg_executable()
     except (MissingDependency, EncoderError) as error:
         return Ffmpeg(None, cause=str(error), fix=_OTHER_FFMPEG)
+    version = ""
     try:
         version = ffmpeg_version()
         _encode_a_frame()
     except EncoderError as error:
-        return Ffmpeg(path, cause=_first_of(error), fix=_OTHER_FFMPEG)
+        return Ffmpeg(path, version, cause=_last_words(error), fix=_OTHER_FFMPEG)
     return Ffmpeg(path, version, encodes=True)
 
 
@@ -258,12 +262,20 @@ def _encode_a_frame() -> None:
         )
 
 
-def _first_of(error: EncoderError) -> str:
+def _last_words(error: EncoderError) -> str:
     said = error.stderr.strip().splitlines()
     return said[-1] if said else str(error)
 
 
-def _examine_package(name: str, program: str, install: str) -> Package:
+def examine_package(name: str, program: str, install: str) -> Package:
+    """Look for a package and try it.
+
+    Args:
+        name: the distribution's name.
+        program: Python code that uses it; run in a process of its own, without OpenGL.
+            Empty where the version is enough.
+        install: the command that installs it.
+    """
     try:
         version = importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:

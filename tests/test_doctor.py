@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec doctor`: what it says, to people and to scripts, and its exit status."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from mjrec.commands.doctor import show_report
+from mjrec.gl import Diagnosis, EglDevice, Probe
+from mjrec.machine_report import (
+    Cpus,
+    Ffmpeg,
+    MachineReport,
+    Package,
+    examine_ffmpeg,
+    examine_package,
+)
+
+_PATH = "/opt/" + "a-long-path/" * 8 + "ffmpeg"
+_APT = "apt-get install -y libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
+
+
+def run_doctor(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    unset = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY", "COLUMNS")
+    environ = {k: v for k, v in os.environ.items() if k not in unset}
+    return subprocess.run(
+        [sys.executable, "-P", "-m", "mjrec", "doctor", *arguments],
+        env={**environ, **variables},
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def healthy() -> subprocess.CompletedProcess[str]:
+    return run_doctor("--json")
+
+
+@pytest.fixture
+def facts(healthy: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    parsed = json.loads(healthy.stdout)
+    assert isinstance(parsed, dict)
+    return parsed
+
+
+def test_status_0_where_something_renders(
+    healthy: subprocess.CompletedProcess[str], facts: dict[str, Any]
+) -> None:
+    """EGL renders here, and mjrec would use it."""
+    assert healthy.returncode == 0, healthy.stderr
+    assert facts["can_render"] is True
+    assert facts["backend"] == "egl"
+    assert facts["reason"] == "the first that renders"
+
+
+def test_the_keys_are_stable(facts: dict[str, Any]) -> None:
+    """Scripts may rely on them; a new one is added here, none is renamed."""
+    assert list(facts) == [
+        "can_render",
+        "backend",
+        "reason",
+        "backends",
+        "problems",
+        "gpu_device_files",
+        "ffmpeg",
+        "packages",
+        "cpus",
+        "python",
+        "platform",
+    ]
+    assert list(facts["backends"][0]) == [
+        "backend",
+        "renders",
+        "gl_renderer",
+        "gl_vendor",
+        "gl_version",
+        "frames_per_second",
+        "devices",
+        "cause",
+        "fix",
+        "output",
+    ]
+    assert list(facts["packages"][0]) == ["name", "version", "works", "cause", "fix"]
+    assert list(facts["ffmpeg"]) == ["path", "version", "encodes", "cause", "fix"]
+    assert list(facts["cpus"]) == ["usable", "present", "allowed", "quota"]
+
+
+def test_each_backend_is_tried(facts: dict[str, Any]) -> None:
+    """Speed and renderer of those that render, cause and fix of the others."""
+    by_name = {tried["backend"]: tried for tried in facts["backends"]}
+    assert list(by_name) == ["egl", "osmesa", "glfw"]
+    assert by_name["egl"]["frames_per_second"] > 0
+    assert by_name["egl"]["gl_renderer"]
+    assert not by_name["glfw"]["renders"]
+    assert "DISPLAY is not set" in by_name["glfw"]["cause"]
+    assert by_name["glfw"]["fix"]
+
+
+def test_ffmpeg_and_versions(facts: dict[str, Any]) -> None:
+    """What is installed, and that it works."""
+    assert facts["ffmpeg"]["encodes"] is True
+    assert Path(facts["ffmpeg"]["path"]).is_file()
+    assert facts["ffmpeg"]["version"].startswith("ffmpeg version")
+    assert facts["python"] == platform.python_version()
+    assert facts["cpus"]["usable"] >= 1
+    packages = {package["name"]: package for package in facts["packages"]}
+    assert list(packages) == ["mjrec", "mujoco", "gymnasium", "dm_control", "numpy"]
+    for name in ("mujoco", "gymnasium", "numpy"):
+        assert packages[name]["version"] == importlib.metadata.version(name)
+    assert packages["gymnasium"]["works"] is True, packages["gymnasium"]
+
+
+def test_an_unset_variable_is_a_note(facts: dict[str, Any]) -> None:
+    """It is no failure: other programs choose GLFW then."""
+    (note,) = facts["problems"]
+    assert "MUJOCO_GL is not set" in note["cause"]
+    assert "export MUJOCO_GL=egl" in note["fix"]
+
+
+def test_status_1_where_nothing_may_render() -> None:
+    """MUJOCO_GL=off: people read why, and what would render."""
+    done = run_doctor(MUJOCO_GL="off")
+    assert done.returncode == 1
+    assert "cannot render" in done.stdout
+    assert "turns rendering" in done.stdout
+    assert "export MUJOCO_GL=egl" in done.stdout
+    assert "Traceback" not in done.stderr
+
+
+def report_of(**changed: Any) -> MachineReport:
+    """Return a report of a machine with a bit of everything."""
+    report = MachineReport(
+        can_render=True,
+        backend="egl",
+        reason="the first that renders",
+        backends=(
+            Probe(
+                "egl",
+                renders=True,
+                gl_renderer="llvmpipe (LLVM 15.0.6, 256 bits)",
+                gl_version="4.5 Mesa [22.3.6]",
+                frames_per_second=12.345,
+                devices=(EglDevice(0, "/dev/dri/renderD128", 3, True, True),),
+            ),
+            Probe(
+                "osmesa",
+                renders=False,
+                cause="[bold]It[/bold] is missing.",
+                fix=f"As root:\n  {_APT}",
+            ),
+        ),
+        problems=(Diagnosis("Something is odd.", "Do:\n  export X=1"),),
+        gpu_device_files=("/dev/nvidia0",),
+        ffmpeg=Ffmpeg(_PATH, "ffmpeg version 9 Copyright (c) 2000", encodes=True),
+        packages=(
+            Package("gymnasium", "1.4.0", works=True),
+            Package("dm_control", None, fix="To install it:\n  pip install x"),
+            Package("mujoco", "9", works=False, cause="It is too new.", fix="Wait."),
+        ),
+        cpus=Cpus(usable=2, present=64, allowed=4, quota=2.5),
+        python="3.11.7",
+        platform="Linux",
+    )
+    return dataclasses.replace(report, **changed)
+
+
+def shown(report: MachineReport) -> str:
+    console = Console(width=80, file=io.StringIO(), highlight=False)
+    show_report(report, console)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_what_people_see() -> None:
+    """Every fact is there, and brackets are no markup."""
+    text = shown(report_of())
+    for said in (
+        "12.3 frames a second",
+        "llvmpipe (LLVM 15.0.6, 256 bits), on the CPU",
+        "4.5 Mesa [22.3.6]",
+        "EGL device 0: the CPU, /dev/dri/renderD128, CUDA device 3, used",
+        "Cause: [bold]It[/bold] is missing.",
+        "uses egl (the first that renders)",
+        "Something is odd.",
+        "not installed",
+        "Cause: It is too new.",
+        "2 usable (4 allowed of 64 present, a quota of 2.5)",
+        "/dev/nvidia0",
+    ):
+        assert said in text
+
+
+def test_eighty_columns_and_commands_in_one_piece() -> None:
+    """Lines fit a terminal; what is to be copied is never broken."""
+    lines = [line.rstrip() for line in shown(report_of()).splitlines()]
+    assert f"    {_APT}" in lines
+    assert _PATH in "\n".join(lines)
+    assert [line for line in lines if len(line) > 80 and _PATH not in line] == []
+
+
+def test_a_long_error_is_not_said_twice() -> None:
+    """The causes stand with the backends; the verdict is one line."""
+    text = shown(
+        report_of(backend=None, can_render=False, reason="Nothing renders.\negl: why")
+    )
+    assert "Nothing renders." in text
+    assert "egl: why" not in text
+
+
+def test_ffmpeg_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that is no ffmpeg is named, with a way out."""
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
+    found = examine_ffmpeg()
+    assert found.path == "/bin/false"
+    assert not found.encodes
+    assert found.cause
+    assert "IMAGEIO_FFMPEG_EXE" in found.fix
+
+
+def test_ffmpeg_without_libx264(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An ffmpeg that cannot encode H.264 is found out, in its own words."""
+    good = examine_ffmpeg()
+    fake = tmp_path / "ffmpeg"
+    fake.write_text(
+        '#!/bin/sh\nfor argument do\n  [ "$argument" = libx264 ] && '
+        "{ echo \"Unknown encoder 'libx264'\" >&2; exit 8; }\ndone\n"
+        f'exec {good.path} "$@"\n'
+    )
+    fake.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake))
+    found = examine_ffmpeg()
+    assert found.version == good.version
+    assert not found.encodes
+    assert "Unknown encoder 'libx264'" in found.cause
+
+
+def test_a_package_that_is_not_installed() -> None:
+    """That is no failure, and it is said how to install it."""
+    found = examine_package("mjrec-there-is-no-such", "import nothing", "pip install x")
+    assert (found.version, found.works) == (None, None)
+    assert "pip install x" in found.fix
+
+
+@pytest.mark.parametrize(
+    ("program", "cause", "fix"),
+    [
+        (
+            "raise AttributeError(\"'MjModel' object has no attribute "
+            "'flex_vertedge'\")",
+            "does not know MuJoCo 4",
+            'pip install "mujoco<4"',
+        ),
+        ("import mjrec_no_such", "mjrec_no_such is not installed", "mjrec_no_such"),
+        ("raise ValueError('of its own')", "ValueError: of its own", "pip install y"),
+        ("import ctypes; ctypes.string_at(0)", "status -11", "pip install y"),
+    ],
+)
+def test_a_package_that_does_not_work(program: str, cause: str, fix: str) -> None:
+    """A failure in a child process has a cause and a fix; even a crash."""
+    found = examine_package("numpy", program, "pip install y")
+    assert found.works is False
+    assert cause in found.cause
+    assert fix in found.fix
