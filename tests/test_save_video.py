@@ -125,8 +125,15 @@ def test_a_generator_is_streamed_and_read_no_further_than_needed(
 
 
 def test_a_generator_serves_both_triggers(tmp_path: Path) -> None:
-    """With a step trigger the frames are kept, so that each video finds them."""
-    mjrec.save_video(iter(shades(5)), tmp_path, always, lambda step: step == 2, fps=30)
+    """With a step trigger the frames are kept, also those of one reused buffer."""
+
+    def frames() -> Iterator[Frame]:
+        buffer = shade(0)
+        for number in range(5):
+            buffer[:] = shade(number)
+            yield buffer
+
+    mjrec.save_video(frames(), tmp_path, always, lambda step: step == 2, fps=30)
     assert shown(tmp_path / "rl-video-episode-0.mp4") == [0, 1, 2, 3, 4]
     assert shown(tmp_path / "rl-video-step-2.mp4") == [3, 4]
 
