@@ -410,6 +410,19 @@ def test_what_a_constructor_raises_is_one_error_with_its_cause(register: Any) ->
     assert isinstance(e.value.__cause__, ZeroDivisionError)
 
 
+def test_a_bare_assertion_says_where_it_stands(register: Any) -> None:
+    """There is nothing else to go by."""
+
+    def broken(**kwargs: Any) -> Any:
+        raise AssertionError
+
+    register("Asserting-v0", broken)
+    with pytest.raises(
+        mjrec.EnvironmentNotMade, match=r"AssertionError in .*test_environments.py, "
+    ):
+        make_gymnasium("Asserting-v0", EnvironmentOptions())
+
+
 def test_what_is_not_installed_is_named_with_its_command(register: Any) -> None:
     """Gymnasium's own message has the command between backticks."""
 

@@ -53,7 +53,7 @@ class StepLimit(dm_env.Environment):  # type: ignore[misc]  # untyped
         if self._ended:
             return self.reset()
         timestep = self._environment.step(action)
-        self._steps = 0 if timestep.first() else self._steps + 1
+        self._steps += 1
         if self._steps >= self._max_steps:
             timestep = timestep._replace(step_type=dm_env.StepType.LAST)
         self._ended = timestep.last()

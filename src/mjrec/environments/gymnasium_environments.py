@@ -7,6 +7,7 @@ import contextlib
 import importlib
 import importlib.util
 import re
+import traceback
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -122,7 +123,7 @@ def _spec(env_id: str) -> registration.EnvSpec:
     if spec is None:
         raise UnknownName(
             "Gymnasium environment",
-            env_id,
+            name,
             registration.registry,
             hint="A package that registers its environments when it is imported is "
             "named before a colon (gymnasium_robotics:FetchReach-v4); other names are "
@@ -182,7 +183,11 @@ def _missing_dependency(env_id: str, error: Exception) -> Error:
 
 
 def _what_was_raised(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
+    if str(error):
+        return f"{type(error).__name__}: {error}"
+    # A bare assertion says nothing but where it stands.
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__} in {place.filename}, line {place.lineno}"
 
 
 def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
