@@ -146,11 +146,26 @@ def test_the_first_camera_that_follows_is_chosen() -> None:
 
 def test_following_the_robot_comes_before_following_a_part() -> None:
     """`trackcom` before `track`, which is all that some models have."""
-    part = '<camera name="hand" mode="track"/>'
+    part = '<camera name="trunk" mode="track"/>'
 
-    assert tracking_camera(model_with("", part)) == "hand"
+    assert tracking_camera(model_with("", part)) == "trunk"
     robot = '<camera name="robot" mode="trackcom"/>'
     assert tracking_camera(model_with("", part + robot)) == "robot"
+
+
+def test_a_camera_on_the_hand_of_a_fixed_arm_follows_no_robot() -> None:
+    """It would show a close-up; dm_control's reacher and manipulator have one."""
+    arm = """
+        <body><joint/><geom size=".1"/>
+          <body><joint type="slide"/><geom size=".1"/>
+            <camera name="hand" mode="track"/>
+          </body>
+        </body>
+    """
+
+    assert tracking_camera(model_with(arm)) is None
+    robot = '<camera name="robot" mode="track"/>'
+    assert tracking_camera(model_with(arm, robot)) == "robot"
 
 
 def test_a_nameless_camera_that_follows_is_a_number() -> None:

@@ -10,7 +10,6 @@ import textwrap
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import gymnasium
@@ -406,6 +405,19 @@ def test_any_thread_may_ask(
     assert [np.array_equal(one, expected) for one in pictures] == [True] * 3
 
 
+def test_a_foreign_context_freed_on_the_thread_does_no_harm(
+    renderer: SceneRenderer, table: tuple[mujoco.MjModel, mujoco.MjData]
+) -> None:
+    """Garbage collection may do so; mujoco 3 then lets go of the current context."""
+    foreign = mujoco.GLContext(8, 8)
+    first = renderer.render(table[1])
+
+    renderer._thread.call(foreign.free)
+
+    assert first.std() > 5
+    assert np.array_equal(renderer.render(table[1]), first)
+
+
 # Its life
 
 
@@ -592,6 +604,30 @@ def test_leaving_without_closing_is_silent(order: str) -> None:
     assert "mjrec" not in done.stderr
 
 
+def test_leaving_in_the_midst_of_a_picture_is_silent() -> None:
+    """Ctrl-C while the driver draws: it is waited for before EGL is shut down."""
+    script = f"""
+        import signal
+        import mujoco
+        from mjrec.simulation.renderer import SceneRenderer
+        model = mujoco.MjModel.from_xml_path({str(ASSETS / "showcase.xml")!r})
+        data = mujoco.MjData(model)
+        renderer = SceneRenderer(model, height=480, width=640)
+        renderer.render(data)
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        try:
+            renderer.render(data)
+        except KeyboardInterrupt:
+            print("interrupted")
+    """
+
+    done = run_script(script)
+
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "interrupted\n"
+
+
 @pytest.mark.parametrize("drawn_by", ["SceneRenderer", "mujoco.Renderer"])
 def test_a_forked_child_is_told_instead_of_hanging(drawn_by: str) -> None:
     """Mesa's threads are not copied by fork, and their work is waited for."""
@@ -706,21 +742,45 @@ def test_a_driver_that_hangs_is_not_waited_for(
     driver.set()
 
 
-def test_ctrl_c_in_the_midst_of_a_picture_harms_nothing() -> None:
-    """The next picture waits for the one that was given up."""
+@pytest.fixture
+def alarm() -> Iterator[None]:
+    """Ctrl-C, a hundredth of a second from now."""
+    earlier = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.01)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, earlier)
+
+
+def test_what_ctrl_c_interrupted_is_waited_for(thread: GLThread, alarm: None) -> None:
+    """The thread may be reading a scene that the caller is about to change."""
+    driver = threading.Event()
+    ended: list[bool] = []
+    with pytest.raises(KeyboardInterrupt):
+        thread.call(lambda: ended.append(driver.wait()))
+
+    threading.Timer(0.05, driver.set).start()
+    thread.settle()
+
+    assert ended == [True]
+    assert thread.call(lambda: 3) == 3
+
+
+def test_a_picture_after_ctrl_c_is_right() -> None:
+    """It is not the one that was given up."""
     model, data = load("showcase")
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
     with SceneRenderer(model, height=480, width=640, camera="overview") as renderer:
-        expected = renderer.render(data)
-        earlier = signal.signal(signal.SIGALRM, interrupt)
+        earlier = signal.signal(signal.SIGALRM, signal.default_int_handler)
+        first = renderer.render(data)
         try:
-            signal.setitimer(signal.ITIMER_REAL, 0.005)
+            signal.setitimer(signal.ITIMER_REAL, 0.01)
             with pytest.raises(KeyboardInterrupt):
                 renderer.render(data)
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, earlier)
-        assert np.array_equal(renderer.render(data), expected)
+        data.geom_xpos += 0.1
+        second = renderer.render(data)
+        data.geom_xpos -= 0.1
+        assert not np.array_equal(second, first)
+        assert np.array_equal(renderer.render(data), first)

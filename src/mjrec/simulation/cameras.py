@@ -28,11 +28,13 @@ Camera: TypeAlias = "str | int | mujoco.MjvCamera"
 
 FREE_CAMERA = -1
 
-# In this order, see `tracking_camera`. Plain integers, because since mujoco 3.12 a
-# member of a MuJoCo enumeration is not equal to the NumPy integer of its value.
-_TRACKING_MODES = (
-    int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM),
-    int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK),
+# Plain integers, because since mujoco 3.12 a member of a MuJoCo enumeration is not
+# equal to the NumPy integer of its value.
+_TRACK = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK)
+_TRACKCOM = int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+_TRAVELLING_JOINTS = (
+    int(mujoco.mjtJoint.mjJNT_FREE),
+    int(mujoco.mjtJoint.mjJNT_SLIDE),
 )
 
 
@@ -90,21 +92,31 @@ def resolve_camera(model: Any, camera: Camera) -> mujoco.MjvCamera:
 def tracking_camera(model: Any) -> str | int | None:
     """Return the camera of the model that follows its robot, if it has one.
 
-    Cameras that follow the centre of mass of a body's subtree (`mode="trackcom"`) come
-    before those that follow one body (`mode="track"`), because the former show the
-    whole robot and the latter often one hand of it; among equals the model's own order
-    decides.
+    The first that follows the centre of mass of a body's subtree (`mode="trackcom"`);
+    else the first that follows a body (`mode="track"`) of something that can travel,
+    which is what hangs on a free or a sliding joint in the world. An arm with a fixed
+    base cannot, and a camera that follows its hand is a close-up.
 
     Returns:
-        Its name, or its number if it has none; None if no camera follows anything.
+        Its name, or its number if it has none; None if no camera follows the robot.
     """
     model = raw_model(model)
-    for mode in _TRACKING_MODES:
-        followers = np.flatnonzero(model.cam_mode == mode)
-        if followers.size:
-            index = int(followers[0])
-            return model.camera(index).name or index
-    return None
+    modes = model.cam_mode.tolist()
+    candidates = [index for index, mode in enumerate(modes) if mode == _TRACKCOM]
+    candidates += [
+        index
+        for index, mode in enumerate(modes)
+        if mode == _TRACK and _travels(model, model.cam_bodyid[index])
+    ]
+    if not candidates:
+        return None
+    return model.camera(candidates[0]).name or candidates[0]
+
+
+def _travels(model: mujoco.MjModel, body: int) -> bool:
+    root = model.body_rootid[body]
+    joints = model.jnt_type[model.jnt_bodyid == root]
+    return bool(np.isin(joints, _TRAVELLING_JOINTS).any())
 
 
 def _unwrapped(holder: object, kind: type) -> Any:

@@ -174,7 +174,8 @@ class GLThread:
     def _answer(self, reply: queue.SimpleQueue[_Outcome]) -> Any:
         try:
             outcome = self._wait_for(reply)
-        except KeyboardInterrupt:
+        except BaseException:
+            # Raised by a signal's handler, as Ctrl-C does.
             self._unanswered = reply
             raise
         if outcome.error is None:
