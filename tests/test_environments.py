@@ -261,13 +261,14 @@ def test_pictures_follow_the_robot_unless_asked_otherwise() -> None:
     assert robot_pixels(-1) == 0
 
 
-def test_the_spec_says_which_camera_shows() -> None:
+def test_the_spec_says_which_camera_was_asked_for() -> None:
     """The environment can be made again from it."""
-    env = make_gymnasium("HalfCheetah-v5", EnvironmentOptions())
-    assert env.spec is not None
-    assert env.spec.kwargs["camera_name"] == "track"
-    assert camera_of(env) == 0
-    env.close()
+    for camera, argument in (("track", "camera_name"), (0, "camera_id")):
+        env = make_gymnasium("HalfCheetah-v5", EnvironmentOptions(camera=camera))
+        assert env.spec is not None
+        assert env.spec.kwargs[argument] == camera
+        assert camera_of(env) == 0
+        env.close()
 
 
 def test_an_environments_own_camera_argument_stays() -> None:
