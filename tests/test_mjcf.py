@@ -146,8 +146,12 @@ def test_a_model_without_actuators_is_simulated(tmp_path: Path) -> None:
     assert observation[2] < 0
 
 
-def test_an_unstable_simulation_ends_where_it_was_sound(tmp_path: Path) -> None:
+def test_an_unstable_simulation_ends_where_it_was_sound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """MuJoCo starts over by itself; the episode must not go on from there."""
+    # MuJoCo writes MUJOCO_LOG.TXT where it is.
+    monkeypatch.chdir(tmp_path)
     path = tmp_path / "unstable.xml"
     path.write_text(
         '<mujoco><worldbody><body><joint name="j" type="slide"/><geom size=".1"/>'
