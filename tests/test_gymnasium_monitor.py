@@ -4,6 +4,7 @@ from __future__ import annotations
 import gc
 import json
 import logging
+import os
 import re
 import subprocess
 import sys
@@ -50,6 +51,11 @@ def frames_in(directory: Path, episode: int) -> list[Any]:
     [path] = directory.glob(f"*.video{episode:06d}.mp4")
     with av.open(str(path)) as container:
         return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+
+
+def finish_episode(env: Any) -> None:
+    while not env.stats_recorder.done:
+        env.step(0)
 
 
 def videos_in(directory: Path) -> list[int]:
@@ -99,7 +105,7 @@ def test_frame_hashes_are_of_the_frames_handed_over(
 def test_metadata_says_what_is_in_the_video(
     corridor: Any, tmp_path: Path, run: Any
 ) -> None:
-    """gym's keys, the episode's, and what made the pictures."""
+    """Keys of gym, the episode's, and what made the pictures."""
     with mjrec.Monitor(corridor, tmp_path) as env:
         run(env, 1, seed=7)
     metadata = metadata_of(tmp_path, 0)
@@ -298,7 +304,7 @@ def test_environment_without_pictures_is_an_error_at_construction(
 
 def test_not_an_environment_is_an_error(tmp_path: Path) -> None:
     """The type that was given is named."""
-    with pytest.raises(InvalidArgument, match="builtins.dict"):
+    with pytest.raises(InvalidArgument, match=r"builtins\.dict"):
         mjrec.Monitor({}, tmp_path)
 
 
@@ -493,7 +499,7 @@ def test_gyms_autoreset_environments_begin_episodes(
     """The picture of the step that ends is the next episode's, and metadata says so."""
 
     class Looping(make_corridor):  # type: ignore[misc,valid-type]  # a fixture's class
-        metadata = make_corridor.metadata | {"semantics.autoreset": True}  # noqa: RUF012
+        metadata = make_corridor.metadata | {"semantics.autoreset": True}
 
         def step(self, action: Any) -> Any:
             result = super().step(action)
@@ -668,12 +674,10 @@ def test_dead_encoder_is_one_error_and_loses_no_statistics(
     )
     env.reset()
     env.step(0)
-    subprocess.run(["pkill", "-9", "-P", str(__import__("os").getpid()), "ffmpeg"])
+    subprocess.run(["pkill", "-9", "-P", str(os.getpid()), "ffmpeg"])
     with pytest.raises(mjrec.EncoderError, match="exit status: -9"):
-        for _ in range(399):
-            env.step(0)
-    while not env.stats_recorder.done:
-        env.step(0)
+        finish_episode(env)
+    finish_episode(env)
     run(env, 1)
     env.close()
     assert stats_of(tmp_path)["episode_lengths"] == [400, 400]

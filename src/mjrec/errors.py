@@ -118,8 +118,8 @@ class ExistingRecordings(Error):
         rest = f" and {more} more" if more > 0 else ""
         super().__init__(
             f"{directory} holds recordings already: {shown}{rest}. Use a directory of "
-            "its own for each run, resume=True (--resume) to add to these recordings, or "
-            "force=True (--force) to delete them."
+            "its own for each run, resume=True (--resume) to add to these recordings, "
+            "or force=True (--force) to delete them."
         )
 
 

@@ -129,9 +129,10 @@ def _print_summary(
     videos = [episode.video.name for episode in recorded if episode.video]
     shown = session.directory.absolute()
     lines = [
-        f"{len(recorded)} episodes of {session.environment}, seed {session.seed}, in",
+        f"{_count(len(recorded), 'episode')} of {session.environment}, "
+        f"seed {session.seed}, in",
         f"  {shown}",
-        f"{len(videos)} videos" + (":" if videos else ""),
+        _count(len(videos), "video") + (":" if videos else ""),
         *(f"  {name}" for name in videos),
     ]
     # Names must survive copying, so no line is folded.
@@ -188,3 +189,7 @@ def _camera(text: str | None) -> str | int | None:
     if text is not None and re.fullmatch(r"-?\d+", text, re.ASCII):
         return int(text)
     return text
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

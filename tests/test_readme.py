@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every block of the README, and every example, runs."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+def blocks(language: str) -> list[str]:
+    return [text for kind, text in BLOCKS if kind == language]
+
+
+def shell_lines() -> list[str]:
+    lines = [
+        line.partition("#")[0].strip() for b in blocks("sh") for line in b.split("\n")
+    ]
+    return sorted({line for line in lines if line})
+
+
+def run(*command: str, cwd: Path) -> str:
+    done = subprocess.run(
+        command, cwd=cwd, capture_output=True, text=True, check=False, timeout=280
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def needs_dm_control(text: str) -> None:
+    if "dm_control" in text:
+        pytest.importorskip("dm_control", reason="dm_control is not installed here")
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A directory in which the README's relative paths mean something."""
+    (tmp_path / "assets").symlink_to(ROOT / "assets")
+    return tmp_path
+
+
+@pytest.mark.parametrize("code", blocks("python"), ids=["gymnasium", "dm_control"])
+def test_python_block_runs(code: str, checkout: Path) -> None:
+    """As it stands, and it leaves a video."""
+    needs_dm_control(code)
+    run(sys.executable, "-c", code, cwd=checkout)
+    assert list(checkout.glob("recordings/*/*.mp4"))
+
+
+@pytest.mark.parametrize("line", [x for x in shell_lines() if x.startswith("mjrec")])
+def test_command_runs(line: str, checkout: Path) -> None:
+    """As it stands, with the recordings that the ones before it made."""
+    needs_dm_control(line)
+    if line.startswith("mjrec list"):
+        [recording] = [x for x in shell_lines() if line.split()[-1] + " " in x]
+        run(sys.executable, "-m", *shlex.split(recording), cwd=checkout)
+    out = run(sys.executable, "-m", *shlex.split(line), cwd=checkout)
+    assert out.strip()
+
+
+def test_system_packages_are_those_that_setup_installs() -> None:
+    """The README's apt line names what scripts/setup looks for."""
+    [line] = [x for x in shell_lines() if x.startswith("apt-get")]
+    packages = [word for word in line.split() if word.startswith("lib")]
+    setup = (ROOT / "scripts" / "setup").read_text()
+    assert packages
+    for package in packages:
+        assert package in setup
+
+
+def test_tree_is_what_a_recording_leaves(checkout: Path) -> None:
+    """Name by name, but for the process id."""
+    [tree] = blocks("text")
+    run(
+        *(sys.executable, "-m", "mjrec", "record", "HalfCheetah-v5"),
+        *("--out", "recordings/random", "--max-steps", "2", "--size", "32x32"),
+        cwd=checkout,
+    )
+    made = {
+        re.sub(r"\.0\.\d+\.", ".0.4711.", path.name)
+        for path in (checkout / "recordings" / "random").iterdir()
+    }
+    assert made == set(re.findall(r"openaigym\.\S+", tree))
+
+
+def test_links_lead_somewhere() -> None:
+    """Pictures and pages of the README are there."""
+    targets = re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / "README.md").read_text())
+    assert targets
+    for target in targets:
+        assert (ROOT / target).exists(), target
+
+
+@pytest.mark.slow
+@pytest.mark.dm_control
+def test_scripts_demo_runs(tmp_path: Path) -> None:
+    """The first command: twenty episodes, six videos, two tables."""
+    assert "scripts/demo" in shell_lines()
+    out = run(str(ROOT / "scripts" / "demo"), str(tmp_path / "demo"), cwd=ROOT)
+    assert len(list((tmp_path / "demo").glob("*/*.mp4"))) == 6
+    assert out.count("truncated") == 20
+
+
+def test_scripts_test_runs(tmp_path: Path) -> None:
+    """The second command, here with one small test of the suite itself."""
+    assert "scripts/test" in shell_lines()
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST")}
+    done = subprocess.run(
+        [str(ROOT / "scripts" / "test"), "tests/test_asciicast.py"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "passed" in done.stdout, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=[path.stem for path in EXAMPLES])
+def test_example_runs(example: Path, tmp_path: Path) -> None:
+    """By itself, in an empty directory, and is listed on the examples' page."""
+    needs_dm_control(example.read_text())
+    copied = shutil.copy(example, tmp_path)
+    run(sys.executable, copied, cwd=tmp_path)
+    assert list((tmp_path / "recordings").iterdir())
+    assert example.name in (ROOT / "examples" / "README.md").read_text()
