@@ -97,8 +97,8 @@ def run_episodes(env: Any, count: int, *, seed: int | None = None) -> None:
 
 
 @pytest.fixture
-def run() -> Callable[..., None]:
-    """`run_episodes`."""
+def play() -> Callable[..., None]:
+    """Return `run_episodes`."""
     return run_episodes
 
 

@@ -125,7 +125,10 @@ def test_record_mjcf_file(mjrec: Any, tmp_path: Path) -> None:
         *("--size", "64x48", "--seed", 0),
     )
     assert status == 0
-    assert metadata_of(tmp_path / "out", 0)["fps"] == "60"
+    metadata = metadata_of(tmp_path / "out", 0)
+    assert metadata["fps"] == "60"
+    assert metadata["camera"] == "front"
+    assert metadata["gl_renderer"]
     frames = frames_in(tmp_path / "out", 0)
     assert len(frames) == 7
     assert (frames[0] != frames[-1]).any()

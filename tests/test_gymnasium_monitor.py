@@ -69,11 +69,11 @@ def videos_in(directory: Path) -> list[int]:
 
 
 def test_records_the_scheduled_episodes(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """Of ten episodes 0, 1 and 8 have a video; all are in the statistics."""
     with mjrec.Monitor(corridor, tmp_path) as env:
-        run(env, 10)
+        play(env, 10)
     assert videos_in(tmp_path) == [0, 1, 8]
     assert stats_of(tmp_path)["episode_lengths"] == [3] * 10
     assert stats_of(tmp_path)["episode_rewards"] == [1.5] * 10
@@ -82,32 +82,32 @@ def test_records_the_scheduled_episodes(
 
 
 def test_video_has_the_first_and_the_last_frame(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """An episode of n steps has n + 1 frames."""
     with mjrec.Monitor(corridor, tmp_path) as env:
-        run(env, 1)
+        play(env, 1)
     shown = [int((frame[0, :, 0] > 128).sum()) for frame in frames_in(tmp_path, 0)]
     assert shown == [4, 8, 12, 16]
 
 
 def test_frame_hashes_are_of_the_frames_handed_over(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """A framehash file stands beside every video."""
     with mjrec.Monitor(corridor, tmp_path) as env:
-        run(env, 1)
+        play(env, 1)
     [path] = tmp_path.glob("*.framehash")
     lines = [line for line in path.read_text().splitlines() if line[0] != "#"]
     assert len(lines) == 4
 
 
 def test_metadata_says_what_is_in_the_video(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """Keys of gym, the episode's, and what made the pictures."""
     with mjrec.Monitor(corridor, tmp_path) as env:
-        run(env, 1, seed=7)
+        play(env, 1, seed=7)
     metadata = metadata_of(tmp_path, 0)
     expected = {
         "episode_id": 0,
@@ -129,7 +129,7 @@ def test_metadata_says_what_is_in_the_video(
 
 
 def test_metadata_names_renderer_and_camera(
-    halfcheetah: Any, tmp_path: Path, run: Any
+    halfcheetah: Any, tmp_path: Path, play: Any
 ) -> None:
     """Pictures of MuJoCo say which OpenGL drew them and from where."""
     with mjrec.Monitor(halfcheetah, tmp_path) as env:
@@ -142,10 +142,10 @@ def test_metadata_names_renderer_and_camera(
     assert metadata["fps"] == "20"
 
 
-def test_manifest_is_gyms(corridor: Any, tmp_path: Path, run: Any) -> None:
+def test_manifest_is_gyms(corridor: Any, tmp_path: Path, play: Any) -> None:
     """Keys in gym's order, base names only, env_info with exactly its two keys."""
     with mjrec.Monitor(corridor, tmp_path) as env:
-        run(env, 1)
+        play(env, 1)
     manifest = manifest_of(tmp_path)
     assert list(manifest) == ["stats", "videos", "env_info", "mjrec"]
     assert manifest["env_info"] == {
@@ -158,11 +158,11 @@ def test_manifest_is_gyms(corridor: Any, tmp_path: Path, run: Any) -> None:
 
 
 def test_journal_has_a_line_for_each_episode_as_it_ends(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """Before anything is closed, with seed and the way it ended."""
     env = mjrec.Monitor(corridor, tmp_path, video_callable=False)
-    run(env, 2, seed=5)
+    play(env, 2, seed=5)
     lines = journal_of(tmp_path)
     assert [line["episode_id"] for line in lines] == [0, 1]
     assert [line["seed"] for line in lines] == [5, 5]
@@ -198,11 +198,11 @@ def test_truncation_ends_an_episode(tmp_path: Path, make_corridor: Any) -> None:
 
 
 def test_text_environment_is_recorded(
-    make_corridor: Any, tmp_path: Path, run: Any
+    make_corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """Its recordings are asciicasts, listed in the manifest."""
     with mjrec.Monitor(make_corridor(render_mode="ansi"), tmp_path) as env:
-        run(env, 1)
+        play(env, 1)
     [[video, _]] = manifest_of(tmp_path)["videos"]
     assert video.endswith("video000000.json")
     assert json.loads((tmp_path / video).read_text())["duration"] == 0.4
@@ -210,12 +210,12 @@ def test_text_environment_is_recorded(
 
 @pytest.mark.parametrize("pop_frames", [True, False])
 def test_frame_collections_lose_and_double_nothing(
-    tmp_path: Path, make_corridor: Any, run: Any, pop_frames: bool
+    tmp_path: Path, make_corridor: Any, play: Any, pop_frames: bool
 ) -> None:
     """Whether or not RenderCollection forgets the frames it has given."""
     env = gymnasium.wrappers.RenderCollection(make_corridor(), pop_frames=pop_frames)
     with mjrec.Monitor(env, tmp_path) as env:
-        run(env, 2)
+        play(env, 2)
     for episode in (0, 1):
         frames = frames_in(tmp_path, episode)
         shown = [int((frame[0, :, 0] > 128).sum()) for frame in frames]
@@ -227,19 +227,19 @@ def test_frame_collections_lose_and_double_nothing(
 
 @pytest.mark.parametrize("never", [False, 0, np.False_])
 def test_false_records_no_video(
-    make_corridor: Any, tmp_path: Path, run: Any, never: Any
+    make_corridor: Any, tmp_path: Path, play: Any, never: Any
 ) -> None:
     """Whatever equals False does; the environment need not give pictures then."""
     with mjrec.Monitor(
         make_corridor(render_mode=None), tmp_path, video_callable=never
     ) as env:
-        run(env, 2)
+        play(env, 2)
     assert videos_in(tmp_path) == []
     assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
 
 
 def test_schedule_is_asked_once_for_each_episode(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """With its number; what it returns counts by its truth."""
     asked: list[int] = []
@@ -249,7 +249,7 @@ def test_schedule_is_asked_once_for_each_episode(
         return episode_id % 2
 
     with mjrec.Monitor(corridor, tmp_path, odd) as env:
-        run(env, 4)
+        play(env, 4)
     assert asked == [0, 1, 2, 3]
     assert videos_in(tmp_path) == [1, 3]
     assert manifest_of(tmp_path)["mjrec"]["schedule"]["name"].endswith("odd")
@@ -316,7 +316,7 @@ def test_vector_environment_is_an_error(make_corridor: Any, tmp_path: Path) -> N
     vector.close()
 
 
-def test_modes_give_the_types(corridor: Any, tmp_path: Path, run: Any) -> None:
+def test_modes_give_the_types(corridor: Any, tmp_path: Path, play: Any) -> None:
     """set_monitor_mode takes effect at the next reset, and types stay aligned."""
     with mjrec.Monitor(corridor, tmp_path, mode="evaluation") as env:
         env.reset()
@@ -324,29 +324,29 @@ def test_modes_give_the_types(corridor: Any, tmp_path: Path, run: Any) -> None:
         env.set_monitor_mode("training")
         for _ in range(3):
             env.step(0)
-        run(env, 1)
+        play(env, 1)
         env.set_monitor_mode("evaluation")
-        run(env, 1)
+        play(env, 1)
         env.reset()
     assert stats_of(tmp_path)["episode_types"] == ["e", "t", "e"]
 
 
 def test_fps_plays_faster_and_keeps_every_frame(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """`fps` is the rate written into the file."""
     with mjrec.Monitor(corridor, tmp_path, fps=50) as env:
-        run(env, 1)
+        play(env, 1)
     assert metadata_of(tmp_path, 0)["fps"] == "50"
     assert len(frames_in(tmp_path, 0)) == 4
 
 
 def test_write_upon_reset_writes_at_each_reset(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """Statistics and manifest are there before the monitor closes."""
     env = mjrec.Monitor(corridor, tmp_path, False, write_upon_reset=True)
-    run(env, 2)
+    play(env, 2)
     env.reset()
     assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
     assert manifest_of(tmp_path)["stats"]
@@ -376,14 +376,14 @@ def test_step_before_reset_is_an_error(corridor: Any, tmp_path: Path) -> None:
 
 
 def test_step_after_the_end_is_an_error(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """A reset is needed, and then it goes on."""
     with mjrec.Monitor(corridor, tmp_path) as env:
-        run(env, 1)
+        play(env, 1)
         with pytest.raises(ResetNeeded, match="after the end"):
             env.step(0)
-        run(env, 1)
+        play(env, 1)
     assert stats_of(tmp_path)["episode_lengths"] == [3, 3]
 
 
@@ -402,7 +402,7 @@ def test_reset_in_mid_episode_is_an_error(corridor: Any, tmp_path: Path) -> None
 
 
 def test_allowed_early_reset_keeps_the_video(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """The unfinished episode has a number and a video, marked; no statistics."""
     with mjrec.Monitor(
@@ -410,7 +410,7 @@ def test_allowed_early_reset_keeps_the_video(
     ) as env:
         env.reset()
         env.step(0)
-        run(env, 1)
+        play(env, 1)
     first, second = metadata_of(tmp_path, 0), metadata_of(tmp_path, 1)
     assert (first["complete"], first["reason"]) == (False, "reset")
     assert second["complete"]
@@ -419,14 +419,14 @@ def test_allowed_early_reset_keeps_the_video(
 
 
 def test_reset_before_any_step_replaces_the_picture(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """The number stays, and the schedule is asked for it once more at most."""
     with mjrec.Monitor(corridor, tmp_path, lambda _: True) as env:
         env.reset()
         env.reset()
         assert env.episode_id == 1
-        run(env, 2)
+        play(env, 2)
     assert videos_in(tmp_path) == [0, 1]
     assert len(frames_in(tmp_path, 0)) == 4
     assert manifest_of(tmp_path)["mjrec"]["schedule"]["recorded"] == [0, 1]
@@ -443,11 +443,11 @@ def test_check_env_passes(tmp_path: Path) -> None:
 
 
 def test_after_close_calls_go_straight_to_the_environment(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """Nothing more is recorded, and nothing is checked."""
     env = mjrec.Monitor(corridor, tmp_path)
-    run(env, 1)
+    play(env, 1)
     env.close()
     before = stats_of(tmp_path)
     env.step(0)
@@ -457,12 +457,12 @@ def test_after_close_calls_go_straight_to_the_environment(
 
 
 def test_gyms_questions_have_gyms_answers(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """Total steps cover the unfinished episode; the lists only complete ones."""
     with mjrec.Monitor(corridor, tmp_path) as env:
         assert env.episode_id == 0
-        run(env, 2)
+        play(env, 2)
         env.reset()
         env.step(0)
         assert env.episode_id == 3
@@ -521,7 +521,7 @@ def test_gyms_autoreset_environments_begin_episodes(
 
 
 def test_close_is_idempotent_and_closes_the_environment_last(
-    make_corridor: Any, tmp_path: Path, run: Any
+    make_corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """The manifest is there when the environment is closed, once."""
     seen: list[bool] = []
@@ -531,7 +531,7 @@ def test_close_is_idempotent_and_closes_the_environment_last(
             seen.append(any(tmp_path.glob("openaigym.manifest.*")))
 
     env = mjrec.Monitor(Watching(), tmp_path)
-    run(env, 1)
+    play(env, 1)
     env.close()
     env.close()
     assert seen == [True]
@@ -550,18 +550,18 @@ def test_close_in_mid_episode_keeps_the_video(corridor: Any, tmp_path: Path) -> 
 
 
 def test_closed_directory_holds_only_finished_files(
-    corridor: Any, tmp_path: Path, run: Any, names: Callable[[Path], list[str]]
+    corridor: Any, tmp_path: Path, play: Any, names: Callable[[Path], list[str]]
 ) -> None:
     """No lock and no temporary file stays."""
     with mjrec.Monitor(corridor, tmp_path) as env:
-        run(env, 1)
+        play(env, 1)
     assert [name for name in names(tmp_path) if name.startswith(".")] == []
 
 
-def test_garbage_collection_closes(corridor: Any, tmp_path: Path, run: Any) -> None:
+def test_garbage_collection_closes(corridor: Any, tmp_path: Path, play: Any) -> None:
     """A monitor that is forgotten writes its results."""
     env = mjrec.Monitor(corridor, tmp_path)
-    run(env, 1)
+    play(env, 1)
     gone = weakref.ref(env)
     del env
     gc.collect()
@@ -603,7 +603,7 @@ def test_leaving_the_interpreter_closes(tmp_path: Path, how: str, status: int) -
 
 
 def test_forked_child_leaves_the_files_alone(
-    corridor: Any, tmp_path: Path, run: Any
+    corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """A child may exit, but not record; the parent's files stay the parent's."""
     script = LEAVING.replace("HalfCheetah-v5", "CartPole-v1").format(
@@ -637,11 +637,11 @@ print(sorted(os.listdir(env.directory)))
 
 
 def test_environment_without_spec_is_recorded_with_a_warning(
-    corridor: Any, tmp_path: Path, run: Any, caplog: pytest.LogCaptureFixture
+    corridor: Any, tmp_path: Path, play: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     """And can be loaded again."""
     with caplog.at_level(logging.WARNING), mjrec.Monitor(corridor, tmp_path) as env:
-        run(env, 1)
+        play(env, 1)
     assert "no spec" in caplog.text
     results = mjrec.load_results(tmp_path)
     assert results is not None
@@ -666,7 +666,7 @@ def test_failing_step_leaves_the_statistics_alone(
 
 
 def test_dead_encoder_is_one_error_and_loses_no_statistics(
-    make_corridor: Any, tmp_path: Path, run: Any
+    make_corridor: Any, tmp_path: Path, play: Any
 ) -> None:
     """The run can go on; the video is marked broken and not listed."""
     env = mjrec.Monitor(
@@ -678,7 +678,7 @@ def test_dead_encoder_is_one_error_and_loses_no_statistics(
     with pytest.raises(mjrec.EncoderError, match="exit status: -9"):
         finish_episode(env)
     finish_episode(env)
-    run(env, 1)
+    play(env, 1)
     env.close()
     assert stats_of(tmp_path)["episode_lengths"] == [400, 400]
     assert manifest_of(tmp_path)["videos"] == []

@@ -33,13 +33,13 @@ def write_video(directory: Path, infix: str, episode: int) -> None:
 
 
 def record(
-    directory: Path, make_corridor: Any, run: Callable[..., None], **options: Any
+    directory: Path, make_corridor: Any, play: Callable[..., None], **options: Any
 ) -> Any:
     """Record two episodes without videos."""
     with mjrec.Monitor(
         make_corridor(), directory, video_callable=False, **options
     ) as env:
-        run(env, 2)
+        play(env, 2)
     return env
 
 
@@ -62,10 +62,10 @@ def test_relative_directory_is_fixed_at_opening(
 
 
 def test_existing_recordings_need_force_or_resume(
-    tmp_path: Path, make_corridor: Any, run: Any
+    tmp_path: Path, make_corridor: Any, play: Any
 ) -> None:
     """The error lists files and the ways out."""
-    record(tmp_path, make_corridor, run)
+    record(tmp_path, make_corridor, play)
     with pytest.raises(ExistingRecordings, match=r"(?s)manifest.*resume=True.*force"):
         open_(tmp_path)
 
@@ -85,10 +85,10 @@ def test_other_peoples_files_are_no_recordings(tmp_path: Path) -> None:
 
 
 def test_force_deletes_monitor_files_only(
-    tmp_path: Path, make_corridor: Any, run: Any, names: Any
+    tmp_path: Path, make_corridor: Any, play: Any, names: Any
 ) -> None:
     """Notes and directories stay, whatever their names begin with."""
-    record(tmp_path, make_corridor, run)
+    record(tmp_path, make_corridor, play)
     (tmp_path / "openaigym.notes.txt").touch()
     (tmp_path / "openaigym.manifest.1.1.manifest.json").mkdir()
     open_(tmp_path, force=True).lock.release()
@@ -107,10 +107,10 @@ def test_force_does_not_delete_under_an_open_monitor(
 
 
 def test_resume_goes_on_after_the_highest_number(
-    tmp_path: Path, make_corridor: Any, run: Any
+    tmp_path: Path, make_corridor: Any, play: Any
 ) -> None:
     """Two episodes were recorded, so the next is number 2."""
-    record(tmp_path, make_corridor, run)
+    record(tmp_path, make_corridor, play)
     place = open_(tmp_path, resume=True)
     assert place.first_episode_id == 2
     place.lock.release()
@@ -147,15 +147,15 @@ def test_resume_never_takes_a_used_name(tmp_path: Path) -> None:
 
 
 def test_open_monitors_do_not_count(
-    tmp_path: Path, make_corridor: Any, run: Any
+    tmp_path: Path, make_corridor: Any, play: Any
 ) -> None:
     """Monitors that share a directory number independently, until they close."""
     with mjrec.Monitor(make_corridor(), tmp_path, video_callable=False) as first:
-        run(first, 3)
+        play(first, 3)
         with mjrec.Monitor(
             make_corridor(), tmp_path, resume=True, video_callable=False
         ) as second:
-            run(second, 1)
+            play(second, 1)
             assert (first.episode_id, second.episode_id) == (3, 1)
     place = open_(tmp_path, resume=True)
     assert place.first_episode_id == 3
@@ -180,10 +180,10 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_resume_over_another_environment_is_an_error(
-    tmp_path: Path, make_corridor: Any, run: Any
+    tmp_path: Path, make_corridor: Any, play: Any
 ) -> None:
     """The error shows both names."""
-    record(tmp_path, make_corridor, run)
+    record(tmp_path, make_corridor, play)
     with pytest.raises(DifferentEnvironment, match=r"Corridor\).*Ant-v5"):
         open_(tmp_path, resume=True, env_info=ENV_INFO | {"env_id": "Ant-v5"})
 

@@ -168,6 +168,7 @@ def assert_same(ours: Any, gyms: Any, *, but: tuple[str, ...] = ()) -> None:
         assert repr(ours[key]) == repr(gyms[key]), key
 
 
+@pytest.mark.legacy
 def test_gym_agrees_on_what_gyms_wrote(gym_python: Path) -> None:
     """Key by key, except where gym is known to be wrong."""
     cases = [
@@ -194,6 +195,7 @@ def test_gym_agrees_on_what_gyms_wrote(gym_python: Path) -> None:
                 assert_same(ours, gyms)
 
 
+@pytest.mark.legacy
 def test_gym_agrees_on_what_we_write(gym_python: Path, tmp_path: Path) -> None:
     """Two monitors of a directory with videos, a key of our own, and infinity."""
     for monitor, (name, shift) in enumerate([("0.7", 0.0), ("1.7", 0.5)]):
@@ -221,6 +223,26 @@ def test_gym_agrees_on_what_we_write(gym_python: Path, tmp_path: Path) -> None:
     assert_same(load(tmp_path), gyms)
 
 
+@pytest.mark.legacy
+def test_gym_agrees_on_what_a_monitor_writes(
+    gym_python: Path, tmp_path: Path, corridor: Any, make_corridor: Any, play: Any
+) -> None:
+    """Two runs, the second resumed, with videos, a mode, and an unfinished episode."""
+    with mjrec.Monitor(corridor, tmp_path) as env:
+        play(env, 2)
+        env.reset()
+        env.step(0)
+    with mjrec.Monitor(
+        make_corridor(length=2), tmp_path, resume=True, mode="evaluation"
+    ) as env:
+        play(env, 2)
+    (gyms,) = gym_load_results(gym_python, tmp_path)
+    assert gyms["episode_lengths"] == [3, 3, 2, 2]
+    assert gyms["episode_types"] == ["t", "t", "e", "e"]
+    assert_same(load(tmp_path), gyms)
+
+
+@pytest.mark.legacy
 def test_gym_reads_null_where_we_wrote_nan(gym_python: Path, tmp_path: Path) -> None:
     """The file is JSON; the other episodes' rewards are unharmed."""
     name = "openaigym.episode_batch.0.7.stats.json"
@@ -234,6 +256,7 @@ def test_gym_reads_null_where_we_wrote_nan(gym_python: Path, tmp_path: Path) -> 
     assert_same(load(tmp_path), gyms, but=("episode_rewards",))
 
 
+@pytest.mark.legacy
 def test_gym_agrees_that_there_is_nothing(gym_python: Path, tmp_path: Path) -> None:
     """None for a missing directory and for one without manifests."""
     directories = [tmp_path / "missing", tmp_path]

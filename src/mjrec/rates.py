@@ -11,7 +11,8 @@ from .errors import InvalidArgument
 
 __all__ = ["MAX_DENOMINATOR", "rate_from_timestep", "to_rate"]
 
-# A timestep is a decimal number of at most microseconds: 0.0333333 means 1/30.
+# Floats are binary; this finds the fraction that was meant (0.05 is 1/20) and errs by
+# less than a millionth of a millionth of a second.
 MAX_DENOMINATOR = 10**6
 
 

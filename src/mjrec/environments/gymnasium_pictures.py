@@ -89,6 +89,10 @@ class EnvironmentPictures:
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         facts: dict[str, Any] = {"pictures": "env.render", "quality": "full"}
+        own_facts = getattr(self._env.unwrapped, "picture_facts", None)
+        if own_facts is not None:
+            # An environment of ours knows better than a look from outside.
+            return {**facts, **own_facts()}
         simulated = _simulated(self._env)
         renderer = getattr(simulated, "mujoco_renderer", None)
         viewer = getattr(renderer, "viewer", None)

@@ -19,6 +19,7 @@ from ..frames import Frame, check_size
 from ..simulation.cameras import resolve_camera
 from ..simulation.mjcf import MjcfSimulation
 from ..simulation.renderer import SceneRenderer
+from ..simulation.scene_pictures import camera_label
 from .default_camera import default_camera
 from .options import EnvironmentOptions
 
@@ -156,6 +157,14 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
                 self.simulation.model, height=height, width=width, camera=self.camera
             )
         return self._renderer.render(self.simulation.data)
+
+    def picture_facts(self) -> dict[str, Any]:
+        """Return what the metadata of a video says about the pictures."""
+        facts = {"camera": camera_label(self.simulation.model, self.camera)}
+        if self._renderer is None:
+            return facts
+        names = ("gl_vendor", "gl_renderer", "gl_version")
+        return {**facts, **dict(zip(names, self._renderer.gl_strings, strict=True))}
 
     def close(self) -> None:
         """Close the renderer; idempotent."""
