@@ -150,6 +150,16 @@ def test_damaged_library(backend: str, library: str, tmp_path: Path) -> None:
     assert "file too short" in answer.cause
 
 
+def test_driver_that_draws_nothing() -> None:
+    """A context that can be made is not enough: the picture is looked at."""
+    usual = probe("egl")
+    if not usual.software:
+        pytest.skip(f"only Mesa can be told to draw nothing, not {usual.gl_renderer}")
+    answer = probe_with("egl", GALLIUM_NOOP="1")
+    assert not answer.renders
+    assert "The driver draws, and draws wrongly." in answer.cause
+
+
 def test_crash_of_the_driver(tmp_path: Path) -> None:
     """A crash ends the child only, and is an answer."""
     variables = python_that_starts_with(tmp_path, "import ctypes; ctypes.string_at(0)")
