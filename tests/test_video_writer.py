@@ -29,7 +29,7 @@ from mjrec.errors import (
     InvalidFrame,
     UnknownName,
 )
-from mjrec.formats.ffmpeg import ffmpeg_executable, run_ffmpeg
+from mjrec.formats.ffmpeg import every_frame_arguments, ffmpeg_executable, run_ffmpeg
 from mjrec.formats.video_writer import VideoFile, VideoWriter
 from mjrec.frames import Frame
 
@@ -121,7 +121,8 @@ def test_every_frame_is_there_once_in_order(tmp_path: Path, fps: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "fps", [40, 1000, Fraction(30000, 1001), Fraction(1000000, 33333), Fraction(1, 10)]
+    "fps",
+    [40, 2000, Fraction(30000, 1001), Fraction(1000000, 33333), Fraction(2003, 999983)],
 )
 def test_the_rate_is_exact(tmp_path: Path, fps: Any) -> None:
     """Another reader finds the very fraction, and frame n at n times its duration."""
@@ -131,6 +132,16 @@ def test_the_rate_is_exact(tmp_path: Path, fps: Any) -> None:
         assert stream.average_rate == fps == result.fps
         times = [frame.pts * frame.time_base for frame in container.decode(stream)]
     assert times == [number / Fraction(fps) for number in range(20)]
+
+
+def test_a_rate_that_ffmpeg_would_round_is_not_given_to_it(tmp_path: Path) -> None:
+    """The result's rate is the file's: near for a float, an error for a fraction."""
+    result = record(tmp_path / "a.mp4", map(numbered, range(9)), fps=59.940059)
+    with av.open(str(result.path)) as container:
+        assert container.streams.video[0].average_rate == result.fps
+    assert result.fps == pytest.approx(59.940059, rel=1e-6)
+    with pytest.raises(InvalidArgument, match="59940059/1000000 cannot be written"):
+        VideoWriter(tmp_path / "b.mp4", fps=Fraction(59940059, 1000000))
 
 
 def test_the_default_plays_everywhere(tmp_path: Path) -> None:
@@ -459,14 +470,14 @@ def test_a_full_disk_is_one_error(
     [
         (("-vf", r"select=not(eq(n\,3)),format=yuv420p"), 99),
         (("-vf", r"select=lt(n\,99),format=yuv420p"), 99),
-        (("-vf", r"select=gt(mod(n\,10)\,0),setpts=N,format=yuv420p"), 90),
-        (("-r", "80", "-fps_mode", "cfr"), 200),
+        (("-vf", r"select=not(eq(mod(n\,10)\,5)),setpts=N,format=yuv420p"), 90),
+        (("-r", "80", every_frame_arguments()[0], "cfr"), r"(199|200)"),
     ],
     ids=["one lost", "last lost", "some lost, the rest moved up", "doubled"],
 )
 @pytest.mark.usefixtures("no_process_stays")
 def test_a_file_with_other_frames_is_not_kept(
-    tmp_path: Path, arguments: tuple[str, ...], left: int
+    tmp_path: Path, arguments: tuple[str, ...], left: int | str
 ) -> None:
     """A frame lost or doubled by the encoder is found in the finished file."""
     video = VideoWriter(tmp_path / "a.mp4", fps=40, encoder_arguments=arguments)

@@ -15,7 +15,13 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from ..errors import InvalidArgument, UnknownName
-from .ffmpeg import ffmpeg_executable, ffmpeg_version, run_ffmpeg, video_encoders
+from .ffmpeg import (
+    every_frame_arguments,
+    ffmpeg_executable,
+    ffmpeg_version,
+    run_ffmpeg,
+    video_encoders,
+)
 
 __all__ = ["MUXERS", "EncoderSettings", "encoder_settings", "try_encoding"]
 
@@ -138,6 +144,7 @@ def encoder_settings(
     encoding = (
         *("-an", "-map_metadata", "-1"),
         *(("-vf", _TO_BT709) if yuv else ("-pix_fmt", pixel_format)),
+        *every_frame_arguments(),
         *("-c:v", codec),
         *_codec_arguments(codec, crf),
         *_quality_arguments(codec, crf, help_text),

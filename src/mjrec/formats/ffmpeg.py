@@ -92,10 +92,10 @@ def video_encoders() -> list[str]:
 
 
 def every_frame_arguments() -> tuple[str, ...]:
-    """Return the output arguments for each decoded frame, none dropped or repeated.
+    """Return the output arguments for each frame once, none dropped or repeated.
 
-    Left alone, ffmpeg makes the rate of raw output even, and so hides what a file
-    lacks or doubles.
+    Left alone, ffmpeg fills gaps with copies and drops what comes too early, to make
+    the rate even; in decoding, that hides what a file lacks or doubles.
     """
     return _every_frame_arguments(*_identity(ffmpeg_executable()))
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import itertools
+import numbers
 import os
 import tempfile
 import warnings
@@ -52,6 +53,9 @@ from .frame_hashes import FrameHashFile, frame_hash_path
 
 __all__ = ["VideoFile", "VideoWriter", "save_video"]
 
+# ffmpeg takes no larger number, above or below, for a rate as a fraction: given one, it
+# silently takes the nearest fraction that fits.
+_MAX_RATE_TERM = 10**6
 _QUEUED_BYTES = 32 << 20
 _MAX_QUEUED_FRAMES = 64
 _READ_SIZE = 1 << 20
@@ -115,7 +119,8 @@ class VideoWriter:
 
     Args:
         path: the file; `.mp4`, `.mov`, `.mkv`, `.webm` or `.avi`.
-        fps: frames per second, exact as a fraction.
+        fps: frames per second. A fraction is exact in the file; a float is the
+            simplest fraction that is equal to within a millionth.
         crf: from 0 (largest) to 51 (worst); 18 if None, which few can tell from the
             original. Below 1, x264 is lossless but for the conversion of colours, and
             the profile is one that browsers do not play.
@@ -152,7 +157,7 @@ class VideoWriter:
         self._encoding: _Encoding | None = None
         self.result: VideoFile | None = None
         self.path = _check_path(path)
-        self.fps = to_rate(fps)
+        self.fps = _check_fps(fps)
         self._settings = encoder_settings(
             codec=codec,
             crf=crf,
@@ -443,6 +448,22 @@ def _check_path(path: str | os.PathLike[str]) -> Path:
         raise DirectoryNotWritable(parent, error) from error
     # Absolute, so that a change of the working directory moves nothing.
     return checked.absolute()
+
+
+def _check_fps(fps: float | Fraction) -> Fraction:
+    """Return the rate, if the file can say it; the nearest that it can, for a float."""
+    rate = to_rate(fps)
+    nearest = (
+        rate.limit_denominator(_MAX_RATE_TERM)
+        if rate < 1
+        else 1 / (1 / rate).limit_denominator(_MAX_RATE_TERM)
+    )
+    if nearest != rate and isinstance(fps, numbers.Rational):
+        raise InvalidArgument(
+            f"fps={rate} cannot be written exactly: above and below may be at most "
+            f"{_MAX_RATE_TERM}. The nearest that can is {nearest}."
+        )
+    return nearest
 
 
 def _decode(
