@@ -45,11 +45,13 @@ def test_size_counts_characters_and_not_bytes(tmp_path: Path) -> None:
 
 
 def test_asciinema_accepts_it(tmp_path: Path) -> None:
-    """The real player prints the frames."""
+    """The real player plays the frames on a terminal."""
     path = tmp_path / "a.json"
     write(path, "hello\n", "world\n")
+    player = [sys.executable, "-m", "asciinema", "play", "--speed", "100", str(path)]
     done = subprocess.run(
-        [sys.executable, "-m", "asciinema", "cat", str(path)],
+        [sys.executable, "-c", f"import pty; pty.spawn({player})"],
+        stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
         check=True,

@@ -85,6 +85,9 @@ class PhysicsPictures:
             height=self._height, width=self._width, camera_id=self._camera
         )
 
+    def begin_episode(self) -> None:
+        """Do nothing: what draws knows of every reset."""
+
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         physics = self._env.physics

@@ -86,6 +86,9 @@ class EnvironmentPictures:
             return self._new_ones(rendered)
         return rendered
 
+    def begin_episode(self) -> None:
+        """Do nothing: what draws knows of every reset."""
+
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         facts: dict[str, Any] = {"pictures": "env.render", "quality": "full"}

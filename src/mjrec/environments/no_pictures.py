@@ -26,6 +26,9 @@ class NoPictureSource:
     def close(self) -> None:
         """Do nothing."""
 
+    def begin_episode(self) -> None:
+        """Do nothing."""
+
     def facts(self) -> dict[str, Any]:
         """Return nothing: there is no video."""
         return {}

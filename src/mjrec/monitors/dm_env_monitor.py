@@ -64,7 +64,6 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
             options=options,
             clock=functools.partial(simulation_time, env),
             declared=functools.partial(declared_rate, env),
-            facts=pictures.facts,
         )
         self._guard = ExitGuard(
             self, functools.partial(_close, self._recorder, pictures, env)

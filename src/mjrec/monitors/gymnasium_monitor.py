@@ -61,7 +61,6 @@ class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
             options=options,
             clock=functools.partial(simulation_time, env),
             declared=functools.partial(declared_rate, env),
-            facts=pictures.facts,
         )
         self._guard = ExitGuard(
             self, functools.partial(_close, self._recorder, pictures, env)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from ..errors import Error, InvalidArgument, NoPictures
 from ..formats.journal import JournalEntry, JournalWriter
@@ -29,7 +29,7 @@ from .opening import OpenDirectory, open_directory
 from .stats_recorder import StatsRecorder
 from .video_recorder import PictureSource, VideoRecorder, can_give_pictures
 
-__all__ = ["Recorder", "RecorderOptions"]
+__all__ = ["EpisodePictures", "Recorder", "RecorderOptions"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +37,19 @@ _FORMAT_VERSION = 1
 _GYM_VERSION = "mjrec-1"
 _MODES = {None: "t", "training": "t", "evaluation": "e"}
 _PACKAGES = ("mjrec", "mujoco", "gymnasium", "dm-control", "numpy", "imageio-ffmpeg")
+
+
+class EpisodePictures(PictureSource, Protocol):
+    """Where the pictures of a run come from, episode by episode."""
+
+    def begin_episode(self) -> None:
+        """Prepare for pictures of an episode; the environment has just been reset."""
+
+    def facts(self) -> Mapping[str, Any]:
+        """Return what the metadata of a video says about its pictures."""
+
+    def close(self) -> None:
+        """Free what was acquired; idempotent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +89,6 @@ class Recorder:
         options: what was asked for.
         clock: returns the simulated time in seconds, or None.
         declared: returns the rate to take where there is no simulated time.
-        facts: returns more for the metadata of each video.
     """
 
     def __init__(
@@ -84,11 +96,10 @@ class Recorder:
         directory: str | os.PathLike[str],
         *,
         env_id: str,
-        pictures: PictureSource,
+        pictures: EpisodePictures,
         options: RecorderOptions,
         clock: Callable[[], float | None] | None = None,
         declared: Callable[[], Fraction] | None = None,
-        facts: Callable[[], Mapping[str, Any]] | None = None,
     ) -> None:
         self._schedule = to_schedule(options.video_callable)
         episode_type = _type_of_mode(options.mode)
@@ -101,7 +112,6 @@ class Recorder:
         self._options = options
         self._clock = clock
         self._declared = declared
-        self._facts = facts
         self._pid = os.getpid()
         self._videos = _Videos()
         self._decision = (-1, False)
@@ -225,8 +235,8 @@ class Recorder:
             picture: False where the environment has reset itself already, and its
                 picture belongs to the next episode.
         """
+        done = self.stats_recorder.after_step(None, reward, terminated or truncated)
         ending = {"terminated": bool(terminated), "truncated": bool(truncated)}
-        done = self.stats_recorder.after_step(None, reward, any(ending.values()))
         if done:
             # First of all, so that no failing video can lose the episode.
             self._journal_episode(**ending)
@@ -271,8 +281,10 @@ class Recorder:
             frame_hashes=True,
             clock=self._clock,
             declared=self._declared,
-            facts=self._facts,
+            facts=self._pictures.facts,
         )
+        if self.video_recorder.enabled:
+            self._pictures.begin_episode()
         self.video_recorder.capture_frame()
 
     def _decide(self, episode_id: int) -> bool:

@@ -222,8 +222,8 @@ def reward_to_float(reward: Any) -> float:
     Raises:
         InvalidArgument: it is something else.
     """
-    if type(reward) is float:
-        return reward
+    if isinstance(reward, float):  # as NumPy's float64 is
+        return float(reward)
     array = np.asarray(reward)
     if array.dtype.kind not in "biuf" or array.size != 1:
         raise InvalidArgument(

@@ -67,12 +67,22 @@ class ScenePictures:
         self._drawn_model: mujoco.MjModel | None = None
         self._shown_camera: Any = camera
         if camera is not None:
-            resolve_camera(raw_model(simulation()[0]), camera)
+            resolve_camera(self._model(), camera)
 
     def render(self) -> Frame:
         """Return the picture of this moment, `(height, width, 3) uint8`."""
-        model, data = self._simulation()
-        return self._renderer_for(raw_model(model)).render(raw_data(data))
+        renderer = self._renderer_for(self._model())
+        return renderer.render(raw_data(self._simulation()[1]))
+
+    def begin_episode(self) -> None:
+        """Look for what a reset may have changed below the renderer.
+
+        Height fields, textures and meshes are copied into the OpenGL context; a task
+        that makes a new terrain in its reset changes only the model.
+        """
+        # Another model gets another renderer when it is drawn.
+        if self._renderer is not None and self._draws(self._model()):
+            self._renderer.model_changed()
 
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
@@ -90,11 +100,18 @@ class ScenePictures:
             self._renderer.close()
             self._renderer = None
 
-    def _renderer_for(self, model: mujoco.MjModel) -> SceneRenderer:
+    def _model(self) -> mujoco.MjModel:
+        return raw_model(self._simulation()[0])
+
+    def _draws(self, model: mujoco.MjModel) -> bool:
         # The Python wrapper of one and the same model can be made anew at each
-        # access; the address tells models apart.
+        # access; the address tells models apart. The drawn one is kept alive, so that
+        # no other can come to lie where it was.
         drawn = self._drawn_model
-        if self._renderer is None or drawn is None or drawn._address != model._address:
+        return drawn is not None and bool(drawn._address == model._address)
+
+    def _renderer_for(self, model: mujoco.MjModel) -> SceneRenderer:
+        if self._renderer is None or not self._draws(model):
             self.close()
             look = self._look()
             self._shown_camera = look.camera if self._camera is None else self._camera
