@@ -470,7 +470,7 @@ def test_a_full_disk_is_one_error(
     [
         (("-vf", r"select=not(eq(n\,3)),format=yuv420p"), 99),
         (("-vf", r"select=lt(n\,99),format=yuv420p"), 99),
-        (("-vf", r"select=not(eq(mod(n\,10)\,5)),setpts=N,format=yuv420p"), 90),
+        (("-vf", r"select=not(eq(mod(n\,10)\,5)),setpts=N,format=yuv420p"), "(89|90)"),
         (("-r", "80", every_frame_arguments()[0], "cfr"), r"(199|200)"),
     ],
     ids=["one lost", "last lost", "some lost, the rest moved up", "doubled"],
