@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 
 # Before anything imports mujoco, which reads it once.
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -100,6 +101,25 @@ def run_episodes(env: Any, count: int, *, seed: int | None = None) -> None:
 def play() -> Callable[..., None]:
     """Return `run_episodes`."""
     return run_episodes
+
+
+def kill_children(name: str) -> int:
+    """Kill this process's children of that name, and return how many there were."""
+    children = {
+        int(pid)
+        for task in Path("/proc/self/task").iterdir()
+        for pid in (task / "children").read_text().split()
+    }
+    named = [p for p in children if name in Path(f"/proc/{p}/comm").read_text()]
+    for pid in named:
+        os.kill(pid, signal.SIGKILL)
+    return len(named)
+
+
+@pytest.fixture
+def kill_ffmpeg() -> Callable[[], int]:
+    """Return a function that kills this process's encoders."""
+    return lambda: kill_children("ffmpeg")
 
 
 @pytest.fixture

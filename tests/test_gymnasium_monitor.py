@@ -4,7 +4,6 @@ from __future__ import annotations
 import gc
 import json
 import logging
-import os
 import re
 import subprocess
 import sys
@@ -666,7 +665,7 @@ def test_failing_step_leaves_the_statistics_alone(
 
 
 def test_dead_encoder_is_one_error_and_loses_no_statistics(
-    make_corridor: Any, tmp_path: Path, play: Any
+    make_corridor: Any, tmp_path: Path, play: Any, kill_ffmpeg: Callable[[], int]
 ) -> None:
     """The run can go on; the video is marked broken and not listed."""
     env = mjrec.Monitor(
@@ -674,7 +673,7 @@ def test_dead_encoder_is_one_error_and_loses_no_statistics(
     )
     env.reset()
     env.step(0)
-    subprocess.run(["pkill", "-9", "-P", str(os.getpid()), "ffmpeg"])
+    assert kill_ffmpeg() == 1
     with pytest.raises(mjrec.EncoderError, match="exit status: -9"):
         finish_episode(env)
     finish_episode(env)

@@ -57,4 +57,6 @@ def rate_from_timestep(timestep: float) -> Fraction:
         raise InvalidArgument(
             f"A timestep must be a positive number of seconds, got {timestep}."
         )
-    return to_rate(1 / Fraction(timestep).limit_denominator(MAX_DENOMINATOR))
+    rate = 1 / Fraction(timestep).limit_denominator(MAX_DENOMINATOR)
+    # Steps of more than a second have numerators that no video file takes.
+    return to_rate(rate.limit_denominator(MAX_DENOMINATOR))

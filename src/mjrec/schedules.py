@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Callable
 from typing import Any, TypeAlias
+
+import numpy as np
 
 from .errors import InvalidArgument
 
@@ -55,7 +58,8 @@ def to_schedule(video_callable: object) -> Schedule:
         return capped_cubic_video_schedule
     if callable(video_callable):
         return video_callable
-    if video_callable == False:  # noqa: E712  gym takes 0 and numpy's False too
+    # gym takes 0 and NumPy's False too.
+    if isinstance(video_callable, numbers.Number | np.bool_) and not video_callable:
         return disable_videos
     raise InvalidArgument(
         "video_callable must be a function from an episode's number to a bool, None "

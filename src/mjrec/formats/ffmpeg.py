@@ -56,7 +56,7 @@ def ffmpeg_executable() -> str:
     import imageio_ffmpeg
 
     try:
-        name = imageio_ffmpeg.get_ffmpeg_exe()
+        name: str = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
         raise MissingDependency(
             "ffmpeg",
@@ -200,7 +200,7 @@ class FfmpegProcess:
         """
         pipe = self._process.stdin
         assert pipe is not None
-        rest = memoryview(data).cast("B")
+        rest = memoryview(data if isinstance(data, bytes) else data.data).cast("B")
         try:
             # A raw pipe may take less than it was given.
             while rest:

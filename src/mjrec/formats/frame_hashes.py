@@ -61,7 +61,7 @@ def frame_hash_header(*, height: int, width: int, fps: Fraction) -> str:
 
 def frame_hash_line(number: int, frame: Frame) -> str:
     """Return the line of the frame with this number, counted from 0."""
-    digest = hashlib.sha256(np.ascontiguousarray(frame)).hexdigest()
+    digest = hashlib.sha256(np.ascontiguousarray(frame).data).hexdigest()
     return f"0, {number:10d}, {number:10d}, {1:8d}, {frame.nbytes:8d}, {digest}\n"
 
 

@@ -258,7 +258,7 @@ class VideoRecorder:
 
     def _real_time(self, frames: int) -> Fraction:
         if self._timestep is not None and frames:
-            return rate_from_timestep(float(self._timestep)) * frames
+            return rate_from_timestep(float(self._timestep / frames))
         return self._declared()
 
     def _open_writer(self, rate: Fraction) -> None:

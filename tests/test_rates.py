@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjrec import InvalidArgument
+from mjrec.rates import MAX_DENOMINATOR, rate_from_timestep, to_rate
+
+
+@pytest.mark.parametrize(
+    ("fps", "rate"),
+    [
+        (30, Fraction(30)),
+        (29.97, Fraction(2997, 100)),
+        (30000 / 1001, Fraction(30000, 1001)),
+        (Fraction(200, 3), Fraction(200, 3)),
+        (np.float32(12.5), Fraction(25, 2)),
+        (np.int64(60), Fraction(60)),
+    ],
+)
+def test_rate_is_the_fraction_that_was_meant(fps: Any, rate: Fraction) -> None:
+    """Numbers of every kind are taken for what their decimals say."""
+    assert to_rate(fps) == rate
+
+
+@pytest.mark.parametrize(
+    "fps", [0, -1, float("nan"), float("inf"), True, "30", None, 1e-9, 1e9]
+)
+def test_impossible_rate_is_an_error(fps: Any) -> None:
+    """What is no number of frames a second is named."""
+    with pytest.raises(InvalidArgument, match="fps must be"):
+        to_rate(fps)
+
+
+@pytest.mark.parametrize(
+    ("timestep", "rate"),
+    [
+        (0.05, Fraction(20)),
+        (0.015, Fraction(200, 3)),
+        (0.1 + 0.2 - 0.25, Fraction(20)),
+        (1 / 60, Fraction(60)),
+    ],
+)
+def test_rate_of_a_timestep(timestep: float, rate: Fraction) -> None:
+    """Sums of binary floats are the decimal numbers that they stand for."""
+    assert rate_from_timestep(timestep) == rate
+
+
+@pytest.mark.parametrize("timestep", [1.234567, 0.0166667, 1e-6, 12.3456789, 1 / 7])
+def test_rate_of_any_timestep_fits_a_video_file(timestep: float) -> None:
+    """Both terms are at most a million, and the rate is right to a millionth."""
+    rate = rate_from_timestep(timestep)
+    assert max(rate.numerator, rate.denominator) <= MAX_DENOMINATOR
+    assert float(rate) * timestep == pytest.approx(1, rel=1e-6)
+
+
+@pytest.mark.parametrize("timestep", [0.0, -0.1, float("nan"), float("inf")])
+def test_impossible_timestep_is_an_error(timestep: float) -> None:
+    """Time goes forward."""
+    with pytest.raises(InvalidArgument, match="timestep"):
+        rate_from_timestep(timestep)
