@@ -320,6 +320,31 @@ def test_list_of_nothing_is_an_error(mjrec: Any, tmp_path: Path) -> None:
     assert "nothing" in err
 
 
+def test_reader_may_leave_early(mjrec: Any, tmp_path: Path) -> None:
+    """`mjrec list DIR | head -1` says nothing on stderr."""
+    mjrec(*CHEETAH, "--out", tmp_path, "--seed", 0, "--schedule", "none")
+    done = subprocess.run(
+        f"{sys.executable} -m mjrec list {tmp_path} --json | true",
+        shell=True,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("command", ["record", "list", "doctor"])
+def test_help_flows(mjrec: Any, capsys: Any, command: str) -> None:
+    """Every command says what it does; descriptions break only at the margin."""
+    with pytest.raises(SystemExit) as left:
+        mjrec(command, "--help")
+    assert left.value.code == 0
+    out = capsys.readouterr().out
+    assert f"usage: mjrec {command}" in out
+    words = " ".join(out.replace("│", " ").split())
+    assert command != "record" or "1000 where the environment itself has no" in words
+
+
 def _start(tmp_path: Path, **streams: Any) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [

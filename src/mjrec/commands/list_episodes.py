@@ -17,6 +17,7 @@ import tyro
 
 from .. import json_text
 from ..results import Episode, iter_episodes
+from .help_text import flowing_help
 
 __all__ = ["episode_table", "list_episodes"]
 
@@ -24,8 +25,9 @@ __all__ = ["episode_table", "list_episodes"]
 _LOG_WIDTH = 160
 
 
+@flowing_help
 def list_episodes(
-    directory: tyro.conf.Positional[Path],
+    directory: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")],
     /,
     *,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,

@@ -18,6 +18,7 @@ from .. import json_text
 from ..errors import InvalidArgument
 from ..frames import check_size
 from ..sessions import Session, SessionEpisode, record_session
+from .help_text import flowing_help
 from .progress import EpisodeProgress
 
 __all__ = ["record"]
@@ -25,8 +26,9 @@ __all__ = ["record"]
 _INTERRUPTED = 130
 
 
+@flowing_help
 def record(
-    env: tyro.conf.Positional[str],
+    env: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")],
     /,
     *,
     out: Path,
