@@ -9,15 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import av
-import dm_env
 import numpy as np
 import pytest
-from absl.testing import absltest
-from dm_env import specs
-from dm_env import test_utils as dm_env_test_utils
 
-import mjrec
-from mjrec import InvalidArgument, NoPictures, ResetNotAllowed, UnknownName
+dm_env = pytest.importorskip("dm_env", reason="dm_env comes with dm_control")
+
+from absl.testing import absltest  # noqa: E402  after importorskip
+from dm_env import specs  # noqa: E402  after importorskip
+from dm_env import test_utils as dm_env_test_utils  # noqa: E402  after importorskip
+
+import mjrec  # noqa: E402  after importorskip
+from mjrec import (  # noqa: E402  after importorskip
+    InvalidArgument,
+    NoPictures,
+    ResetNotAllowed,
+    UnknownName,
+)
 
 
 class Countdown(dm_env.Environment):  # type: ignore[misc]  # dm_env is untyped

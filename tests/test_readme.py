@@ -101,7 +101,6 @@ def test_links_lead_somewhere() -> None:
         assert (ROOT / target).exists(), target
 
 
-@pytest.mark.slow
 @pytest.mark.dm_control
 def test_scripts_demo_runs(tmp_path: Path) -> None:
     """The first command: twenty episodes, six videos, two tables."""

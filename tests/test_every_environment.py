@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Monitors of every environment there is: a few here, all with MJREC_TEST_ALL=1."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import gymnasium
+import pytest
+
+from mjrec.sessions import Session, record_session
+
+GYMNASIUM = sorted(
+    env_id
+    for env_id, spec in gymnasium.registry.items()
+    if "gymnasium.envs.mujoco" in str(spec.entry_point) and env_id.endswith("-v5")
+)
+FEW = {"HalfCheetah-v5", "Humanoid-v5", "dm_control/cheetah-run", "dm_control/dog-run"}
+
+
+def suite_tasks() -> list[str]:
+    if importlib.util.find_spec("dm_control") is None:
+        return []
+    from dm_control import suite
+
+    return [f"dm_control/{domain}-{task}" for domain, task in suite.ALL_TASKS]
+
+
+def chosen(names: list[str]) -> list[str]:
+    if os.environ.get("MJREC_TEST_ALL") == "1":
+        return names
+    return [name for name in names if name in FEW]
+
+
+def record(name: str, directory: Path, *, steps: int = 3) -> dict[str, Any]:
+    """Record an episode; returns its metadata."""
+    session = Session(
+        environment=name,
+        directory=directory,
+        seed=0,
+        max_steps=steps,
+        height=48,
+        width=64,
+    )
+    [episode] = record_session(session)
+    assert episode.length <= steps
+    [path] = directory.glob("*.meta.json")
+    metadata: dict[str, Any] = json.loads(path.read_text())
+    assert metadata["frame_count"] == episode.length + 1
+    return metadata
+
+
+def check_pictures(directory: Path) -> None:
+    """Frames have content: neither black nor of one colour."""
+    [path] = directory.glob("*.mp4")
+    with av.open(str(path)) as container:
+        for frame in container.decode(video=0):
+            assert frame.to_ndarray(format="rgb24").std() > 5
+
+
+def test_all_of_gymnasiums_are_known() -> None:
+    """The list is not empty by mistake."""
+    assert len(GYMNASIUM) == 11
+
+
+@pytest.mark.parametrize("env_id", chosen(GYMNASIUM))
+def test_gymnasium(env_id: str, tmp_path: Path) -> None:
+    """Recorded in real time, with something to see."""
+    metadata = record(env_id, tmp_path)
+    check_pictures(tmp_path)
+    env = gymnasium.make(env_id)
+    assert Fraction(metadata["timestep"]) == Fraction(
+        env.unwrapped.dt  # type: ignore[attr-defined]  # MuJoCo environments have it
+    ).limit_denominator(10**6)
+    assert metadata["playback_speed"] == 1.0
+    env.close()
+
+
+@pytest.mark.dm_control
+@pytest.mark.parametrize("name", chosen(suite_tasks()))
+def test_dm_control(name: str, tmp_path: Path) -> None:
+    """Recorded in real time, with something to see."""
+    from dm_control import suite
+
+    metadata = record(name, tmp_path)
+    check_pictures(tmp_path)
+    env = suite.load(*name.removeprefix("dm_control/").split("-"))
+    assert Fraction(metadata["timestep"]) == Fraction(
+        env.control_timestep()
+    ).limit_denominator(10**6)
+    assert metadata["playback_speed"] == 1.0
+    env.close()
