@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from mjrec import ClosedError, InvalidFrame
+from mjrec import ClosedError, DirectoryNotWritable, InvalidFrame
 from mjrec.formats.asciicast import AsciicastWriter, text_of_frame
 
 
@@ -73,6 +73,13 @@ def test_unfinished_has_no_final_name(tmp_path: Path) -> None:
     assert [p.suffix for p in tmp_path.iterdir()] == [".part"]
     writer.abort()
     assert not list(tmp_path.iterdir())
+
+
+def test_missing_directory_is_an_error(tmp_path: Path) -> None:
+    """The same as for videos."""
+    writer = AsciicastWriter(tmp_path / "no" / "a.json", rate=Fraction(1))
+    with pytest.raises(DirectoryNotWritable, match="no"):
+        writer.write("a")
 
 
 def test_write_after_close_is_an_error(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import pty
 import signal
@@ -283,6 +284,14 @@ def test_existing_recordings_need_force_or_resume(mjrec: Any, tmp_path: Path) ->
     )
     assert status == 0
     assert len(results_of(tmp_path)["episode_lengths"]) == 2
+
+
+def test_messages_are_said_once(mjrec: Any, tmp_path: Path) -> None:
+    """However often the command ran in one process."""
+    handlers = logging.getLogger("mjrec").handlers[:]
+    mjrec("list", tmp_path)
+    mjrec("list", tmp_path)
+    assert logging.getLogger("mjrec").handlers == handlers
 
 
 def test_wrong_usage_is_status_2(mjrec: Any) -> None:

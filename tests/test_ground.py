@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import mjrec
 from mjrec import ExistingRecordings, InvalidArgument, InvalidFrame, UnknownName
 from mjrec.atomic_files import is_temporary, replacing, write_text
 from mjrec.frames import check_frame, check_size, pad_to_even
@@ -128,6 +130,35 @@ def test_unknown_name_lists_what_there_is() -> None:
     assert "Names like it: Env-v3" in str(UnknownName("environment", "env-v3", many))
     assert "none with a like name" in str(UnknownName("environment", "zzz", many))
     assert "There are none." in str(UnknownName("camera", "a", []))
+
+
+ERRORS = [
+    mjrec.UnknownName("camera", "a", ["b"]),
+    mjrec.ExistingRecordings(Path("d"), ["a"]),
+    mjrec.DirectoryNotWritable(Path("d"), "why"),
+    mjrec.DifferentEnvironment(Path("d"), "a", "b"),
+    mjrec.EncoderError("what", command=["ffmpeg"], returncode=1, stderr="said"),
+    mjrec.UnreadableFile(Path("f"), "why"),
+    mjrec.MissingDependency("p", purpose="x", install="pip install p"),
+    mjrec.EnvironmentNotMade("e", "why"),
+    mjrec.ResetNeeded("text"),
+]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_errors_come_home_from_other_processes(error: mjrec.Error) -> None:
+    """They survive pickling, message and facts."""
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is type(error)
+    assert str(again) == str(error)
+    assert vars(again) == vars(error)
+
+
+def test_value_that_holds_itself_is_written() -> None:
+    """As what Python shows of it."""
+    loop: list[Any] = []
+    loop.append(loop)
+    assert loads(dumps(loop)) == {"repr": "[[...]]"}
 
 
 def test_existing_recordings_lists_five_at_most() -> None:

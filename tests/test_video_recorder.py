@@ -309,6 +309,26 @@ def test_without_a_path_it_makes_one(corridor: Any) -> None:
     assert len(frames_of(recorder.path)) == 2
 
 
+def test_later_chdir_parts_nothing(
+    corridor: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Video and metadata go where the relative path pointed at first."""
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    recorder = VideoRecorder(corridor, "v.mp4")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    record(recorder, corridor, 1)
+    assert {p.name for p in tmp_path.glob("v.*")} == {"v.mp4", "v.meta.json"}
+
+
+def test_with_closes(corridor: Any, tmp_path: Path) -> None:
+    """Leaving the block finishes the file."""
+    with VideoRecorder(corridor, tmp_path / "v.mp4") as recorder:
+        recorder.capture_frame()
+    assert recorder.finished
+    assert len(frames_of(recorder.path)) == 1
+
+
 def test_users_metadata_is_left_alone(corridor: Any, tmp_path: Path) -> None:
     """The dictionary given is copied, not changed."""
     given = {"episode_id": 1}

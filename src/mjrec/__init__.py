@@ -74,13 +74,14 @@ _LAZY = {
     "write_archive": "formats.archive",
 }
 
+# What can be had without any extra, so that `from mjrec import *` works there too;
+# `DmEnvMonitor` needs dm_env.
 __all__ = [
     "ArchiveError",
     "ClosedError",
     "DifferentEnvironment",
     "DirectoryInUse",
     "DirectoryNotWritable",
-    "DmEnvMonitor",
     "EncoderError",
     "EnvironmentNotMade",
     "Episode",
@@ -121,7 +122,15 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module("importlib.metadata").version("mjrec")
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f".{_LAZY[name]}", __name__), name)
+    try:
+        module = importlib.import_module(f".{_LAZY[name]}", __name__)
+    except ModuleNotFoundError as error:
+        if error.name != "dm_env":
+            raise
+        raise MissingDependency(
+            "dm_env", purpose=name, install='pip install "mjrec[dm-control]"'
+        ) from error
+    value = getattr(module, name)
     # Kept, so that later uses cost nothing.
     globals()[name] = value
     return value

@@ -32,6 +32,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 __all__ = [
     "ArchiveError",
@@ -59,6 +60,18 @@ __all__ = [
 
 class Error(Exception):
     """Base of every error that mjrec raises on purpose."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # The subclasses take facts and make the message of them; pickle (an error
+        # that comes home from a worker process) would call them with the message.
+        return _rebuilt, (type(self), self.args, self.__dict__)
+
+
+def _rebuilt(kind: type[Error], args: tuple[Any, ...], facts: dict[str, Any]) -> Error:
+    error = kind.__new__(kind)
+    error.args = args
+    error.__dict__.update(facts)
+    return error
 
 
 class InvalidArgument(Error, ValueError):
@@ -229,7 +242,10 @@ class UnreadableFile(Error):
     def __init__(self, path: Path, reason: object) -> None:
         self.path = path
         self.reason = str(reason)
-        super().__init__(f"Cannot read {path}: {reason}.")
+        super().__init__(
+            f"Cannot read {path}: {reason}. The other files of its directory are as "
+            "good as before; to read them, move this one away."
+        )
 
 
 class MissingDependency(Error, ImportError):

@@ -28,7 +28,12 @@ def dumps(value: object, *, indent: int | None = None) -> str:
     # json offers no hook for floats. A string that cannot occur by chance stands in
     # for infinity and is exchanged for the number afterwards.
     mark = uuid.uuid4().hex
-    text = json.dumps(_plain(value, mark), indent=indent, allow_nan=False)
+    try:
+        plain = _plain(value, mark)
+    except RecursionError:
+        # A value that holds itself; Python's own text of it ends.
+        plain = {"repr": repr(value)}
+    text = json.dumps(plain, indent=indent, allow_nan=False)
     return text.replace(f'"-{mark}"', "-1e999").replace(f'"{mark}"', "1e999")
 
 

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import tyro
 
@@ -37,11 +38,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the arguments; those of the process, if None.
     """
-    # Only what mjrec says: MuJoCo's remarks on other people's models are not news here.
-    handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
-    logging.getLogger("mjrec").addHandler(handler)
-    logging.getLogger("absl").setLevel(logging.ERROR)
+    with _warnings_on_stderr():
+        return _run(argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
     try:
         status: int = tyro.extras.subcommand_cli_from_dict(
             _COMMANDS,
@@ -62,3 +63,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _FAILED
     return status
+
+
+@contextlib.contextmanager
+def _warnings_on_stderr() -> Iterator[None]:
+    # Only what mjrec says: MuJoCo's remarks on other people's models are not news here.
+    logging.getLogger("absl").setLevel(logging.ERROR)
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    logger = logging.getLogger("mjrec")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -74,23 +73,29 @@ def environment_from_name(
             return _mjcf(name, options)
 
 
+# Each of the modules imported below loads a framework, and a name asks for one.
+
+
 def _gymnasium(env_id: str, options: EnvironmentOptions) -> NamedEnvironment:
-    module = _module("gymnasium_environments")
+    from . import gymnasium_environments as module
+
     environment = module.make_gymnasium(env_id, options)
     return NamedEnvironment(
         environment=environment,
-        env_id=environment.spec.id,
+        env_id=_id_of(environment),
         begin_episode=module.begin_episode,
         step=module.step,
     )
 
 
 def _mjcf(name: MjcfName, options: EnvironmentOptions) -> NamedEnvironment:
-    environment = _module("mjcf_environments").make_mjcf(name.path, options)
-    module = _module("gymnasium_environments")
+    from . import gymnasium_environments as module
+    from .mjcf_environments import make_mjcf
+
+    environment = make_mjcf(name.path, options)
     return NamedEnvironment(
         environment=environment,
-        env_id=environment.spec.id,
+        env_id=_id_of(environment),
         begin_episode=module.begin_episode,
         step=module.step,
     )
@@ -98,7 +103,7 @@ def _mjcf(name: MjcfName, options: EnvironmentOptions) -> NamedEnvironment:
 
 def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnvironment:
     try:
-        module = _module("dm_control_environments")
+        from . import dm_control_environments as module
     except Exception as error:
         raise dm_control_failure(str(name), error) from error
     environment = module.make_dm_control(name.domain, name.task, options)
@@ -111,19 +116,18 @@ def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnviro
     )
 
 
+def _id_of(environment: Any) -> str:
+    return str(environment.spec.id)
+
+
 def _dm_control_view(environment: Any, options: EnvironmentOptions) -> dict[str, Any]:
     if not options.pictures:
         return {}
+    from ..simulation.cameras import resolve_camera
+    from .default_camera import default_camera
+
     model = environment.physics.model
     if options.camera is None:
-        camera = _module("default_camera").default_camera(model)
-    else:
-        camera = options.camera
-        cameras = importlib.import_module("..simulation.cameras", __package__)
-        cameras.resolve_camera(model, camera)
-    return {"camera": camera, **options.size}
-
-
-def _module(name: str) -> Any:
-    # Each of these imports a framework, and a name asks for one of them.
-    return importlib.import_module(f".{name}", __package__)
+        return {"camera": default_camera(model), **options.size}
+    resolve_camera(model, options.camera)
+    return {"camera": options.camera, **options.size}

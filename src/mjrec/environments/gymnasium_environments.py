@@ -22,6 +22,7 @@ from ..errors import (
     NoPictures,
     UnknownName,
 )
+from ..simulation.inside import simulation_in
 from .episode_seeds import EpisodeSeeds
 from .options import EnvironmentOptions
 from .working_directory import working_directory_importable
@@ -40,9 +41,6 @@ _PYGAME_EXTRAS = {
 
 # Arguments with which a person has chosen the view.
 _VIEW_ARGUMENTS = ("camera_name", "camera_id", "default_camera_config")
-
-# Gymnasium-Robotics' mazes and kitchen hold the MuJoCo environment in these.
-_HOLDERS = ("point_env", "ant_env", "robot_env")
 
 
 def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[Any, Any]:
@@ -382,15 +380,13 @@ def _set_camera(simulated: Any, camera: str | int) -> None:
 
 def _simulated(env: gymnasium.Env[Any, Any]) -> Any:
     """Return the object inside `env` with MuJoCo's model and Gymnasium's renderer."""
-    base = env.unwrapped
-    for holder in (base, *(getattr(base, name, None) for name in _HOLDERS)):
-        model = getattr(holder, "model", None)
-        if type(model).__name__ == "MjModel" and hasattr(holder, "mujoco_renderer"):
-            return holder
-    return None
+    simulation = simulation_in(env)
+    return simulation if hasattr(simulation, "mujoco_renderer") else None
 
 
 def _cameras() -> Any:
     # Not imported above, because a Gymnasium environment that has no use for MuJoCo
     # must not load it.
-    return importlib.import_module("..simulation.cameras", __package__)
+    from ..simulation import cameras
+
+    return cameras

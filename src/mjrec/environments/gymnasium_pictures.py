@@ -3,20 +3,17 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 from ..errors import InvalidArgument
+from ..simulation.inside import simulation_in
 
 if TYPE_CHECKING:
     from ..simulation.scene_pictures import ScenePictures
 
 __all__ = ["EnvironmentPictures", "gymnasium_pictures"]
-
-# Gymnasium-Robotics' mazes and kitchen hold the MuJoCo environment in these.
-_INNER = ("point_env", "ant_env", "robot_env")
 
 
 def gymnasium_pictures(
@@ -44,22 +41,24 @@ def gymnasium_pictures(
     """
     if camera is None and height is None and width is None:
         return EnvironmentPictures(env)
-    simulated = _simulated(env)
+    simulated = simulation_in(env)
     if simulated is None:
         raise InvalidArgument(
             "camera, height and width choose among the pictures of a MuJoCo "
             f"environment, and {env} has no MuJoCo model and data. Make the "
             "environment itself with the camera and size that the videos are to have."
         )
-    scenes = _simulation_module("scene_pictures")
-    pictures: ScenePictures = scenes.ScenePictures(
+    # Loaded where there is a simulation, and so mujoco, already: importing mujoco
+    # settles its OpenGL backend, which is not ours to do for a CartPole.
+    from ..simulation.scene_pictures import Look, ScenePictures
+
+    return ScenePictures(
         lambda: (simulated.model, simulated.data),
-        look=lambda: scenes.Look(**_look(simulated, env)),
+        look=lambda: Look(**_look(simulated, env)),
         camera=camera,
         height=_own_size(simulated, "height") if height is None else height,
         width=_own_size(simulated, "width") if width is None else width,
     )
-    return pictures
 
 
 class EnvironmentPictures:
@@ -96,14 +95,16 @@ class EnvironmentPictures:
         if own_facts is not None:
             # An environment of ours knows better than a look from outside.
             return {**facts, **own_facts()}
-        simulated = _simulated(self._env)
+        simulated = simulation_in(self._env)
         renderer = getattr(simulated, "mujoco_renderer", None)
         viewer = getattr(renderer, "viewer", None)
         if simulated is not None and viewer is not None:
-            label = _simulation_module("scene_pictures").camera_label
-            facts["camera"] = label(simulated.model, viewer.cam)
+            from ..simulation.gl_strings import current_gl_strings
+            from ..simulation.scene_pictures import camera_label
+
+            facts["camera"] = camera_label(simulated.model, viewer.cam)
             # The viewer's context stays current on the thread that drew.
-            facts.update(_simulation_module("gl_strings").current_gl_strings())
+            facts.update(current_gl_strings())
         return facts
 
     def close(self) -> None:
@@ -120,24 +121,6 @@ def _keeps_frames(env: gymnasium.Env[Any, Any]) -> bool:
     """Tell whether `render` gives all frames every time, old ones too."""
     # What gymnasium.wrappers.RenderCollection(pop_frames=False) does.
     return env.has_wrapper_attr("pop_frames") and not env.get_wrapper_attr("pop_frames")
-
-
-def _simulated(env: gymnasium.Env[Any, Any]) -> Any:
-    """Return the object inside `env` that holds MuJoCo's model and data, or None."""
-    base = env.unwrapped
-    for holder in (base, *(getattr(base, name, None) for name in _INNER)):
-        kinds = [
-            type(getattr(holder, name, None)).__name__ for name in ("model", "data")
-        ]
-        if kinds == ["MjModel", "MjData"]:
-            return holder
-    return None
-
-
-def _simulation_module(name: str) -> Any:
-    # Loaded where there is a MuJoCo simulation, and so mujoco, already: importing
-    # mujoco settles its OpenGL backend, which is not ours to do for a CartPole.
-    return importlib.import_module(f"..simulation.{name}", __package__)
 
 
 def _own_size(simulated: Any, name: str) -> int:

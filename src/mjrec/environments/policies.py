@@ -196,11 +196,13 @@ def _actions(environment: Any) -> Actions:
     # Of each framework only what the environment has loaded already is imported.
     actions: Actions
     if callable(getattr(environment, "action_spec", None)):
-        module = importlib.import_module(".dm_env_actions", __package__)
-        actions = module.DmEnvActions(environment.action_spec())
+        from .dm_env_actions import DmEnvActions
+
+        actions = DmEnvActions(environment.action_spec())
     else:
-        module = importlib.import_module(".gymnasium_actions", __package__)
-        actions = module.GymnasiumActions(environment.action_space)
+        from .gymnasium_actions import GymnasiumActions
+
+        actions = GymnasiumActions(environment.action_space)
     return actions
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO
 
 from .. import atomic_files
-from ..errors import ClosedError, InvalidFrame
+from ..errors import ClosedError, DirectoryNotWritable, InvalidFrame
 
 __all__ = ["AsciicastWriter", "text_of_frame"]
 
@@ -49,17 +49,13 @@ class AsciicastWriter:
     Args:
         path: the finished file.
         rate: frames per second.
-        title: the recording's title.
     """
 
-    def __init__(
-        self, path: Path, *, rate: Fraction, title: str = "mjrec recording"
-    ) -> None:
+    def __init__(self, path: Path, *, rate: Fraction) -> None:
         self.path = path
         self.frame_count = 0
         self._delay = float(1 / rate)
         self._rate = rate
-        self._title = title
         self._width = 0
         self._height = 0
         self._body_path = atomic_files.temporary_path(path)
@@ -71,11 +67,12 @@ class AsciicastWriter:
 
         Raises:
             ClosedError: the writer is closed.
+            DirectoryNotWritable: no file can be made beside `path`.
         """
         if self._closed:
             raise ClosedError(f"The text recording {self.path} is closed.")
         if self._body is None:
-            self._body = self._body_path.open("w", encoding="utf-8")
+            self._body = self._opened()
         lines = text.replace("\r\n", "\n").split("\n")
         self._width = max(self._width, *(_columns(line) for line in lines))
         self._height = max(self._height, len(lines))
@@ -85,18 +82,18 @@ class AsciicastWriter:
         self.frame_count += 1
 
     def close(self) -> None:
-        """Finish the file; without a frame there is none. Idempotent."""
+        """Finish the file; without a frame there is none. Idempotent.
+
+        What raised or was interrupted can be tried again.
+        """
         if self._closed:
             return
-        self._closed = True
-        if self._body is None:
-            return
-        self._body.close()
-        try:
+        if self._body is not None:
+            self._body.close()
             with atomic_files.replacing(self.path) as temporary:
                 self._assemble(temporary)
-        finally:
-            self._body_path.unlink()
+            self._body_path.unlink(missing_ok=True)
+        self._closed = True
 
     def abort(self) -> None:
         """End without a file."""
@@ -105,6 +102,12 @@ class AsciicastWriter:
             self._body.close()
             self._body_path.unlink(missing_ok=True)
 
+    def _opened(self) -> IO[str]:
+        try:
+            return self._body_path.open("w", encoding="utf-8")
+        except OSError as error:
+            raise DirectoryNotWritable(self.path.parent, error.strerror) from error
+
     def _assemble(self, target: Path) -> None:
         header = {
             "version": 1,
@@ -112,7 +115,7 @@ class AsciicastWriter:
             "height": self._height,
             "duration": float(self.frame_count / self._rate),
             "command": "-",
-            "title": self._title,
+            "title": "mjrec recording",
             "env": {},
         }
         with (

@@ -91,7 +91,6 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     When it raises, `env` is as it was, and no file is left.
     """
     monitor = _monitor_class(env)
-    defaults_to_early_reset = monitor.__name__ == "DmEnvMonitor"
     return monitor(
         env,
         directory,
@@ -104,7 +103,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             mode=mode,
             fps=fps,
             allow_early_reset=(
-                defaults_to_early_reset
+                monitor.allows_early_reset
                 if allow_early_reset is None
                 else allow_early_reset
             ),
@@ -116,7 +115,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     )
 
 
-def _monitor_class(env: Any) -> Callable[..., GymnasiumMonitor | DmEnvMonitor]:
+def _monitor_class(env: Any) -> type[GymnasiumMonitor] | type[DmEnvMonitor]:
     # An instance of a framework's class exists only where the framework is loaded.
     gymnasium = sys.modules.get("gymnasium")
     if gymnasium is not None and isinstance(env, gymnasium.vector.VectorEnv):

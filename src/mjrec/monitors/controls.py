@@ -1,21 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every monitor offers beside the environment's own interface: gym's names."""
+"""What every monitor has beside the environment's own interface: gym's names."""
 
 from __future__ import annotations
 
+import functools
+import os
 from pathlib import Path
+from typing import Any, ClassVar
 
-from ..recorder.recorder import Recorder
+from ..recorder.declared_rate import declared_rate
+from ..recorder.exit_guard import ExitGuard
+from ..recorder.recorder import EpisodePictures, Recorder, RecorderOptions
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.video_recorder import VideoRecorder
+from ..simulation.inside import simulation_time
 
 __all__ = ["MonitorControls"]
 
 
 class MonitorControls:
-    """The part of a monitor that does not depend on the framework."""
+    """The part of a monitor that does not depend on the framework.
+
+    Attributes:
+        allows_early_reset: whether the framework's contract allows a reset in
+            mid-episode.
+    """
+
+    allows_early_reset: ClassVar[bool]
 
     _recorder: Recorder
+    _guard: ExitGuard
 
     @property
     def directory(self) -> Path:
@@ -64,3 +78,48 @@ class MonitorControls:
     def get_episode_lengths(self) -> list[int]:
         """Return the steps of each complete episode."""
         return list(self._recorder.stats_recorder.episode_lengths)
+
+    def close(self) -> None:
+        """Finish the recordings, then close the environment. Idempotent.
+
+        Raises:
+            EncoderError: the running video could not be finished; all else is.
+        """
+        self._guard.close()
+
+    def _start(
+        self,
+        env: Any,
+        directory: str | os.PathLike[str],
+        *,
+        env_id: str,
+        pictures: EpisodePictures,
+        options: RecorderOptions,
+    ) -> None:
+        """Open the directory; from here on the environment is this monitor's."""
+        self._recorder = Recorder(
+            directory,
+            env_id=env_id,
+            pictures=pictures,
+            options=options,
+            clock=functools.partial(simulation_time, env),
+            declared=functools.partial(declared_rate, env),
+        )
+        self._guard = ExitGuard(
+            self, functools.partial(_close, self._recorder, pictures, env)
+        )
+
+    def _begin(self, *, seed: Any = None, options: Any = None) -> None:
+        """Record that the environment has been reset."""
+        self._recorder.reset(seed=seed, options=options)
+        if self._recorder.video_recorder and self._recorder.video_recorder.enabled:
+            # Drawing has loaded OpenGL by now, which tears itself down at exit.
+            self._guard.run_first_at_exit()
+
+
+def _close(recorder: Recorder, pictures: EpisodePictures, env: Any) -> None:
+    try:
+        recorder.close()
+    finally:
+        pictures.close()
+        env.close()

@@ -3,18 +3,16 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
 from typing import Any
 
 import dm_env
 
+from ..environments.dm_env_episodes import is_terminated, is_truncated
 from ..environments.no_pictures import NoPictureSource
 from ..errors import InvalidArgument
-from ..recorder.clock import declared_rate, simulation_time
-from ..recorder.exit_guard import ExitGuard
-from ..recorder.recorder import Recorder, RecorderOptions
+from ..recorder.recorder import RecorderOptions
 from .controls import MonitorControls
 
 __all__ = ["DmEnvMonitor"]
@@ -43,6 +41,8 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
             dm_env's `reset` takes none, so whoever seeds the environment says so here.
     """
 
+    allows_early_reset = True
+
     def __init__(
         self,
         env: dm_env.Environment,
@@ -56,17 +56,12 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
     ) -> None:
         self._env = env
         self.seed: Any = None
-        pictures = _pictures(env, camera=camera, height=height, width=width)
-        self._recorder = Recorder(
+        self._start(
+            env,
             directory,
             env_id=env_id or _env_id(env),
-            pictures=pictures,
+            pictures=_pictures(env, camera=camera, height=height, width=width),
             options=options,
-            clock=functools.partial(simulation_time, env),
-            declared=functools.partial(declared_rate, env),
-        )
-        self._guard = ExitGuard(
-            self, functools.partial(_close, self._recorder, pictures, env)
         )
 
     def reset(self) -> dm_env.TimeStep:
@@ -79,7 +74,7 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
             return self._env.reset()
         self._recorder.before_reset()
         timestep = self._env.reset()
-        self._begin()
+        self._begin(seed=self.seed)
         return timestep
 
     def step(self, action: Any) -> dm_env.TimeStep:
@@ -92,7 +87,7 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
         if timestep.first():
             # The environment was reset behind the monitor's back.
             self._recorder.before_reset()
-            self._begin()
+            self._begin(seed=self.seed)
         else:
             self._record(timestep)
         return timestep
@@ -114,8 +109,13 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
         return self._env.discount_spec()
 
     def close(self) -> None:
-        """Finish the recordings, then close the environment. Idempotent."""
-        self._guard.close()
+        """Finish the recordings, then close the environment. Idempotent.
+
+        Raises:
+            EncoderError: the running video could not be finished; all else is.
+        """
+        # Both base classes have a close.
+        MonitorControls.close(self)
 
     def __getattr__(self, name: str) -> Any:
         # Called only for what is not found here. `_env` itself is missing where the
@@ -125,20 +125,11 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
         return getattr(self._env, name)
 
     def _record(self, timestep: dm_env.TimeStep) -> None:
-        last = timestep.last()
-        # dm_env's own convention: a discount of 0 is the end of the task; another one
-        # is a limit from outside.
-        terminated = last and not timestep.discount
         self._recorder.step(
             0.0 if timestep.reward is None else timestep.reward,
-            terminated=terminated,
-            truncated=last and not terminated,
+            terminated=is_terminated(timestep),
+            truncated=is_truncated(timestep),
         )
-
-    def _begin(self) -> None:
-        self._recorder.reset(seed=self.seed)
-        # Drawing has loaded OpenGL by now, which tears itself down at exit.
-        self._guard.run_first_at_exit()
 
 
 def _pictures(
@@ -164,11 +155,3 @@ def _env_id(env: dm_env.Environment) -> str:
         unknown,
     )
     return unknown
-
-
-def _close(recorder: Recorder, pictures: Any, env: dm_env.Environment) -> None:
-    try:
-        recorder.close()
-    finally:
-        pictures.close()
-        env.close()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
 from collections.abc import Iterator
@@ -13,9 +12,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import gymnasium_pictures
-from ..recorder.clock import declared_rate, simulation_time
-from ..recorder.exit_guard import ExitGuard
-from ..recorder.recorder import Recorder, RecorderOptions
+from ..recorder.recorder import RecorderOptions
 from .controls import MonitorControls
 
 __all__ = ["GymnasiumMonitor"]
@@ -36,6 +33,8 @@ class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
     closed.
     """
 
+    allows_early_reset = False
+
     def __init__(
         self,
         env: gymnasium.Env[Any, Any],
@@ -53,17 +52,12 @@ class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
         self._next_step_autoreset = any(
             isinstance(wrapper, gymnasium.wrappers.Autoreset) for wrapper in _chain(env)
         )
-        pictures = gymnasium_pictures(env, camera=camera, height=height, width=width)
-        self._recorder = Recorder(
+        self._start(
+            env,
             directory,
             env_id=env_id or _env_id(env),
-            pictures=pictures,
+            pictures=gymnasium_pictures(env, camera=camera, height=height, width=width),
             options=options,
-            clock=functools.partial(simulation_time, env),
-            declared=functools.partial(declared_rate, env),
-        )
-        self._guard = ExitGuard(
-            self, functools.partial(_close, self._recorder, pictures, env)
         )
 
     # Gymnasium's own wrappers override the attribute by a property too.
@@ -115,8 +109,13 @@ class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
         return result
 
     def close(self) -> None:
-        """Finish the recordings, then close the environment. Idempotent."""
-        self._guard.close()
+        """Finish the recordings, then close the environment. Idempotent.
+
+        Raises:
+            EncoderError: the running video could not be finished; all else is.
+        """
+        # Both base classes have a close.
+        MonitorControls.close(self)
 
     def _reset_by_step(
         self, action: Any
@@ -125,11 +124,6 @@ class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
         result = self.env.step(action)
         self._begin()
         return result
-
-    def _begin(self, *, seed: int | None = None, options: Any = None) -> None:
-        self._recorder.reset(seed=seed, options=options)
-        # Drawing has loaded OpenGL by now, which tears itself down at exit.
-        self._guard.run_first_at_exit()
 
 
 def _env_id(env: gymnasium.Env[Any, Any]) -> str:
@@ -150,11 +144,3 @@ def _chain(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
     while isinstance(env, gymnasium.Wrapper):
         env = env.env
         yield env
-
-
-def _close(recorder: Recorder, pictures: Any, env: gymnasium.Env[Any, Any]) -> None:
-    try:
-        recorder.close()
-    finally:
-        pictures.close()
-        env.close()

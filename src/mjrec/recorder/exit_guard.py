@@ -5,10 +5,14 @@ from __future__ import annotations
 
 import atexit
 import os
+import threading
 import weakref
 from collections.abc import Callable
 
 __all__ = ["ExitGuard"]
+
+# How the names of this package's own threads begin.
+_OWN_THREADS = "mjrec-"
 
 
 class ExitGuard:
@@ -24,22 +28,38 @@ class ExitGuard:
     """
 
     def __init__(self, owner: object, close: Callable[[], None]) -> None:
-        self._finalize = weakref.finalize(owner, _in_process(os.getpid(), close))
+        self._close = _in_process(os.getpid(), close)
+        self._finalize = weakref.finalize(owner, _aside, self._close)
         # weakref's own exit hook is as old as its first use in the process, and hooks
         # run newest first: simulators would have torn OpenGL down before us.
         self._finalize.atexit = False
+        self._first = False
         atexit.register(self._finalize)
 
     def run_first_at_exit(self) -> None:
-        """Put this hook before all exit hooks that were registered so far."""
-        if self._finalize.alive:
+        """Put this hook before all exit hooks that were registered so far; once."""
+        if not self._first and self._finalize.alive:
+            self._first = True
             atexit.unregister(self._finalize)
             atexit.register(self._finalize)
 
     def close(self) -> None:
-        """Call `close`, unless that was done already."""
+        """Call `close`, unless that was done already.
+
+        Where it is interrupted (Ctrl-C), the next call calls it again.
+        """
+        if not self._finalize.alive:
+            return
+        try:
+            self._close()
+        except Exception:
+            self._retire()
+            raise
+        self._retire()
+
+    def _retire(self) -> None:
+        self._finalize.detach()
         atexit.unregister(self._finalize)
-        self._finalize()
 
 
 def _in_process(pid: int, close: Callable[[], None]) -> Callable[[], None]:
@@ -48,3 +68,15 @@ def _in_process(pid: int, close: Callable[[], None]) -> Callable[[], None]:
             close()
 
     return close_here
+
+
+def _aside(close: Callable[[], None]) -> None:
+    """Call `close`, on another thread where this one is ours.
+
+    Garbage is collected on whichever thread happens to allocate. Closing waits for the
+    encoder's thread, which must not be the one that waits.
+    """
+    if threading.current_thread().name.startswith(_OWN_THREADS):
+        threading.Thread(target=close, name="close").start()
+    else:
+        close()

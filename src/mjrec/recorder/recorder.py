@@ -173,12 +173,7 @@ class Recorder:
             ResetNotAllowed: in mid-episode, unless early resets are allowed.
             Error: in a process forked from the one that made the recorder.
         """
-        if os.getpid() != self._pid:
-            raise Error(
-                f"This monitor belongs to process {self._pid}, and this is "
-                f"{os.getpid()}, forked from it. Two processes cannot write the same "
-                "files: make the monitor inside the process that uses it."
-            )
+        self._check_process()
         self.stats_recorder.before_reset()
         self._reset_time = time.time()
 
@@ -215,7 +210,9 @@ class Recorder:
 
         Raises:
             ResetNeeded: before the first reset, or after the end of an episode.
+            Error: in a process forked from the one that made the recorder.
         """
+        self._check_process()
         self.stats_recorder.before_step()
 
     def step(
@@ -240,36 +237,56 @@ class Recorder:
         if done:
             # First of all, so that no failing video can lose the episode.
             self._journal_episode(**ending)
-        if self.video_recorder is not None and self.video_recorder.functional:
-            if picture:
-                self.video_recorder.capture_frame()
-            else:
-                self.video_recorder.metadata["final_frame"] = "missing"
-        if done:
-            self._end_video(complete=True, **ending)
+        try:
+            self._take_picture(missing=not picture)
+        finally:
+            if done:
+                self._end_video(complete=True, **ending)
 
     def close(self) -> None:
         """Finish the video, write statistics and manifest, and let go. Idempotent.
 
         An episode that is not over is no part of the statistics; its video is kept,
-        marked incomplete.
+        marked incomplete. Where it is interrupted (Ctrl-C), the next call goes on.
 
         Raises:
             EncoderError: the video could not be finished; the rest is written.
         """
         if self.closed:
             return
-        self.closed = True
         try:
             self._end_video(complete=False, reason="close")
-        finally:
-            try:
-                self._flush()
-                self.stats_recorder.closed = True
-            finally:
-                self._journal.close()
-                self._place.lock.release()
+        except Exception:
+            self._let_go()
+            raise
+        self._let_go()
         logger.info("Finished writing results. They are in %s.", self.directory)
+
+    def _let_go(self) -> None:
+        try:
+            self._flush()
+        finally:
+            self.closed = True
+            self.stats_recorder.closed = True
+            self._journal.close()
+            self._place.lock.release()
+
+    def _check_process(self) -> None:
+        if os.getpid() != self._pid:
+            raise Error(
+                f"This monitor belongs to process {self._pid}, and this is "
+                f"{os.getpid()}, forked from it. Two processes cannot write the same "
+                "files: make the monitor inside the process that uses it."
+            )
+
+    def _take_picture(self, *, missing: bool) -> None:
+        recorder = self.video_recorder
+        if recorder is None or not recorder.functional:
+            return
+        if missing:
+            recorder.metadata["final_frame"] = "missing"
+        else:
+            recorder.capture_frame()
 
     def _begin_video(self, episode_id: int) -> None:
         self.video_recorder = VideoRecorder(
@@ -316,9 +333,10 @@ class Recorder:
         if recorder is None or not recorder.enabled or recorder.closed:
             return
         stats = self.stats_recorder
+        if "complete" not in recorder.metadata:
+            # Else an end that was interrupted is taken up again.
+            recorder.metadata.update(complete=complete, **facts)
         recorder.metadata.update(
-            complete=complete,
-            **facts,
             length=stats.steps,
             reward=stats.rewards,
             type=stats.episode_type,
@@ -331,7 +349,8 @@ class Recorder:
         try:
             recorder.close()
         finally:
-            self._note(recorder)
+            if recorder.closed:
+                self._note(recorder)
 
     def _note(self, recorder: VideoRecorder) -> None:
         assert recorder.path is not None
@@ -339,7 +358,7 @@ class Recorder:
         names = (Path(recorder.path).name, Path(recorder.metadata_path).name)
         if recorder.broken:
             self._videos.broken.append(names[1])
-        elif not recorder.empty:
+        elif recorder.finished:
             self._videos.finished.append(names)
 
     def _flush(self) -> None:

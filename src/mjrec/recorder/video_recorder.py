@@ -9,16 +9,18 @@ import tempfile
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Protocol
+from types import TracebackType
+from typing import Any, Protocol, Self
 
 from .. import json_text
 from ..atomic_files import write_text
-from ..errors import Error, InvalidArgument, InvalidFrame
+from ..errors import InvalidArgument, InvalidFrame
 from ..formats.asciicast import AsciicastWriter, text_of_frame
 from ..formats.video_writer import VideoFile, VideoWriter
 from ..frames import Frame, check_frame
 from ..rates import rate_from_timestep, to_rate
-from .clock import declared_rate, simulation_time
+from ..simulation.inside import simulation_time
+from .declared_rate import declared_rate
 
 __all__ = ["PictureSource", "VideoRecorder", "can_give_pictures"]
 
@@ -83,6 +85,7 @@ class VideoRecorder:
         metadata: what the metadata file will hold, as far as it is known.
         enabled: whether it records.
         broken: a bad frame, or an encoder that failed, ended the video early.
+        finished: the video is there, under its name and whole; known after `close`.
     """
 
     def __init__(
@@ -102,6 +105,7 @@ class VideoRecorder:
         self.env = env
         self.enabled = bool(enabled) and can_give_pictures(env)
         self.broken = False
+        self.finished = False
         self.path: str | None = None
         self.metadata_path: str | None = None
         self.metadata = dict(metadata or {})
@@ -130,7 +134,8 @@ class VideoRecorder:
                     getattr(env, "render_mode", None),
                 )
             return
-        self.path = self._path_of(path, base_path)
+        # Absolute, so that a later chdir does not part the video from its metadata.
+        self.path = str(Path(self._path_of(path, base_path)).absolute())
         self.metadata_path = str(Path(self.path).with_suffix(".meta.json"))
         self.metadata["content_type"] = (
             "video/vnd.openai.ansivid" if self.ansi_mode else "video/mp4"
@@ -169,38 +174,50 @@ class VideoRecorder:
             return
         rendered = self.env.render()
         frames = rendered if isinstance(rendered, list) else [rendered]
-        time = self._clock()
         step, self._captures = self._captures, self._captures + 1
         try:
             for frame in frames:
                 self._add(self._take(frame))
                 self._steps.add(step)
-            self._settle_rate(time, len(frames))
+            self._settle_rate(len(frames))
         except InvalidFrame as error:
             self._break(str(error))
-        except Error:
-            self._abandon()
+        except Exception as error:
+            self._abandon(error)
             raise
 
     def close(self) -> None:
         """Finish the video and write its metadata. A second call does nothing.
 
-        Without a frame there is no video, and the metadata says `empty`.
+        Without a frame there is no video, and the metadata says `empty`. Where it is
+        interrupted (Ctrl-C), the next call finishes what is left.
 
         Raises:
             EncoderError: ffmpeg failed; the metadata is written all the same.
         """
-        if self._closed or not self.enabled:
-            self._closed = True
+        if self._closed:
             return
-        self._closed = True
-        try:
-            self._finish_writer()
-        except Error:
-            self._abandon()
-            raise
-        finally:
+        if self.enabled:
+            try:
+                self._finish_writer()
+            except Exception as error:
+                self._abandon(error)
+                self._write_metadata()
+                self._closed = True
+                raise
             self._write_metadata()
+        self._closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
 
     def discard(self) -> None:
         """End without a video and without metadata."""
@@ -245,12 +262,13 @@ class VideoRecorder:
             # The environment may draw the next picture into the same array.
             self._waiting.append(frame.copy())
 
-    def _settle_rate(self, time: float | None, frames: int) -> None:
+    def _settle_rate(self, frames: int) -> None:
         if self._captures == 1:
-            self._first_time = time
+            self._first_time = self._clock()
             if self._fps is not None:
                 self._open_writer(self._fps)
         elif self._captures == 2:
+            time = self._clock()
             if time is not None and self._first_time is not None:
                 self._timestep = _step_between(self._first_time, time)
             if self._writer is None:
@@ -284,9 +302,11 @@ class VideoRecorder:
             reason,
         )
 
-    def _abandon(self) -> None:
+    def _abandon(self, error: Exception) -> None:
         """Give the video up: its encoder failed, and no part of it is to be trusted."""
         self.broken = True
+        self.finished = False
+        self.metadata["broken_reason"] = str(error)
         self._waiting.clear()
         if self._writer is not None:
             self._writer.abort()
@@ -296,6 +316,7 @@ class VideoRecorder:
             self._open_writer(self._fps or self._declared())
         if self._writer is not None:
             self._writer.close()
+            self.finished = True
 
     def _write_metadata(self) -> None:
         if self._steps.total:

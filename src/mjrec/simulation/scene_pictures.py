@@ -36,9 +36,8 @@ class ScenePictures:
 
     Args:
         simulation: returns the model and the data of this moment, MuJoCo's own or
-            dm_control's. A model other than the last one gets a renderer of its own.
-        look: returns how the environment shows its scene; asked when a renderer is
-            made.
+            dm_control's. The model may be another one at each call.
+        look: returns how the environment shows its scene; asked at the first picture.
         camera: instead of the look's.
         height: in pixels.
         width: in pixels.
@@ -64,15 +63,19 @@ class ScenePictures:
         self._camera = camera
         self._height, self._width = check_size(height, width)
         self._renderer: SceneRenderer | None = None
-        self._drawn_model: mujoco.MjModel | None = None
-        self._shown_camera: Any = camera
+        self._model: mujoco.MjModel | None = None
         if camera is not None:
-            resolve_camera(self._model(), camera)
+            resolve_camera(raw_model(simulation()[0]), camera)
 
     def render(self) -> Frame:
         """Return the picture of this moment, `(height, width, 3) uint8`."""
-        renderer = self._renderer_for(self._model())
-        return renderer.render(raw_data(self._simulation()[1]))
+        model, data = self._simulation()
+        if self._renderer is None:
+            self._renderer = self._made(raw_model(model))
+        elif raw_model(model) is not self._model:
+            self._renderer.model_changed(model)
+        self._model = raw_model(model)
+        return self._renderer.render(raw_data(data))
 
     def begin_episode(self) -> None:
         """Look for what a reset may have changed below the renderer.
@@ -80,15 +83,15 @@ class ScenePictures:
         Height fields, textures and meshes are copied into the OpenGL context; a task
         that makes a new terrain in its reset changes only the model.
         """
-        # Another model gets another renderer when it is drawn.
-        if self._renderer is not None and self._draws(self._model()):
-            self._renderer.model_changed()
+        if self._renderer is not None:
+            self._model = raw_model(self._simulation()[0])
+            self._renderer.model_changed(self._model)
 
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         facts: dict[str, Any] = {"pictures": "scene", "quality": "full"}
-        if self._drawn_model is not None:
-            facts["camera"] = camera_label(self._drawn_model, self._shown_camera)
+        if self._model is not None:
+            facts["camera"] = camera_label(self._model, self._camera)
         if self._renderer is not None:
             vendor, renderer, version = self._renderer.gl_strings
             facts.update(gl_vendor=vendor, gl_renderer=renderer, gl_version=version)
@@ -100,31 +103,18 @@ class ScenePictures:
             self._renderer.close()
             self._renderer = None
 
-    def _model(self) -> mujoco.MjModel:
-        return raw_model(self._simulation()[0])
-
-    def _draws(self, model: mujoco.MjModel) -> bool:
-        # The Python wrapper of one and the same model can be made anew at each
-        # access; the address tells models apart. The drawn one is kept alive, so that
-        # no other can come to lie where it was.
-        drawn = self._drawn_model
-        return drawn is not None and bool(drawn._address == model._address)
-
-    def _renderer_for(self, model: mujoco.MjModel) -> SceneRenderer:
-        if self._renderer is None or not self._draws(model):
-            self.close()
-            look = self._look()
-            self._shown_camera = look.camera if self._camera is None else self._camera
-            self._renderer = SceneRenderer(
-                model,
-                height=self._height,
-                width=self._width,
-                camera=self._shown_camera,
-                scene_option=look.scene_option,
-                max_geom=look.max_geom,
-            )
-            self._drawn_model = model
-        return self._renderer
+    def _made(self, model: mujoco.MjModel) -> SceneRenderer:
+        look = self._look()
+        if self._camera is None:
+            self._camera = look.camera
+        return SceneRenderer(
+            model,
+            height=self._height,
+            width=self._width,
+            camera=self._camera,
+            scene_option=look.scene_option,
+            max_geom=look.max_geom,
+        )
 
 
 def option_without_rangefinder() -> mujoco.MjvOption:
