@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import collections
+import logging
 import os
 import threading
 from collections.abc import Callable
@@ -12,6 +13,8 @@ from typing import Generic, TypeVar
 from .errors import ClosedError
 
 __all__ = ["WorkerThread"]
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -24,10 +27,13 @@ class WorkerThread(Generic[T]):
     The thread is a daemon, so that it never keeps the interpreter from ending; only
     `close` promises that every item was consumed.
 
+    Where no thread can be started (at interpreter exit, from Python 3.12 on, or beyond
+    the system's limit) `put` consumes each item itself, on the caller's thread.
+
     Args:
         consume: called with each item, always on the same thread.
         capacity: how many items may wait.
-        name: the thread's name, seen in debuggers.
+        name: what the thread is for. Its name is this behind `mjrec-`.
         finish: called on the thread after the last item; not after an error or
             `abort`.
     """
@@ -45,17 +51,28 @@ class WorkerThread(Generic[T]):
         self._consume = consume
         self._finish = finish
         self._capacity = capacity
+        self._name = name
         self._waiting: collections.deque[T] = collections.deque()
-        # Condition's own lock is reentrant: a garbage collection while the thread
-        # holds it may run a finaliser that calls `leave`.
-        self._changed = threading.Condition()
+        # Reentrant: a garbage collection while the thread holds it may run a finaliser
+        # that calls `leave`. Taken by itself, not through the condition, whose
+        # `__enter__` is Python: Ctrl-C at its end would leave it locked.
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._closing = False
         self._aborted = False
         self._error: BaseException | None = None
         self._error_was_raised = False
         self._process_id = os.getpid()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+        # Held until the work is done. `Thread.join` would not do: Python 3.11 and 3.12
+        # take a thread for ended when Ctrl-C interrupts the wait for it.
+        self._at_work = threading.Lock()
+        self._at_work.acquire()
+        self._thread = threading.Thread(
+            target=self._work, name=f"mjrec-{name}", daemon=True
+        )
+        self._has_thread = True
+        self._consumes_here = False
+        self._start_thread()
 
     @property
     def failed(self) -> bool:
@@ -72,52 +89,73 @@ class WorkerThread(Generic[T]):
         """
         if os.getpid() != self._process_id:
             raise ClosedError(
-                f"{self._thread.name} lives in process {self._process_id} and cannot "
-                "be used after a fork: make it in the process that uses it."
+                f"{self._name} lives in process {self._process_id} and cannot be used "
+                "after a fork: make it in the process that uses it."
             )
-        with self._changed:
+        with self._lock:
             self._changed.wait_for(self._has_room_or_ended)
             self._raise_error()
             if self._closing:
-                raise ClosedError(f"{self._thread.name} is closed.")
+                raise ClosedError(f"{self._name} is closed.")
             self._waiting.append(item)
             self._changed.notify_all()
+        if not self._has_thread:
+            self._work_here()
+            self._raise_error()
 
     def close(self) -> None:
         """Wait until every item is consumed and the thread has ended.
 
-        May be called again, also after it was interrupted.
+        May be called again, also after it was interrupted. Called on the thread itself,
+        as by a finaliser during a garbage collection there, it is `leave`.
 
         Raises:
             BaseException: whatever the function raised, unless `put` or an earlier
                 `close` has raised it already.
         """
         self.leave()
-        self._join()
+        self._wait_for_end()
         if not self._error_was_raised:
             self._raise_error()
 
     def leave(self) -> None:
         """Let the thread consume what waits and end by itself. Never blocks."""
-        with self._changed:
+        with self._lock:
             self._closing = True
             self._changed.notify_all()
+        if not self._has_thread and os.getpid() == self._process_id:
+            self._work_here()
 
     def abort(self) -> None:
         """Drop what waits, wait for the item in hand, end the thread; raise nothing.
 
         Idempotent. Whatever the function may be blocked on has to be released first.
+        Called on the thread itself it does not wait.
         """
-        with self._changed:
-            self._closing = True
+        with self._lock:
             self._aborted = True
             self._waiting.clear()
-            self._changed.notify_all()
-        self._join()
+        self.leave()
+        self._wait_for_end()
 
-    def _join(self) -> None:
-        # A forked child has no such thread to wait for.
-        if os.getpid() == self._process_id:
+    def _start_thread(self) -> None:
+        try:
+            self._thread.start()
+        except RuntimeError as error:
+            logger.info("%s works without a thread: %s.", self._name, error)
+            self._has_thread = False
+        except BaseException:
+            # Ctrl-C while it starts: it may be there, and nobody will ever close it.
+            self._aborted = True
+            self.leave()
+            raise
+
+    def _wait_for_end(self) -> None:
+        # A forked child has no such thread to wait for, and nobody waits for himself.
+        is_here = threading.current_thread() is self._thread
+        if self._has_thread and not is_here and os.getpid() == self._process_id:
+            with self._at_work:
+                pass
             self._thread.join()
 
     def _has_room_or_ended(self) -> bool:
@@ -128,26 +166,48 @@ class WorkerThread(Generic[T]):
             self._error_was_raised = True
             raise self._error
 
-    def _run(self) -> None:
+    def _work(self) -> None:
+        try:
+            self._consume_all()
+        finally:
+            self._at_work.release()
+
+    def _work_here(self) -> None:
+        # A signal's handler may call `close` in the midst of an item.
+        if self._consumes_here:
+            return
+        self._consumes_here = True
+        try:
+            self._consume_all()
+        finally:
+            self._consumes_here = False
+
+    def _consume_all(self) -> None:
         try:
             while self._wait_for_item():
                 self._consume(self._take())
-            if self._finish is not None and not self._aborted:
-                self._finish()
+            if self._closing:
+                self._call_finish()
         # Whatever it is, it belongs to the caller; nobody looks at this thread.
         except BaseException as error:
-            with self._changed:
+            with self._lock:
                 self._error = error
                 self._waiting.clear()
                 self._changed.notify_all()
 
+    def _call_finish(self) -> None:
+        finish, self._finish = self._finish, None
+        if finish is not None and not (self._aborted or self.failed):
+            finish()
+
     def _wait_for_item(self) -> bool:
-        with self._changed:
-            self._changed.wait_for(lambda: self._closing or bool(self._waiting))
+        with self._lock:
+            if self._has_thread:
+                self._changed.wait_for(lambda: self._closing or bool(self._waiting))
             return bool(self._waiting)
 
     def _take(self) -> T:
-        with self._changed:
+        with self._lock:
             item = self._waiting.popleft()
             self._changed.notify_all()
             return item
