@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 import pickle
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 
 import mjrec
 from mjrec import ExistingRecordings, InvalidArgument, InvalidFrame, UnknownName
-from mjrec.atomic_files import is_temporary, replacing, write_text
+from mjrec.atomic_files import replacing, write_text
 from mjrec.frames import check_frame, check_size, pad_to_even
 from mjrec.json_text import dumps, float_from_json, loads
 
@@ -66,7 +67,7 @@ def test_file_appears_whole(tmp_path: Path) -> None:
     with replacing(path) as temporary:
         temporary.write_text("half")
         assert not path.exists()
-        assert is_temporary(temporary)
+        assert re.fullmatch(r"\.a\.txt\.[0-9a-f]{8}\.part", temporary.name)
         assert temporary.parent == tmp_path
     assert path.read_text() == "half"
     assert list(tmp_path.iterdir()) == [path]

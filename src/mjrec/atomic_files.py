@@ -13,19 +13,12 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["is_temporary", "replacing", "temporary_path", "write_text"]
-
-_SUFFIX = ".part"
+__all__ = ["replacing", "temporary_path", "write_text"]
 
 
 def temporary_path(path: Path) -> Path:
     """Return a new name for an unfinished `path`, in the same directory."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}{_SUFFIX}")
-
-
-def is_temporary(path: Path) -> bool:
-    """Tell whether `path` has the name of an unfinished file of ours."""
-    return path.name.startswith(".") and path.name.endswith(_SUFFIX)
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
 
 
 @contextlib.contextmanager

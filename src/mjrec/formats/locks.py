@@ -24,7 +24,7 @@ class Lock:
 
     Args:
         path: the file to make; it must not exist.
-        content: for people who look into it. Nothing reads it back.
+        content: what others may read about its holder; it stays when the holder dies.
 
     Raises:
         FileExistsError: the file is there, held or left behind.
