@@ -35,8 +35,8 @@ from .errors import (
 
 if TYPE_CHECKING:
     from .formats.archive import write_archive as write_archive
+    from .formats.frames_to_videos import save_video as save_video
     from .formats.video_writer import VideoWriter as VideoWriter
-    from .formats.video_writer import save_video as save_video
     from .gl import use_gl as use_gl
     from .monitors import Monitor as Monitor
     from .monitors.dm_env_monitor import DmEnvMonitor as DmEnvMonitor
@@ -69,7 +69,7 @@ _LAZY = {
     "iter_episodes": "results",
     "load_results": "results",
     "merge_stats_files": "results",
-    "save_video": "formats.video_writer",
+    "save_video": "formats.frames_to_videos",
     "use_gl": "gl",
     "write_archive": "formats.archive",
 }

@@ -8,14 +8,14 @@ is complete and its frames have been counted again.
 
 from __future__ import annotations
 
+import contextlib
+import enum
 import hashlib
-import inspect
-import itertools
 import numbers
 import os
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -30,11 +30,9 @@ from ..errors import (
     DirectoryNotWritable,
     FrameCountError,
     InvalidArgument,
-    UnknownName,
 )
 from ..frames import Frame, check_frame, check_size, pad_to_even
 from ..rates import to_rate
-from ..schedules import capped_cubic_video_schedule
 from ..worker_thread import WorkerThread
 from .encoder_settings import (
     MUXERS,
@@ -51,7 +49,7 @@ from .ffmpeg import (
 )
 from .frame_hashes import FrameHashFile, frame_hash_path
 
-__all__ = ["VideoFile", "VideoWriter", "save_video"]
+__all__ = ["VideoFile", "VideoWriter"]
 
 # ffmpeg takes no larger number, above or below, for a rate as a fraction: given one, it
 # silently takes the nearest fraction that fits.
@@ -97,6 +95,15 @@ class VideoFile:
     decoded_sha256: str
     frame_hash_path: Path | None
     encoder: dict[str, Any]
+
+
+class _State(enum.Enum):
+    """How far a video is; the two in the middle last only after an interruption."""
+
+    OPEN = "open"
+    FINISHING = "not finished"
+    ABORTING = "given up"
+    CLOSED = "closed"
 
 
 class VideoWriter:
@@ -153,7 +160,7 @@ class VideoWriter:
         frame_hashes: bool = False,
         encoder_arguments: Sequence[str] = (),
     ) -> None:
-        self._closed = True
+        self._state = _State.CLOSED
         self._encoding: _Encoding | None = None
         self.result: VideoFile | None = None
         self.path = _check_path(path)
@@ -168,7 +175,7 @@ class VideoWriter:
         try_encoding(ffmpeg_executable(), self._settings, self.fps)
         self._frame_count = 0
         self._process_id = os.getpid()
-        self._closed = False
+        self._state = _State.OPEN
 
     @property
     def frame_count(self) -> int:
@@ -177,8 +184,8 @@ class VideoWriter:
 
     @property
     def closed(self) -> bool:
-        """Whether the writer takes no more frames."""
-        return self._closed
+        """Whether the file is finished or given up."""
+        return self._state is _State.CLOSED
 
     def write(self, frame: Frame) -> None:
         """Add a frame, a `(height, width, 3) uint8` array; the first fixes the size.
@@ -191,10 +198,11 @@ class VideoWriter:
             ClosedError: after `close` or `abort`.
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
         """
-        if self._closed:
+        if self._state is not _State.OPEN:
             raise ClosedError(
-                f"The video {self.path} is closed after {self._frame_count} frames; "
-                "a file cannot be reopened: write another one."
+                f"The video {self.path} is {self._state.value} after "
+                f"{self._frame_count} frames; a file cannot be reopened: write another "
+                "one."
             )
         self._check_process()
         started = self._encoding
@@ -204,37 +212,52 @@ class VideoWriter:
             encoding = started or self._start(checked)
             # A plain copy in rows from top to bottom, whatever the view was.
             encoding.worker.put(np.array(checked, order="C", copy=True, subok=False))
-        except Exception:
-            self.abort()
+        except BaseException as error:
+            # Ctrl-C while it waits for room costs nothing. Where there is no thread it
+            # may come in the midst of a frame, which costs the video.
+            if isinstance(error, Exception) or self._has_failed():
+                self.abort()
             raise
         self._frame_count += 1
 
     def close(self) -> None:
         """Finish the file: encode what waits, count the frames again, give the name.
 
-        Idempotent; may be called again after Ctrl-C interrupted it.
+        Idempotent. After Ctrl-C has interrupted it, `closed` is False, no more frames
+        are taken, and another call goes on to the same end. On the thread that encodes,
+        where a garbage collection may call it, it waits for nothing and leaves the rest
+        to another call.
 
         Raises:
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
             FrameCountError: the file does not hold the frames that were written.
         """
-        if self._closed:
+        if self._state is _State.ABORTING:
+            self.abort()
+        if self._state is _State.CLOSED:
             return
         if self._encoding is not None and not self._was_forked():
+            self._state = _State.FINISHING
             try:
                 self.result = self._encoding.finish()
             except Exception:
                 self.abort()
                 raise
-        self._closed = True
+            if self.result is None:
+                return
+        self._state = _State.CLOSED
 
     def abort(self) -> None:
-        """Stop at once and leave nothing; an older file of that name stays."""
-        if self._closed:
+        """Stop at once and leave nothing; an older file of that name stays.
+
+        Idempotent; may be called again after Ctrl-C interrupted it.
+        """
+        if self._state is _State.CLOSED:
             return
-        self._closed = True
+        self._state = _State.ABORTING
         if self._encoding is not None and not self._was_forked():
             self._encoding.abort()
+        self._state = _State.CLOSED
 
     def __enter__(self) -> Self:
         return self
@@ -255,7 +278,7 @@ class VideoWriter:
             error.add_note(f"The video {self.path} could not be finished: {failure}")
 
     def __del__(self) -> None:
-        if self._closed or self._encoding is None or self._was_forked():
+        if self.closed or self._encoding is None or self._was_forked():
             return
         # Waiting is not for a finaliser. The thread encodes what waits and ffmpeg
         # finishes its file, under the temporary name.
@@ -269,10 +292,10 @@ class VideoWriter:
         )
 
     def __repr__(self) -> str:
-        state = "closed" if self._closed else "open"
         return (
             f"<{type(self).__name__} {str(self.path)!r} fps={self.fps} "
-            f"codec={self._settings.codec} {state}, {self._frame_count} frames>"
+            f"codec={self._settings.codec} {self._state.value}, "
+            f"{self._frame_count} frames>"
         )
 
     def _was_forked(self) -> bool:
@@ -285,6 +308,9 @@ class VideoWriter:
                 f"The video {self.path} belongs to process {self._process_id}, from "
                 "which this one was forked: write it there, or another one here."
             )
+
+    def _has_failed(self) -> bool:
+        return self._encoding is not None and self._encoding.worker.failed
 
     def _start(self, first: Frame) -> _Encoding:
         self._encoding = _Encoding(
@@ -316,58 +342,43 @@ class _Encoding:
         self._settings = settings
         self._padded = (size[0] + size[0] % 2, size[1] + size[1] % 2)
         self._encoded = 0
-        self._hashes = (
-            FrameHashFile(frame_hash_path(path), size=size, fps=fps)
-            if frame_hashes
-            else None
-        )
-        try:
+        self._input_ended = False
+        self._result: VideoFile | None = None
+        with contextlib.ExitStack() as on_failure:
+            self._hashes = self._open_hashes() if frame_hashes else None
+            on_failure.callback(self._abort_hashes)
             self._process = self._start_ffmpeg()
-        except BaseException:
-            self._abort_hashes()
-            raise
-        height, width = self._padded
-        frame_bytes = height * width * 3
-        self.worker = WorkerThread[Frame](
-            self._encode,
-            capacity=min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes)),
-            name=f"encoder of {path.name}",
-            finish=self._process.end_input,
-        )
+            on_failure.callback(self._end_process)
+            self.worker = self._start_worker()
+            on_failure.pop_all()
 
-    def finish(self) -> VideoFile:
-        """Complete the file, check it and give it its name."""
+    def finish(self) -> VideoFile | None:
+        """Complete the file, check it and give it its name.
+
+        May be called again after it was interrupted, and goes on then. None on the
+        encoder's own thread, which cannot wait for itself.
+        """
         self.worker.close()
+        if not self._input_ended:
+            return None
         self._process.wait()
-        decoded_sha256 = self._count_and_hash()
-        file_sha256 = _sha256_of_file(self.temporary)
-        result = VideoFile(
-            path=self._path,
-            frame_count=self._encoded,
-            height=self.size[0],
-            width=self.size[1],
-            padded_height=self._padded[0],
-            padded_width=self._padded[1],
-            fps=self._fps,
-            codec=self._settings.codec,
-            pixel_format=self._settings.pixel_format,
-            file_sha256=file_sha256,
-            decoded_sha256=decoded_sha256,
-            frame_hash_path=frame_hash_path(self._path) if self._hashes else None,
-            encoder=self._describe_encoder(),
-        )
-        self._rename()
+        if self._result is None:
+            self._result = self._check()
+        self._rename(self._result)
         self._process.release()
-        return result
+        return self._result
 
     def abort(self) -> None:
-        """End everything and remove the temporary files."""
+        """End everything and remove the temporary files. May be called again."""
         # First the process: the thread may be waiting for it to read.
         self._process.kill()
         self.worker.abort()
-        self._process.release()
-        self.temporary.unlink(missing_ok=True)
+        self._end_process()
         self._abort_hashes()
+
+    def _open_hashes(self) -> FrameHashFile:
+        path = frame_hash_path(self._path)
+        return FrameHashFile(path, size=self.size, fps=self._fps)
 
     def _start_ffmpeg(self) -> FfmpegProcess:
         height, width = self._padded
@@ -376,6 +387,21 @@ class _Encoding:
         )
         what = f"The video {self._path} could not be encoded."
         return FfmpegProcess(arguments, what=what, reads=True)
+
+    def _start_worker(self) -> WorkerThread[Frame]:
+        height, width = self._padded
+        frame_bytes = height * width * 3
+        return WorkerThread[Frame](
+            self._encode,
+            capacity=min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes)),
+            name=f"encoder of {self._path.name}",
+            finish=self._end_input,
+        )
+
+    def _end_process(self) -> None:
+        self._process.kill()
+        self._process.release()
+        self.temporary.unlink(missing_ok=True)
 
     def _abort_hashes(self) -> None:
         if self._hashes is not None:
@@ -386,6 +412,29 @@ class _Encoding:
             self._hashes.add(frame)
         self._process.write(pad_to_even(frame))
         self._encoded += 1
+
+    def _end_input(self) -> None:
+        self._process.end_input()
+        self._input_ended = True
+
+    def _check(self) -> VideoFile:
+        """Return what the finished file holds."""
+        decoded_sha256 = self._count_and_hash()
+        return VideoFile(
+            path=self._path,
+            frame_count=self._encoded,
+            height=self.size[0],
+            width=self.size[1],
+            padded_height=self._padded[0],
+            padded_width=self._padded[1],
+            fps=self._fps,
+            codec=self._settings.codec,
+            pixel_format=self._settings.pixel_format,
+            file_sha256=_sha256_of_file(self.temporary),
+            decoded_sha256=decoded_sha256,
+            frame_hash_path=frame_hash_path(self._path) if self._hashes else None,
+            encoder=self._describe_encoder(),
+        )
 
     def _count_and_hash(self) -> str:
         frame_count, digest = _decode(
@@ -403,7 +452,7 @@ class _Encoding:
             )
         return digest
 
-    def _rename(self) -> None:
+    def _rename(self, result: VideoFile) -> None:
         # The hashes first: where there is a video, what belongs to it is there too.
         try:
             if self._hashes is not None:
@@ -411,9 +460,17 @@ class _Encoding:
             elif self._path.exists():
                 # Those of the video that is replaced now would be wrong.
                 frame_hash_path(self._path).unlink(missing_ok=True)
-            self.temporary.replace(self._path)
+            self._replace(result)
         except OSError as error:
             raise DirectoryNotWritable(self._path.parent, error) from error
+
+    def _replace(self, result: VideoFile) -> None:
+        try:
+            self.temporary.replace(self._path)
+        except FileNotFoundError:
+            # An earlier call may have been interrupted just after it had done this.
+            if _sha256_of_file(self._path) != result.file_sha256:
+                raise
 
     def _describe_encoder(self) -> dict[str, Any]:
         executable, *arguments = self._process.command
@@ -479,9 +536,9 @@ def _decode(
         what=f"The finished video {video} cannot be decoded.",
         writes=True,
     )
-    digest = hashlib.sha256()
-    total = 0
     try:
+        digest = hashlib.sha256()
+        total = 0
         while block := process.read(_READ_SIZE):
             digest.update(block)
             total += len(block)
@@ -505,110 +562,3 @@ def _sha256_of_file(path: Path) -> str:
 def _as_file(path: Path) -> str:
     # Without the prefix a colon in the name would make ffmpeg look for a protocol.
     return f"file:{path}"
-
-
-def save_video(
-    frames: Iterable[Frame],
-    video_folder: str | os.PathLike[str],
-    episode_trigger: Callable[[int], Any] | None = None,
-    step_trigger: Callable[[int], Any] | None = None,
-    video_length: int | None = None,
-    name_prefix: str = "rl-video",
-    episode_index: int = 0,
-    step_starting_index: int = 0,
-    **kwargs: Any,
-) -> None:
-    """Write videos of one episode's frames, as Gymnasium's function of that name does.
-
-    `<prefix>-episode-<episode_index>.mp4` holds the episode, if `episode_trigger` says
-    yes; `<prefix>-step-<n>.mp4` begins with the frame of step n, for each n for which
-    `step_trigger` says yes. The first frame is the reset's and belongs to no step; the
-    second is that of step `step_starting_index`. Every frame is in the file.
-
-    `frames` may be any iterable. Where only the episode trigger is used it is streamed,
-    read no further than `video_length`, and not at all when no video is due; with a
-    step trigger, whose videos may overlap, all frames are held in memory. An existing
-    video is replaced when the new one is complete. No frames, no file. If `frames`
-    raises, the frames before that are kept.
-
-    Args:
-        frames: `(height, width, 3) uint8` arrays.
-        video_folder: the directory; made if need be.
-        episode_trigger: from an episode's number to whether it gets a video. If both
-            triggers are None: the cubes 0, 1, 8, 27 ... 729 and every 1000th.
-        step_trigger: from a step's number to whether a video begins there.
-        video_length: the most frames of a video; all that follow if None.
-        name_prefix: begins the files' names.
-        episode_index: the episode's number.
-        step_starting_index: the number of the episode's first step.
-        **kwargs: `fps`, which is required, and the other options of `VideoWriter`.
-
-    Raises:
-        InvalidArgument: `fps` is missing, an option is unknown, or a value cannot be.
-        DirectoryNotWritable: `video_folder` cannot be made or written to.
-        InvalidFrame: what is no picture.
-        EncoderError: as `VideoWriter.write` and `close`.
-    """
-    _check_options(kwargs)
-    _check_video_length(video_length)
-    if episode_trigger is None and step_trigger is None:
-        episode_trigger = capped_cubic_video_schedule
-    folder = _make_directory(Path(video_folder))
-    if step_trigger is not None:
-        frames = held = _hold(frames)
-    if episode_trigger is not None and episode_trigger(episode_index):
-        path = folder / f"{name_prefix}-episode-{episode_index}.mp4"
-        _write_video(itertools.islice(frames, video_length), path, kwargs)
-    if step_trigger is not None:
-        # The first frame is the reset's.
-        for step, first in enumerate(range(1, len(held)), start=step_starting_index):
-            if step_trigger(step):
-                last = None if video_length is None else first + video_length
-                path = folder / f"{name_prefix}-step-{step}.mp4"
-                _write_video(held[first:last], path, kwargs)
-
-
-def _hold(frames: Iterable[Frame]) -> Sequence[Frame]:
-    if isinstance(frames, Sequence | np.ndarray):
-        return list(frames)
-    # Copies: a generator may fill the same array again and again.
-    return [np.array(frame) for frame in frames]
-
-
-def _write_video(frames: Iterable[Frame], path: Path, options: dict[str, Any]) -> None:
-    with VideoWriter(path, **options) as video:
-        for frame in frames:
-            video.write(frame)
-
-
-def _check_options(options: dict[str, Any]) -> None:
-    parameters = inspect.signature(VideoWriter).parameters.values()
-    known = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
-    for name in options:
-        if name not in known:
-            raise UnknownName("option of save_video", name, known)
-    if "fps" not in options:
-        raise InvalidArgument(
-            "save_video needs fps, the frames per second of the video: "
-            "fps=env.metadata['render_fps'], for example."
-        )
-    to_rate(options["fps"])
-
-
-def _check_video_length(video_length: object) -> None:
-    if video_length is None:
-        return
-    is_number = isinstance(video_length, int) and not isinstance(video_length, bool)
-    if not is_number or not video_length > 0:  # type: ignore[operator]  # is_number
-        raise InvalidArgument(
-            "video_length must be a positive number of frames, or None for all, got "
-            f"{video_length!r}."
-        )
-
-
-def _make_directory(directory: Path) -> Path:
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DirectoryNotWritable(directory, error) from error
-    return directory
