@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from mjrec.errors import EncoderError
+from mjrec.errors import EncoderError, InvalidArgument, MissingDependency
 from mjrec.formats.ffmpeg import (
     FfmpegProcess,
     ffmpeg_executable,
@@ -55,22 +55,75 @@ def test_a_program_that_is_not_there_is_named(
 ) -> None:
     """A wrong IMAGEIO_FFMPEG_EXE is an error with the variable and its value."""
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "nowhere"))
-    with pytest.raises(EncoderError, match=r"IMAGEIO_FFMPEG_EXE is '.*nowhere'"):
+    with pytest.raises(InvalidArgument, match=r"IMAGEIO_FFMPEG_EXE is '.*nowhere'"):
         ffmpeg_executable()
 
 
-def test_a_program_that_cannot_be_started_is_an_encoder_error(
+def test_no_program_at_all_is_a_missing_dependency(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A file that is executable and no program gives one error of ours."""
+    """Neither named nor brought along nor in PATH: what to install is said."""
+    nothing = (
+        "def get_ffmpeg_exe(): raise RuntimeError('No ffmpeg exe could be found.')"
+    )
+    (tmp_path / "imageio_ffmpeg.py").write_text(nothing)
+    monkeypatch.delitem(sys.modules, "imageio_ffmpeg", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        with pytest.raises(MissingDependency, match="install imageio-ffmpeg"):
+            ffmpeg_executable()
+    finally:
+        sys.modules.pop("imageio_ffmpeg", None)
+
+
+def test_a_program_that_cannot_be_started_is_told_from_one_that_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that is executable and no program: no exit status, but the reason."""
     broken = tmp_path / "broken"
     broken.write_bytes(b"\0\0\0\0")
     broken.chmod(0o755)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(broken))
-    with pytest.raises(EncoderError, match="could not be started"):
+    reason = r"IMAGEIO_FFMPEG_EXE is '.*broken', .* Exec format error\. Unset it"
+    with pytest.raises(InvalidArgument, match=reason):
         run_ffmpeg(["-version"])
-    with pytest.raises(EncoderError, match="could not be started"):
+    with pytest.raises(InvalidArgument, match=reason):
         FfmpegProcess(["-version"], what="It failed.")
+
+
+def test_a_broken_program_that_nobody_named_is_a_missing_dependency(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The one that is there is named, and how to get another."""
+    broken = tmp_path / "broken"
+    broken.write_bytes(b"\0\0\0\0")
+    broken.chmod(0o755)
+    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE", raising=False)
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(broken))
+    with pytest.raises(MissingDependency, match=r"broken \(Exec format error\)"):
+        run_ffmpeg(["-version"])
+
+
+def test_a_lack_of_open_files_is_not_blamed_on_the_program() -> None:
+    """What the system refused is said as the system says it."""
+    code = (
+        "import resource\n"
+        "from mjrec.errors import EncoderError, Error, MissingDependency\n"
+        "from mjrec.formats.ffmpeg import ffmpeg_executable, run_ffmpeg\n"
+        "ffmpeg_executable()\n"
+        "limit = resource.RLIMIT_NOFILE\n"
+        "resource.setrlimit(limit, (4, resource.getrlimit(limit)[1]))\n"
+        "try:\n"
+        "    run_ffmpeg(['-version'])\n"
+        "except Error as error:\n"
+        "    assert not isinstance(error, EncoderError | MissingDependency)\n"
+        "    assert 'could not be started: [Errno 24]' in str(error), error\n"
+        "    print('told')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, timeout=60, stdout=subprocess.PIPE
+    )
+    assert done.stdout == b"told\n"
 
 
 def test_a_failure_has_command_status_and_the_end_of_stderr() -> None:

@@ -2,8 +2,9 @@
 """ffmpeg: which one, and running it so that a failure is never missed.
 
 `imageio-ffmpeg` brings the binary (or finds one); driving it is done here. Every
-failure is one `EncoderError` with the command, the exit status and the end of what
-ffmpeg said.
+failure of an ffmpeg that ran is one `EncoderError` with the command, the exit status
+and the end of what it said. One that cannot be started is another error, with the
+reason.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
-from ..errors import EncoderError, MissingDependency
+from ..errors import EncoderError, Error, InvalidArgument, MissingDependency
 from ..frames import Frame
 
 __all__ = [
@@ -50,7 +51,7 @@ def ffmpeg_executable() -> str:
 
     Raises:
         MissingDependency: there is none.
-        EncoderError: `IMAGEIO_FFMPEG_EXE` names none.
+        InvalidArgument: `IMAGEIO_FFMPEG_EXE` names none.
     """
     # Not at the top: importing mjrec imports no ffmpeg.
     import imageio_ffmpeg
@@ -58,21 +59,10 @@ def ffmpeg_executable() -> str:
     try:
         name: str = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
-        raise MissingDependency(
-            "ffmpeg",
-            purpose="Writing a video",
-            install=f"pip install imageio-ffmpeg, or set {_ENVIRONMENT_VARIABLE} to "
-            "the path of an ffmpeg",
-        ) from error
+        raise _no_program("ffmpeg") from error
     path = shutil.which(name)
     if path is None:
-        raise EncoderError(
-            f"{_ENVIRONMENT_VARIABLE} is {name!r}, and no program can be started "
-            "under that name: unset it, or set it to the path of an ffmpeg.",
-            command=[name],
-            returncode=None,
-            stderr="",
-        )
+        raise _unusable(name, "there is no program of that name")
     return path
 
 
@@ -114,7 +104,8 @@ def run_ffmpeg(
         what: what fails when it fails: the first sentence of the error.
 
     Raises:
-        EncoderError: it could not be started or its exit status is not 0.
+        EncoderError: its exit status is not 0.
+        Error: it could not be started, as `ffmpeg_executable` where that is its fault.
     """
     command = [ffmpeg_executable(), *arguments]
     try:
@@ -126,7 +117,7 @@ def run_ffmpeg(
             start_new_session=True,
         )
     except OSError as error:
-        raise _not_started(command, error) from error
+        raise _not_started(command[0], error) from error
     if done.returncode != 0:
         raise EncoderError(
             what,
@@ -149,6 +140,9 @@ class FfmpegProcess:
         what: what fails when it fails: the first sentence of the error.
         reads: whether it is fed through `write`.
         writes: whether it is read through `read`.
+
+    Raises:
+        Error: as `run_ffmpeg`, if it could not be started.
     """
 
     def __init__(
@@ -172,9 +166,11 @@ class FfmpegProcess:
                 bufsize=0,
                 start_new_session=True,
             )
-        except OSError as error:
+        except BaseException as error:
             self._stderr.close()
-            raise _not_started(self._command, error) from error
+            if isinstance(error, OSError):
+                raise _not_started(self._command[0], error) from error
+            raise
         for pipe in self._pipes():
             # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More is
             # a favour that the kernel may refuse.
@@ -324,12 +320,30 @@ def _every_frame_arguments(
     return name, "passthrough"
 
 
-def _not_started(command: Sequence[str], error: OSError) -> EncoderError:
-    return EncoderError(
-        f"ffmpeg could not be started: {error}.",
-        command=command,
-        returncode=None,
-        stderr="",
+def _not_started(executable: str, error: OSError) -> Error:
+    # The name is there only where the program itself is to blame, and not a lack of
+    # memory, processes or open files.
+    if error.filename is None:
+        return Error(f"ffmpeg ({executable}) could not be started: {error}.")
+    return _unusable(executable, error.strerror)
+
+
+def _unusable(executable: str, reason: object) -> Error:
+    named = os.environ.get(_ENVIRONMENT_VARIABLE)
+    if named:
+        return InvalidArgument(
+            f"{_ENVIRONMENT_VARIABLE} is {named!r}, which cannot be started: {reason}. "
+            "Unset it, or set it to the path of an ffmpeg."
+        )
+    return _no_program(f"an ffmpeg other than {executable} ({reason})")
+
+
+def _no_program(what: str) -> MissingDependency:
+    return MissingDependency(
+        what,
+        purpose="Writing a video",
+        install="pip install --force-reinstall imageio-ffmpeg, or set "
+        f"{_ENVIRONMENT_VARIABLE} to the path of an ffmpeg",
     )
 
 
