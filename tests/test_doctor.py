@@ -249,6 +249,35 @@ def test_ffmpeg_without_libx264(
     assert "Unknown encoder 'libx264'" in found.cause
 
 
+def test_ffmpeg_that_fails_at_the_real_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """H.264 alone is not enough: what a recording asks for is tried."""
+    good = examine_ffmpeg()
+    assert good.encodes
+    fake = tmp_path / "ffmpeg"
+    fake.write_text(
+        '#!/bin/sh\nfor argument do\n  [ "$argument" = cpu-independent=1 ] && '
+        "{ echo 'Error parsing option cpu-independent' >&2; exit 8; }\ndone\n"
+        f'exec {good.path} "$@"\n'
+    )
+    fake.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake))
+    found = examine_ffmpeg()
+    assert not found.encodes
+    assert found.cause == "Error parsing option cpu-independent"
+
+
+def test_ffmpeg_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The report says so and goes on."""
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "nowhere"))
+    found = examine_ffmpeg()
+    assert found.path is None
+    assert "nowhere" in found.cause
+
+
 def test_a_package_that_is_not_installed() -> None:
     """That is no failure, and it is said how to install it."""
     found = examine_package("mjrec-there-is-no-such", "import nothing", "pip install x")

@@ -10,9 +10,11 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 
-from .errors import EncoderError, Error, MissingDependency
-from .formats.ffmpeg import ffmpeg_executable, ffmpeg_version, run_ffmpeg
+from .errors import EncoderError, Error
+from .formats.encoder_settings import MUXERS, encoder_settings, try_encoding
+from .formats.ffmpeg import ffmpeg_executable, ffmpeg_version
 from .gl import BACKENDS, Diagnosis, Probe, choose, diagnose, probe
 from .gl.backends import platforms_contradict
 from .machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
@@ -47,7 +49,7 @@ _PACKAGES = (
     ("numpy", "", ""),
 )
 _PROGRAM_TIMEOUT = 120
-_SIDE = 64
+_TRIAL_FPS = Fraction(50)
 
 
 @dataclass(frozen=True)
@@ -221,16 +223,17 @@ def _examine_cpus() -> Cpus:
 
 
 def examine_ffmpeg() -> Ffmpeg:
-    """Find ffmpeg and encode a picture with it."""
+    """Find ffmpeg and encode a picture as a recording does."""
     try:
         path = ffmpeg_executable()
-    except (MissingDependency, EncoderError) as error:
+    except Error as error:
         return Ffmpeg(None, cause=str(error), fix=_OTHER_FFMPEG)
     version = ""
     try:
         version = ffmpeg_version()
-        _encode_a_frame()
-    except EncoderError as error:
+        settings = encoder_settings(codec=None, crf=None, muxer=MUXERS[".mp4"])
+        try_encoding(path, settings, _TRIAL_FPS)
+    except Error as error:
         return Ffmpeg(path, version, cause=_last_words(error), fix=_OTHER_FFMPEG)
     return Ffmpeg(path, version, encodes=True)
 
@@ -242,28 +245,8 @@ _OTHER_FFMPEG = (
 )
 
 
-def _encode_a_frame() -> None:
-    """Make a video of one grey picture.
-
-    Raises:
-        EncoderError: ffmpeg failed.
-    """
-    picture = bytes([128]) * (3 * _SIDE * _SIDE)
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{_SIDE}x{_SIDE}"]
-    coded = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-f", "h264"]
-    arguments = ["-v", "error", *raw, "-i", "pipe:0", *coded, "pipe:1"]
-    done = run_ffmpeg(arguments, standard_input=picture)
-    if not done.stdout:
-        raise EncoderError(
-            "ffmpeg made no video out of a picture.",
-            command=done.args,
-            returncode=done.returncode,
-            stderr=done.stderr.decode(errors="replace"),
-        )
-
-
-def _last_words(error: EncoderError) -> str:
-    said = error.stderr.strip().splitlines()
+def _last_words(error: Error) -> str:
+    said = error.stderr.strip().splitlines() if isinstance(error, EncoderError) else []
     return said[-1] if said else str(error)
 
 
