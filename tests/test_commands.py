@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import av
 import pytest
+from recordings import frames_in, metadata_of
 
 from mjrec import load_results
 from mjrec.commands import main
@@ -59,18 +59,6 @@ def mjrec(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, s
         return status, out, err
 
     return run
-
-
-def frames_in(directory: Path, episode: int) -> list[Any]:
-    [path] = directory.glob(f"*.video{episode:06d}.mp4")
-    with av.open(str(path)) as container:
-        return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
-
-
-def metadata_of(directory: Path, episode: int) -> dict[str, Any]:
-    [path] = directory.glob(f"*.video{episode:06d}.meta.json")
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
 
 
 def results_of(directory: Path) -> dict[str, Any]:

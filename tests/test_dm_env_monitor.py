@@ -2,13 +2,11 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pytest
 
@@ -17,6 +15,7 @@ dm_env = pytest.importorskip("dm_env", reason="dm_env comes with dm_control")
 from absl.testing import absltest  # noqa: E402  after importorskip
 from dm_env import specs  # noqa: E402  after importorskip
 from dm_env import test_utils as dm_env_test_utils  # noqa: E402  after importorskip
+from recordings import frames_in, journal_of, metadata_of  # noqa: E402  after importorskip
 
 import mjrec  # noqa: E402  after importorskip
 from mjrec import (  # noqa: E402  after importorskip
@@ -68,29 +67,6 @@ def cheetah() -> Iterator[Any]:
     env = suite.load("cheetah", "run", task_kwargs={"random": 0, "time_limit": 0.04})
     yield env
     env.close()
-
-
-def stats_of(directory: Path) -> dict[str, Any]:
-    [path] = directory.glob("openaigym.episode_batch.*")
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
-
-
-def journal_of(directory: Path) -> list[dict[str, Any]]:
-    [path] = directory.glob("openaigym.episodes.*")
-    return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-def metadata_of(directory: Path, episode: int) -> dict[str, Any]:
-    [path] = directory.glob(f"*.video{episode:06d}.meta.json")
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
-
-
-def frames_in(directory: Path, episode: int) -> list[Any]:
-    [path] = directory.glob(f"*.video{episode:06d}.mp4")
-    with av.open(str(path)) as container:
-        return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
 
 
 def zeros(env: Any) -> Any:

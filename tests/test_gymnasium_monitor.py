@@ -5,7 +5,6 @@ import atexit
 import gc
 import json
 import logging
-import re
 import subprocess
 import sys
 import threading
@@ -15,55 +14,26 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import av
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from recordings import (
+    frames_in,
+    journal_of,
+    manifest_of,
+    metadata_of,
+    stats_of,
+    videos_in,
+)
 
 import mjrec
 from mjrec import InvalidArgument, NoPictures, ResetNeeded, ResetNotAllowed
 
 
-def manifest_of(directory: Path) -> dict[str, Any]:
-    [path] = directory.glob("openaigym.manifest.*")
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
-
-
-def stats_of(directory: Path) -> dict[str, Any]:
-    [path] = directory.glob("openaigym.episode_batch.*")
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
-
-
-def journal_of(directory: Path) -> list[dict[str, Any]]:
-    [path] = directory.glob("openaigym.episodes.*")
-    return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-def metadata_of(directory: Path, episode: int) -> dict[str, Any]:
-    [path] = directory.glob(f"*.video{episode:06d}.meta.json")
-    content: dict[str, Any] = json.loads(path.read_text())
-    return content
-
-
-def frames_in(directory: Path, episode: int) -> list[Any]:
-    [path] = directory.glob(f"*.video{episode:06d}.mp4")
-    with av.open(str(path)) as container:
-        return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
-
-
 def finish_episode(env: Any) -> None:
     while not env.stats_recorder.done:
         env.step(0)
-
-
-def videos_in(directory: Path) -> list[int]:
-    return sorted(
-        int(re.findall(r"video(\d{6})\.mp4", p.name)[0])
-        for p in directory.glob("*.mp4")
-    )
 
 
 # --- what is recorded -----------------------------------------------------------

@@ -13,13 +13,9 @@ import av
 import gymnasium
 import numpy as np
 import pytest
+from recordings import frames_of
 
 from mjrec import InvalidArgument, VideoRecorder
-
-
-def frames_of(path: str | Path) -> list[Any]:
-    with av.open(str(path)) as container:
-        return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
 
 
 def metadata_of(recorder: VideoRecorder) -> dict[str, Any]:

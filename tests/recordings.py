@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads what a monitor wrote, with nothing of mjrec."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import av
+
+
+def manifest_of(directory: Path) -> dict[str, Any]:
+    return _json("openaigym.manifest.*", directory)
+
+
+def stats_of(directory: Path) -> dict[str, Any]:
+    return _json("openaigym.episode_batch.*", directory)
+
+
+def journal_of(directory: Path) -> list[dict[str, Any]]:
+    [path] = directory.glob("openaigym.episodes.*")
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def metadata_of(directory: Path, episode: int) -> dict[str, Any]:
+    return _json(f"*.video{episode:06d}.meta.json", directory)
+
+
+def frames_in(directory: Path, episode: int) -> list[Any]:
+    [path] = directory.glob(f"*.video{episode:06d}.mp4")
+    return frames_of(path)
+
+
+def frames_of(path: str | Path | None) -> list[Any]:
+    """Decode a video, with another decoder than the one that wrote it."""
+    with av.open(str(path)) as container:
+        return [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+
+
+def videos_in(directory: Path) -> list[int]:
+    """Return the numbers of the episodes that have a video."""
+    names = (path.name for path in directory.glob("*.mp4"))
+    return sorted(int(re.findall(r"video(\d{6})\.mp4", name)[0]) for name in names)
+
+
+def _json(pattern: str, directory: Path) -> dict[str, Any]:
+    [path] = directory.glob(pattern)
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
