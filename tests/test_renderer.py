@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
@@ -19,6 +20,7 @@ import pytest
 
 from mjrec.errors import ClosedError, GLError, InvalidArgument, UnknownName
 from mjrec.simulation import gl_thread
+from mjrec.simulation.gl_strings import current_gl_strings
 from mjrec.simulation.gl_thread import GLThread
 from mjrec.simulation.renderer import SceneRenderer
 
@@ -731,6 +733,17 @@ def test_everything_runs_on_one_thread_of_its_own() -> None:
     assert len(set(identities) - {threading.get_ident()}) == 1
 
 
+def test_everybody_reads_the_same_strings(thread: GLThread) -> None:
+    """Who draws is asked in one way, here and in the metadata."""
+    vendor, renderer, version = thread.strings
+    assert renderer
+    assert thread.call(current_gl_strings) == {
+        "gl_vendor": vendor,
+        "gl_renderer": renderer,
+        "gl_version": version,
+    }
+
+
 def test_a_driver_that_hangs_is_not_waited_for(
     thread: GLThread, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -746,24 +759,34 @@ def test_a_driver_that_hangs_is_not_waited_for(
     driver.set()
 
 
-@pytest.fixture
-def alarm() -> Iterator[None]:
-    """Ctrl-C, a hundredth of a second from now."""
+@contextlib.contextmanager
+def ctrl_c_soon() -> Iterator[None]:
+    """Raise KeyboardInterrupt from a signal's handler, a hundredth of a second on."""
     earlier = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, 0.01)
-    yield
-    signal.setitimer(signal.ITIMER_REAL, 0)
-    signal.signal(signal.SIGALRM, earlier)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, earlier)
 
 
-def test_what_ctrl_c_interrupted_is_waited_for(thread: GLThread, alarm: None) -> None:
+def test_what_ctrl_c_interrupted_is_waited_for(thread: GLThread) -> None:
     """The thread may be reading a scene that the caller is about to change."""
     driver = threading.Event()
     ended: list[bool] = []
-    with pytest.raises(KeyboardInterrupt):
-        thread.call(lambda: ended.append(driver.wait()))
+    caller = threading.get_ident()
 
-    threading.Timer(0.05, driver.set).start()
+    def draw() -> None:
+        signal.pthread_kill(caller, signal.SIGINT)
+        ended.append(driver.wait(30))
+
+    with pytest.raises(KeyboardInterrupt):
+        thread.call(draw)
+    # It waits, or there would be nothing to interrupt.
+    with ctrl_c_soon(), pytest.raises(KeyboardInterrupt):
+        thread.settle()
+    driver.set()
     thread.settle()
 
     assert ended == [True]
@@ -774,15 +797,9 @@ def test_a_picture_after_ctrl_c_is_right() -> None:
     """It is not the one that was given up."""
     model, data = load("showcase")
     with SceneRenderer(model, height=480, width=640, camera="overview") as renderer:
-        earlier = signal.signal(signal.SIGALRM, signal.default_int_handler)
         first = renderer.render(data)
-        try:
-            signal.setitimer(signal.ITIMER_REAL, 0.01)
-            with pytest.raises(KeyboardInterrupt):
-                renderer.render(data)
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, earlier)
+        with ctrl_c_soon(), pytest.raises(KeyboardInterrupt):
+            renderer.render(data)
         data.geom_xpos += 0.1
         second = renderer.render(data)
         data.geom_xpos -= 0.1

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import mujoco
 
 from ..errors import ClosedError, Error, GLError
+from .gl_strings import current_gl_strings
 
 __all__ = ["GLStrings", "GLThread", "gl_error", "opengl"]
 
@@ -125,8 +126,8 @@ class GLThread:
         """
         self.settle()
         reply: queue.SimpleQueue[_Outcome] = queue.SimpleQueue()
-        self._requests.put(_Request(lambda: function(*args, **kwargs), reply))
-        value: T = self._answer(reply)
+        request = _Request(lambda: function(*args, **kwargs), reply)
+        value: T = self._answer(reply, request)
         return value
 
     def settle(self) -> None:
@@ -171,8 +172,13 @@ class GLThread:
                 "The OpenGL driver hangs since an earlier call: end this process."
             )
 
-    def _answer(self, reply: queue.SimpleQueue[_Outcome]) -> Any:
+    def _answer(
+        self, reply: queue.SimpleQueue[_Outcome], request: _Request | None = None
+    ) -> Any:
         try:
+            if request is not None:
+                # Not before: Ctrl-C may come as soon as the thread has it.
+                self._requests.put(request)
             outcome = self._wait_for(reply)
         except BaseException:
             # Raised by a signal's handler, as Ctrl-C does.
@@ -286,11 +292,11 @@ def _make_context() -> Any:
 
 
 def _read_strings() -> GLStrings:
-    gl = opengl()
-    names = (gl.GL_VENDOR, gl.GL_RENDERER, gl.GL_VERSION)
-    return GLStrings(
-        *((gl.glGetString(name) or b"").decode(errors="replace") for name in names)
-    )
+    # Not every context of mujoco's imports it, and nothing is read through it before.
+    opengl()
+    found = current_gl_strings()
+    names = ("gl_vendor", "gl_renderer", "gl_version")
+    return GLStrings(*(found.get(name, "") for name in names))
 
 
 def opengl() -> Any:
