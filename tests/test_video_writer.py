@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
+import itertools
 import os
 import select
 import signal
 import subprocess
 import sys
+import threading
 import tracemalloc
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import av
@@ -29,9 +33,15 @@ from mjrec.errors import (
     InvalidFrame,
     UnknownName,
 )
-from mjrec.formats.ffmpeg import every_frame_arguments, ffmpeg_executable, run_ffmpeg
+from mjrec.formats.ffmpeg import (
+    FfmpegProcess,
+    every_frame_arguments,
+    ffmpeg_executable,
+    run_ffmpeg,
+)
 from mjrec.formats.video_writer import VideoFile, VideoWriter
 from mjrec.frames import Frame
+from mjrec.worker_thread import WorkerThread
 
 BITS = 8
 
@@ -591,6 +601,211 @@ def test_frame_hashes_are_of_the_frames_as_given(tmp_path: Path) -> None:
     raw = b"".join(frame.tobytes() for frame in originals)
     theirs = run_ffmpeg(arguments.split(), standard_input=raw).stdout
     assert result.frame_hash_path.read_bytes() == theirs
+
+
+@contextlib.contextmanager
+def ctrl_c_soon() -> Iterator[None]:
+    """Raise KeyboardInterrupt from a signal's handler, a hundredth of a second on."""
+    earlier = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, earlier)
+
+
+# Shell, before the real ffmpeg runs. The encoder is known by its output's name.
+ENCODES = '[[ "${@: -1}" == *.part ]]'
+HELD = {
+    "the thread feeds": f"if {ENCODES}; then read -r < GATE; fi",
+    "ffmpeg encodes": f'if {ENCODES}; then REAL "$@"; read -r < GATE; exit; fi',
+    "the file is decoded": 'if [[ "$*" == *" -xerror "* ]]; then read -r < GATE; fi',
+}
+
+
+@pytest.mark.usefixtures("no_process_stays")
+@pytest.mark.parametrize("end", ["close", "abort"])
+@pytest.mark.parametrize("held", HELD)
+def test_an_interrupted_close_can_be_called_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held: str, end: str
+) -> None:
+    """Ctrl-C while close waits, twice; then it finishes, or abort leaves nothing."""
+    out, gate = tmp_path / "out", tmp_path / "gate"
+    out.mkdir()
+    os.mkfifo(gate)
+    prelude = HELD[held].replace("GATE", str(gate)).replace("REAL", ffmpeg_executable())
+    ffmpeg_under(monkeypatch, tmp_path, prelude)
+    # Open at both ends, so that what is written stays until it is read.
+    opened = os.open(gate, os.O_RDWR)
+    video = VideoWriter(out / "a.mp4", fps=40, frame_hashes=True)
+    try:
+        # More than the pipe holds.
+        for number in range(60):
+            video.write(numbered(number, height=120, width=160))
+        for _ in range(2):
+            with ctrl_c_soon(), pytest.raises(KeyboardInterrupt):
+                video.close()
+            assert not video.closed
+            assert not video.path.exists()
+        with pytest.raises(ClosedError, match="not finished after 60 frames"):
+            video.write(numbered(1, height=120, width=160))
+        if end == "close":
+            os.write(opened, b"go\n" * 9)
+        getattr(video, end)()
+    finally:
+        os.close(opened)
+    assert video.closed
+    if end == "abort":
+        assert list(out.iterdir()) == []
+        return
+    assert video.result is not None
+    assert video.result.frame_count == 60
+    assert [number_of(frame) for frame in read(video.path)] == list(range(60))
+    assert sorted(one.name for one in out.iterdir()) == ["a.framehash", "a.mp4"]
+
+
+@pytest.mark.usefixtures("no_process_stays")
+# What an interruption keeps the decoder's pipes from, garbage collection does.
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+def test_close_goes_on_wherever_ctrl_c_came(tmp_path: Path) -> None:
+    """SIGINT at the end of each function of the writer that close calls."""
+    plain = record(tmp_path / "plain.mp4", map(numbered, range(9)), frame_hashes=True)
+    points = 0
+    while True:
+        path = tmp_path / f"{points}.mp4"
+        video = VideoWriter(path, fps=40, frame_hashes=True)
+        for number in range(9):
+            video.write(numbered(number))
+        if not close_interrupted_at(video, points):
+            break
+        assert not video.closed
+        video.close()
+        assert path.read_bytes() == plain.path.read_bytes()
+        assert path.with_suffix(".framehash").exists()
+        points += 1
+    assert points > 10
+    assert not list(tmp_path.glob(".*"))
+
+
+def close_interrupted_at(video: VideoWriter, point: int) -> bool:
+    """Close with SIGINT at the end of a function; False if there are not as many."""
+    returns = itertools.count()
+    modules = ("video_writer", "worker_thread", "frame_hashes", "ffmpeg")
+    # After the one there is nothing to go on with, after the other nobody has the
+    # process yet.
+    left_out = (VideoWriter.close.__code__, FfmpegProcess.__init__.__code__)
+
+    def at_event(frame: FrameType, event: str, argument: object) -> None:
+        ours = Path(frame.f_code.co_filename).stem in modules
+        if not ours or event != "return" or frame.f_code in left_out:
+            return
+        if next(returns) == point:
+            sys.setprofile(None)
+            signal.raise_signal(signal.SIGINT)
+
+    sys.setprofile(at_event)
+    try:
+        video.close()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(None)
+    return False
+
+
+@pytest.mark.usefixtures("no_process_stays")
+def test_an_interrupted_abort_can_be_called_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A close that comes instead does not finish what was given up."""
+    video = VideoWriter(tmp_path / "a.mp4", fps=40, frame_hashes=True)
+    video.write(numbered(1))
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            WorkerThread, "abort", lambda _: signal.raise_signal(signal.SIGINT)
+        )
+        with pytest.raises(KeyboardInterrupt):
+            video.abort()
+    assert not video.closed
+    video.close()
+    assert video.closed
+    assert video.result is None
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("no_process_stays")
+def test_what_fails_before_the_first_frame_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the encoder nor the file of hashes outlives a thread that fails."""
+
+    def fail(thread: threading.Thread) -> None:
+        raise MemoryError
+
+    video = VideoWriter(tmp_path / "a.mp4", fps=40, frame_hashes=True)
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", fail)
+        with pytest.raises(MemoryError):
+            video.write(numbered(1))
+    assert video.closed
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_is_written_in_an_exit_hook(tmp_path: Path) -> None:
+    """Also on a Python that starts no thread there."""
+    code = (
+        "import atexit\n"
+        "atexit.register(record, Path('a.mp4'), map(numbered, range(20)))\n"
+        "def refuse(thread): raise RuntimeError('interpreter shutdown')\n"
+        "atexit.register(setattr, threading.Thread, 'start', refuse)\n"
+    )
+    child = run_child(code, cwd=tmp_path)
+    assert (child.returncode, child.stderr) == (0, "")
+    shown = [number_of(frame) for frame in read(tmp_path / "a.mp4")]
+    assert shown == list(range(20))
+
+
+@pytest.mark.usefixtures("no_process_stays")
+def test_ctrl_c_within_a_frame_gives_the_video_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no thread encodes, half a frame would shift all that follow."""
+
+    def refuse(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    video = VideoWriter(tmp_path / "a.mp4", fps=40, frame_hashes=True)
+    video.write(numbered(1))
+    monkeypatch.setattr(
+        FfmpegProcess, "write", lambda *_: signal.raise_signal(signal.SIGINT)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        video.write(numbered(2))
+    assert video.closed
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("no_process_stays")
+def test_close_on_the_encoders_thread_leaves_the_rest_to_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when a garbage collection there ends the writer's owner."""
+    write, closes = FfmpegProcess.write, threading.Event()
+
+    def write_and_close(process: FfmpegProcess, data: Any) -> None:
+        write(process, data)
+        video.close()
+        closes.set()
+
+    monkeypatch.setattr(FfmpegProcess, "write", write_and_close)
+    video = VideoWriter(tmp_path / "a.mp4", fps=40)
+    video.write(numbered(1))
+    assert closes.wait(30)
+    assert not video.closed
+    video.close()
+    assert [number_of(frame) for frame in read(video.path)] == [1]
 
 
 def wait_for_end(pid: int) -> None:

@@ -171,12 +171,13 @@ class FfmpegProcess:
             if isinstance(error, OSError):
                 raise _not_started(self._command[0], error) from error
             raise
-        for pipe in self._pipes():
-            # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More is
-            # a favour that the kernel may refuse.
-            with contextlib.suppress(OSError):
-                fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
-        _running.add(self)
+        try:
+            self._enlarge_pipes()
+            _running.add(self)
+        except BaseException:
+            self.kill()
+            self.release()
+            raise
 
     @property
     def pid(self) -> int:
@@ -252,6 +253,13 @@ class FfmpegProcess:
 
     def _pipes(self) -> list[IO[bytes]]:
         return [pipe for pipe in (self._process.stdin, self._process.stdout) if pipe]
+
+    def _enlarge_pipes(self) -> None:
+        for pipe in self._pipes():
+            # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More is
+            # a favour that the kernel may refuse.
+            with contextlib.suppress(OSError):
+                fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
 
     def _died(self) -> EncoderError:
         try:
