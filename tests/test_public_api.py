@@ -2,10 +2,6 @@
 from __future__ import annotations
 
 import ast
-import contextlib
-import importlib
-import importlib.util
-import pkgutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -67,6 +63,8 @@ def imports(name: str, path: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.Call):
+            yield from _imported_by_call(node, package)
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             yield node.module or ""
         elif isinstance(node, ast.ImportFrom):
@@ -74,6 +72,33 @@ def imports(name: str, path: Path) -> Iterator[str]:
             module = [*base, *filter(None, [node.module])]
             for alias in node.names:
                 yield ".".join([*module, alias.name] if not node.module else module)
+
+
+def _imported_by_call(call: ast.Call, package: list[str]) -> Iterator[str]:
+    """Yield what a call like `import_module("..a.b", __package__)` imports."""
+    function = ast.unparse(call.func).rpartition(".")[2]
+    first = call.args[0] if call.args else None
+    if function == "import_module" and isinstance(first, ast.Constant):
+        dots = len(first.value) - len(first.value.lstrip("."))
+        base = ["mjrec", *package[: len(package) - dots + 1]] if dots else []
+        yield ".".join([*base, first.value.lstrip(".")])
+
+
+@pytest.mark.parametrize(
+    ("code", "imported"),
+    [
+        ('importlib.import_module("..b.c", __package__)', "mjrec.b.c"),
+        ('import_module(".c", __package__)', "mjrec.a.c"),
+        ('importlib.import_module("mujoco.egl")', "mujoco.egl"),
+        ("from ..b import c", "mjrec.b"),
+        ("from .. import b", "mjrec.b"),
+        ("def f():\n    import mujoco", "mujoco"),
+    ],
+)
+def test_imports_are_seen(code: str, imported: str, tmp_path: Path) -> None:
+    """Also those by a call."""
+    (tmp_path / "module.py").write_text(code)
+    assert list(imports("a.module", tmp_path / "module.py")) == [imported]
 
 
 def row(name: str) -> int:
@@ -174,14 +199,21 @@ def test_read_half_needs_no_simulator() -> None:
 
 def test_no_module_hides_a_public_name() -> None:
     """After every submodule was imported, every public name is still what it was."""
-    missing = () if importlib.util.find_spec("dm_control") else (ModuleNotFoundError,)
-    before = {name: getattr(mjrec, name) for name in mjrec.__all__}
-    for module in pkgutil.walk_packages(mjrec.__path__, "mjrec."):
-        if module.name != "mjrec.__main__":
-            # Without the extra there is no dm_control to hide anything.
-            with contextlib.suppress(*missing):
-                importlib.import_module(module.name)
-    assert {name: getattr(mjrec, name) for name in mjrec.__all__} == before
+    # In a process of its own: here, anything may have been imported before. Modules
+    # first, because a name that was used once stays.
+    assert _run(
+        "import contextlib, importlib, importlib.util, pkgutil, types, mjrec\n"
+        "lacks = not importlib.util.find_spec('dm_control')\n"
+        "for module in pkgutil.walk_packages(mjrec.__path__, 'mjrec.'):\n"
+        "    if module.name != 'mjrec.__main__':\n"
+        # Without the extra there is no dm_control to hide anything.
+        "        with contextlib.suppress(*[ModuleNotFoundError] * lacks):\n"
+        "            importlib.import_module(module.name)\n"
+        "names = {name: getattr(mjrec, name) for name in mjrec.__all__}\n"
+        "print([n for n, v in names.items() if isinstance(v, types.ModuleType)])\n"
+        "print([n for n, where in mjrec._LAZY.items() if getattr(mjrec, n) "
+        "is not getattr(importlib.import_module('mjrec.' + where), n)])"
+    ).split() == ["[]", "[]"]
 
 
 def test_version_is_the_packages() -> None:

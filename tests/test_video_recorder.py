@@ -51,6 +51,14 @@ def picture(height: int = 8, width: int = 10) -> Any:
     return np.full((height, width, 3), 90, np.uint8)
 
 
+def picture_of(number: int) -> Any:
+    return np.full((16, 16, 3), 25 * number, np.uint8)
+
+
+def number_of(frame: Any) -> int:
+    return round(float(frame.mean()) / 25)
+
+
 def test_every_capture_is_a_frame(corridor: Any, tmp_path: Path) -> None:
     """The reset's frame and the last one are in the file, in order."""
     recorder = VideoRecorder(corridor, tmp_path / "v.mp4")
@@ -151,8 +159,19 @@ def test_single_frame_is_a_video(corridor: Any, tmp_path: Path) -> None:
 def test_frame_list_is_drained_in_order(make_corridor: Any, tmp_path: Path) -> None:
     """All the frames of a step are recorded, and the rate fits them."""
     env = make_corridor(render_mode="rgb_array_list")
-    recorder = VideoRecorder(env, tmp_path / "v.mp4")
-    assert record(recorder, env, 2)["frame_count"] == 3
+    # Three pictures for each tenth of a second.
+    times = iter([0.0, 0.1, 0.2])
+    shown = iter([[1, 2, 3], [4, 5, 6], [7, 8, 9]])
+    env.render = lambda: [picture_of(number) for number in next(shown)]
+    recorder = VideoRecorder(env, tmp_path / "v.mp4", clock=lambda: next(times))
+    metadata = record(recorder, env, 2)
+    recorded = [number_of(frame) for frame in frames_of(recorder.path)]
+    assert recorded == list(range(1, 10))
+    assert metadata["frame_count"] == 9
+    assert metadata["fps"] == "30"
+    assert metadata["playback_speed"] == 1.0
+    with av.open(str(recorder.path)) as container:
+        assert container.streams.video[0].average_rate == 30
 
 
 def test_text_environment_becomes_an_asciicast(
