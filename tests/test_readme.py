@@ -121,7 +121,12 @@ def test_scripts_test_runs(tmp_path: Path) -> None:
         text=True,
         check=False,
     )
-    assert "passed" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
+    # pytest's own line, not ruff's, with as many tests as the file has functions.
+    counted = re.search(r"^=+ (\d+) passed in ", done.stdout, re.MULTILINE)
+    tests = (ROOT / "tests" / "test_asciicast.py").read_text().count("\ndef test_")
+    assert counted, done.stdout
+    assert int(counted[1]) >= tests > 0
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=[path.stem for path in EXAMPLES])
