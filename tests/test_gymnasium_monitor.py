@@ -815,3 +815,154 @@ def test_unknown_camera_lists_the_names(halfcheetah: Any, tmp_path: Path) -> Non
     with pytest.raises(mjrec.UnknownName, match="track"):
         mjrec.Monitor(halfcheetah, tmp_path / "new", camera="side")
     assert not (tmp_path / "new").exists()
+
+
+# --- several environments in one process ------------------------------------------
+
+
+def make_halfcheetah(**options: Any) -> Any:
+    return gymnasium.make(
+        "HalfCheetah-v5", render_mode="rgb_array", width=64, height=48, **options
+    )
+
+
+def make_ant() -> Any:
+    return gymnasium.make("Ant-v5", render_mode="rgb_array", width=64, height=48)
+
+
+def first_hashes(directory: Path) -> list[str]:
+    """Return the hash of each frame of episode 0, as it was rendered."""
+    [path] = directory.glob("*.video000000.framehash")
+    lines = [line for line in path.read_text().splitlines() if line[0] != "#"]
+    return [line.split()[-1] for line in lines]
+
+
+def record_steps(env: Any, steps: int = 3) -> None:
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(env.action_space.sample())
+
+
+def test_environments_that_take_turns_are_drawn_each_in_its_own_context(
+    tmp_path: Path,
+) -> None:
+    """Interleaved, and after one was closed: the pictures are those of alone."""
+    for name, make in (("cheetah", make_halfcheetah), ("ant", make_ant)):
+        with mjrec.Monitor(make(), tmp_path / name) as env:
+            record_steps(env)
+    cheetah = mjrec.Monitor(make_halfcheetah(), tmp_path / "cheetah2")
+    ant = mjrec.Monitor(make_ant(), tmp_path / "ant2")
+    for env in (cheetah, ant):
+        env.action_space.seed(0)
+        env.reset(seed=0)
+    for _ in range(2):
+        cheetah.step(cheetah.action_space.sample())
+        ant.step(ant.action_space.sample())
+    ant.step(ant.action_space.sample())
+    ant.close()
+    gc.collect()
+    cheetah.step(cheetah.action_space.sample())
+    cheetah.close()
+    for name in ("cheetah", "ant"):
+        assert first_hashes(tmp_path / f"{name}2") == first_hashes(tmp_path / name)
+
+
+def test_the_users_other_environment_is_drawn_as_before(tmp_path: Path) -> None:
+    """Recording one environment, with its own camera or another, and closing it."""
+    other = make_ant()
+    other.reset(seed=0)
+    before = other.render()
+    for number, options in enumerate([{}, {"camera": "track"}]):
+        with mjrec.Monitor(
+            make_halfcheetah(), tmp_path / str(number), **options
+        ) as env:
+            record_steps(env)
+            if options:
+                assert (other.render() == before).all()
+    fresh = make_ant()
+    fresh.reset(seed=0)
+    assert (fresh.render() == before).all()
+    fresh.close()
+    other.close()
+
+
+def test_missed_picture_is_not_counted_as_a_step(
+    make_corridor: Any, tmp_path: Path
+) -> None:
+    """The metadata says of which steps the frames are."""
+
+    class Blinking(make_corridor):  # type: ignore[misc,valid-type]  # a fixture's class
+        def render(self) -> Any:
+            if self.position == 2:
+                raise RuntimeError("on purpose")
+            return super().render()
+
+    with mjrec.Monitor(Blinking(length=5), tmp_path) as env:
+        env.reset()
+        for step in range(1, 6):
+            if step == 2:
+                with pytest.raises(RuntimeError):
+                    env.step(0)
+            else:
+                env.step(0)
+    assert metadata_of(tmp_path, 0)["frame_steps"] == [[0, 1], [3, 5]]
+
+
+def test_users_exception_is_not_hidden_by_a_failing_close(
+    make_corridor: Any, tmp_path: Path, kill_ffmpeg: Callable[[], int]
+) -> None:
+    """The encoder's failure is a note on it."""
+
+    def fail() -> None:
+        with mjrec.Monitor(make_corridor(length=9), tmp_path) as env:
+            env.reset()
+            env.step(0)
+            assert kill_ffmpeg() == 1
+            raise KeyError("of the user")
+
+    with pytest.raises(KeyError, match="of the user") as raised:
+        fail()
+    assert "ffmpeg" in raised.value.__notes__[0]
+
+
+def test_failed_encoder_leaves_no_claim_of_frames(
+    make_corridor: Any, tmp_path: Path, kill_ffmpeg: Callable[[], int]
+) -> None:
+    """The metadata says why there is no video."""
+    env = mjrec.Monitor(make_corridor(length=9), tmp_path)
+    env.reset()
+    env.step(0)
+    kill_ffmpeg()
+    with pytest.raises(mjrec.EncoderError):
+        env.close()
+    metadata = metadata_of(tmp_path, 0)
+    assert metadata["broken"]
+    assert metadata["empty"]
+    assert "-9" in metadata["broken_reason"]
+    assert "frame_count" not in metadata
+
+
+def test_close_can_be_tried_again_when_there_is_space(
+    corridor: Any, tmp_path: Path, play: Any
+) -> None:
+    """A directory that is gone for a while stands for a full disk."""
+    env = mjrec.Monitor(corridor, tmp_path / "a", video_callable=False)
+    play(env, 1)
+    (tmp_path / "a").rename(tmp_path / "b")
+    with pytest.raises(mjrec.FileNotWritten, match=r"stats\.json.*close\(\) once more"):
+        env.close()
+    (tmp_path / "b").rename(tmp_path / "a")
+    env.close()
+    assert stats_of(tmp_path / "a")["episode_lengths"] == [3]
+    assert manifest_of(tmp_path / "a")
+
+
+def test_environment_that_the_user_closed_first(tmp_path: Path) -> None:
+    """The recordings are finished all the same."""
+    env = make_halfcheetah()
+    monitor = mjrec.Monitor(env, tmp_path)
+    record_steps(monitor)
+    env.close()
+    monitor.close()
+    assert len(frames_in(tmp_path, 0)) == 4

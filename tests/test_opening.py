@@ -124,6 +124,15 @@ def test_resume_counts_videos_of_a_dead_monitor(tmp_path: Path) -> None:
     place.lock.release()
 
 
+def test_resume_counts_an_episode_in_flight(tmp_path: Path) -> None:
+    """The unfinished video of a killed run has a number too."""
+    write_video(tmp_path, "0.1", 0)
+    (tmp_path / ".openaigym.video.0.1.video000001.mp4.0a1b2c3d.part").touch()
+    place = open_(tmp_path, resume=True)
+    assert place.first_episode_id == 2
+    place.lock.release()
+
+
 def test_resume_counts_the_same_uid_only(tmp_path: Path) -> None:
     """With a uid each run has numbers of its own; without, the directory's."""
     write_video(tmp_path, "0.alice", 7)
@@ -212,6 +221,12 @@ def test_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(DirectoryNotWritable, match="file"):
         open_(tmp_path / "file")
+
+
+def test_name_that_is_too_long_is_an_error(tmp_path: Path) -> None:
+    """The system's own words are in it."""
+    with pytest.raises(DirectoryNotWritable, match="too long"):
+        open_(tmp_path / ("x" * 300))
 
 
 @pytest.mark.parametrize("path", ["/proc/self", "/proc/mjrec/recordings"])

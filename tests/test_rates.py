@@ -19,6 +19,8 @@ from mjrec.rates import MAX_DENOMINATOR, rate_from_timestep, to_rate
         (30000 / 1001, Fraction(30000, 1001)),
         (Fraction(200, 3), Fraction(200, 3)),
         (np.float32(12.5), Fraction(25, 2)),
+        (np.float32(29.97), Fraction(2997, 100)),
+        (np.float64(29.97), Fraction(2997, 100)),
         (np.int64(60), Fraction(60)),
     ],
 )

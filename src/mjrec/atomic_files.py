@@ -13,6 +13,8 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
+from .errors import FileNotWritten
+
 __all__ = ["replacing", "temporary_path", "write_text"]
 
 
@@ -37,6 +39,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text`, in UTF-8, as the whole content of `path`."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    """Write `text`, in UTF-8, as the whole content of `path`.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone or read-only.
+    """
+    try:
+        with replacing(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise FileNotWritten(path, error.strerror) from error

@@ -9,7 +9,8 @@
     │   └── InvalidFrame                    not a (height, width, 3) uint8 picture
     ├── ExistingRecordings                  neither force nor resume was asked for
     ├── DirectoryInUse                      another live monitor writes there
-    ├── DirectoryNotWritable                (also OSError)
+    ├── DirectoryNotWritable (also OSError) it cannot be made or written to
+    ├── FileNotWritten (also OSError)       a full disk, say
     ├── DifferentEnvironment                resume over another environment
     ├── EnvironmentNotMade                  it is known, and making it failed
     ├── NoPictures                          the environment cannot be drawn
@@ -44,6 +45,7 @@ __all__ = [
     "EnvironmentNotMade",
     "Error",
     "ExistingRecordings",
+    "FileNotWritten",
     "FrameCountError",
     "GLError",
     "InvalidArgument",
@@ -148,6 +150,21 @@ class DirectoryNotWritable(Error, OSError):
         super().__init__(
             f"Cannot write into {directory}: {reason}. Choose a directory that this "
             "user may write to."
+        )
+
+
+class FileNotWritten(Error, OSError):
+    """A file could not be written: the disk is full, or the directory is gone.
+
+    Attributes:
+        path: the file.
+    """
+
+    def __init__(self, path: Path, reason: object) -> None:
+        self.path = path
+        super().__init__(
+            f"Cannot write {path}: {reason}. What is there stays as it is; where space "
+            "was lacking, free some and close() once more."
         )
 
 

@@ -38,7 +38,8 @@ def to_rate(fps: float | Fraction) -> Fraction:
     rate = (
         Fraction(fps)
         if isinstance(fps, numbers.Rational)
-        else Fraction(float(fps)).limit_denominator(MAX_DENOMINATOR)
+        # By its shortest text, so that float32's 29.97 is 2997/100 too.
+        else Fraction(str(fps)).limit_denominator(MAX_DENOMINATOR)
     )
     if not Fraction(1, 1000) <= rate <= MAX_DENOMINATOR:
         raise InvalidArgument(

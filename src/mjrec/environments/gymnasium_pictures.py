@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -13,7 +15,7 @@ from ..simulation.inside import simulation_in
 if TYPE_CHECKING:
     from ..simulation.scene_pictures import ScenePictures
 
-__all__ = ["EnvironmentPictures", "gymnasium_pictures"]
+__all__ = ["EnvironmentPictures", "close_environment", "gymnasium_pictures"]
 
 
 def gymnasium_pictures(
@@ -54,7 +56,7 @@ def gymnasium_pictures(
 
     return ScenePictures(
         lambda: (simulated.model, simulated.data),
-        look=lambda: Look(**_look(simulated, env)),
+        look=lambda: Look(**_look(simulated, env, camera=camera is None)),
         camera=camera,
         height=_own_size(simulated, "height") if height is None else height,
         width=_own_size(simulated, "width") if width is None else width,
@@ -80,7 +82,8 @@ class EnvironmentPictures:
 
     def render(self) -> Any:
         """Return the picture of this moment, or the list of those not seen yet."""
-        rendered: Any = self._env.render()
+        with _own_context(self._env):
+            rendered: Any = self._env.render()
         if self._keeps_frames and isinstance(rendered, list):
             return self._new_ones(rendered)
         return rendered
@@ -96,15 +99,14 @@ class EnvironmentPictures:
             # An environment of ours knows better than a look from outside.
             return {**facts, **own_facts()}
         simulated = simulation_in(self._env)
-        renderer = getattr(simulated, "mujoco_renderer", None)
-        viewer = getattr(renderer, "viewer", None)
+        viewer = getattr(_renderer(self._env), "viewer", None)
         if simulated is not None and viewer is not None:
             from ..simulation.gl_strings import current_gl_strings
             from ..simulation.scene_pictures import camera_label
 
             facts["camera"] = camera_label(simulated.model, viewer.cam)
-            # The viewer's context stays current on the thread that drew.
-            facts.update(current_gl_strings())
+            with _own_context(self._env):
+                facts.update(current_gl_strings())
         return facts
 
     def close(self) -> None:
@@ -115,6 +117,51 @@ class EnvironmentPictures:
         first = self._seen if len(frames) > self._seen else 0
         self._seen = len(frames)
         return frames[first:]
+
+
+def close_environment(env: gymnasium.Env[Any, Any]) -> None:
+    """Close an environment, and first free what lies in its OpenGL contexts.
+
+    Gymnasium leaves that to the garbage collector, which frees it in whichever context
+    is current then, and so blackens somebody else's pictures.
+    """
+    for viewer in getattr(_renderer(env), "_viewers", {}).values():
+        with _current(viewer):
+            viewer.con.free()
+            viewer.free()
+    env.close()
+
+
+@contextlib.contextmanager
+def _own_context(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
+    """Make the context that Gymnasium draws with current, for the block.
+
+    Gymnasium itself does so only when it makes the context: of two environments that
+    take turns, one would be drawn with the other's meshes and textures, or not at all.
+    What was current before, for somebody else's pictures, is so again afterwards.
+    """
+    renderer = _renderer(env)
+    if renderer is None:
+        yield
+        return
+    with _current(renderer.viewer):
+        yield
+
+
+@contextlib.contextmanager
+def _current(viewer: Any) -> Iterator[None]:
+    """Make a viewer's context current, if there is a viewer; then what was before."""
+    from ..simulation.gl_current import current_context_kept
+
+    with current_context_kept():
+        if viewer is not None:
+            viewer.make_context_current()
+        yield
+
+
+def _renderer(env: gymnasium.Env[Any, Any]) -> Any:
+    """Return what Gymnasium draws a MuJoCo environment with; None for others."""
+    return getattr(simulation_in(env), "mujoco_renderer", None)
 
 
 def _keeps_frames(env: gymnasium.Env[Any, Any]) -> bool:
@@ -128,19 +175,24 @@ def _own_size(simulated: Any, name: str) -> int:
     return int(getattr(simulated, name, 480))
 
 
-def _look(simulated: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
-    """Return how the environment itself shows its scene, as arguments of `Look`."""
+def _look(
+    simulated: Any, env: gymnasium.Env[Any, Any], *, camera: bool
+) -> dict[str, Any]:
+    """Return how the environment itself shows its scene, as arguments of `Look`.
+
+    Args:
+        simulated: holds the model, the data and the renderer.
+        env: the same, with its wrappers.
+        camera: whether the environment's own camera is wanted. Gymnasium settles it
+            when it draws for the first time, and so it is made to.
+    """
     renderer = getattr(simulated, "mujoco_renderer", None)
     if renderer is None:
         return {}
-    if getattr(renderer, "viewer", None) is None and env.render_mode == "rgb_array":
-        # Gymnasium settles its camera when it draws for the first time.
+    if camera and renderer.viewer is None and env.render_mode == "rgb_array":
         env.render()
-    viewer = getattr(renderer, "viewer", None)
+    look = {"max_geom": renderer.max_geom}
+    viewer = renderer.viewer
     if viewer is None:
-        return {}
-    return {
-        "camera": viewer.cam,
-        "scene_option": viewer.vopt,
-        "max_geom": renderer.max_geom,
-    }
+        return look
+    return {**look, "camera": viewer.cam, "scene_option": viewer.vopt}

@@ -35,7 +35,7 @@ _KINDS = {
     bool: "true or false",
     dict: "an object",
     float: "a number",
-    int: "a number",
+    int: "a whole number",
     list: "a list",
     str: "a text",
     type(None): "null",

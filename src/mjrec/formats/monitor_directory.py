@@ -65,6 +65,9 @@ _PATTERNS = (
 )
 _HIDDEN = (
     re.compile(r"\.openaigym\.(?P<infix>.+)\.lock"),
+    re.compile(
+        r"\.openaigym\.video\.(?P<infix>.+)\.video(?P<episode>\d{6,})\.[^/]*\.part"
+    ),
     re.compile(r"\.openaigym\..+\.part"),
 )
 
@@ -149,7 +152,7 @@ def infix_of(name: str) -> str | None:
 
 def episode_of(name: str) -> int | None:
     """Return the episode's number in a file's name; None where there is none."""
-    for pattern in _PATTERNS:
+    for pattern in (*_PATTERNS, *_HIDDEN):
         match = pattern.fullmatch(name)
         if match and match.groupdict().get("episode"):
             return int(match["episode"])

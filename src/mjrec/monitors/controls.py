@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import functools
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, Self
 
 from ..recorder.declared_rate import declared_rate
 from ..recorder.exit_guard import ExitGuard
@@ -84,8 +85,23 @@ class MonitorControls:
 
         Raises:
             EncoderError: the running video could not be finished; all else is.
+            FileNotWritten: the disk is full; the next call tries again.
         """
         self._guard.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc_info: Any) -> Literal[False]:
+        _, first, _ = exc_info
+        try:
+            self.close()
+        except Exception as second:
+            if first is None:
+                raise
+            # What went wrong first is what the user needs to see.
+            first.add_note(f"Closing the monitor failed too: {second}")
+        return False
 
     def _start(
         self,
@@ -95,6 +111,7 @@ class MonitorControls:
         env_id: str,
         pictures: EpisodePictures,
         options: RecorderOptions,
+        close_environment: Callable[[Any], None],
     ) -> None:
         """Open the directory; from here on the environment is this monitor's."""
         self._recorder = Recorder(
@@ -106,7 +123,13 @@ class MonitorControls:
             declared=functools.partial(declared_rate, env),
         )
         self._guard = ExitGuard(
-            self, functools.partial(_close, self._recorder, pictures, env)
+            self,
+            functools.partial(
+                _close,
+                self._recorder,
+                pictures,
+                functools.partial(close_environment, env),
+            ),
         )
 
     def _begin(self, *, seed: Any = None, options: Any = None) -> None:
@@ -117,9 +140,11 @@ class MonitorControls:
             self._guard.run_first_at_exit()
 
 
-def _close(recorder: Recorder, pictures: EpisodePictures, env: Any) -> None:
+def _close(
+    recorder: Recorder, pictures: EpisodePictures, close_environment: Callable[[], None]
+) -> None:
     try:
         recorder.close()
     finally:
         pictures.close()
-        env.close()
+        close_environment()

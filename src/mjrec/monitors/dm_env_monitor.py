@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import operator
 import os
 from typing import Any
 
@@ -25,7 +26,7 @@ _NO_PHYSICS = (
 )
 
 
-class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  # untyped
+class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  # untyped
     """Records a dm_env environment; `mjrec.Monitor` makes one and says how.
 
     It keeps dm_env's contract: `reset` at any time; `step` before the first reset, or
@@ -62,6 +63,7 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
             env_id=env_id or _env_id(env),
             pictures=_pictures(env, camera=camera, height=height, width=width),
             options=options,
+            close_environment=operator.methodcaller("close"),
         )
 
     def reset(self) -> dm_env.TimeStep:
@@ -107,15 +109,6 @@ class DmEnvMonitor(dm_env.Environment, MonitorControls):  # type: ignore[misc]  
     def discount_spec(self) -> Any:
         """Return the environment's."""
         return self._env.discount_spec()
-
-    def close(self) -> None:
-        """Finish the recordings, then close the environment. Idempotent.
-
-        Raises:
-            EncoderError: the running video could not be finished; all else is.
-        """
-        # Both base classes have a close.
-        MonitorControls.close(self)
 
     def __getattr__(self, name: str) -> Any:
         # Called only for what is not found here. `_env` itself is missing where the

@@ -11,7 +11,7 @@ from typing import Any, SupportsFloat
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from ..environments.gymnasium_pictures import gymnasium_pictures
+from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
 from ..recorder.recorder import RecorderOptions
 from .controls import MonitorControls
 
@@ -20,7 +20,7 @@ __all__ = ["GymnasiumMonitor"]
 logger = logging.getLogger(__name__)
 
 
-class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
+class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
     """Records a Gymnasium environment; `mjrec.Monitor` makes one and says how.
 
     An episode is over when it is terminated or truncated. A reset in mid-episode is
@@ -58,6 +58,7 @@ class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
             env_id=env_id or _env_id(env),
             pictures=gymnasium_pictures(env, camera=camera, height=height, width=width),
             options=options,
+            close_environment=close_environment,
         )
 
     # Gymnasium's own wrappers override the attribute by a property too.
@@ -107,15 +108,6 @@ class GymnasiumMonitor(gymnasium.Wrapper[Any, Any, Any, Any], MonitorControls):
             self._recorder.before_reset()
             self._begin()
         return result
-
-    def close(self) -> None:
-        """Finish the recordings, then close the environment. Idempotent.
-
-        Raises:
-            EncoderError: the running video could not be finished; all else is.
-        """
-        # Both base classes have a close.
-        MonitorControls.close(self)
 
     def _reset_by_step(
         self, action: Any

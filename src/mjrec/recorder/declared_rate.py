@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import logging
 from fractions import Fraction
+from typing import Any
 
+from ..errors import InvalidArgument
 from ..rates import rate_from_timestep, to_rate
 from ..simulation.inside import simulation_in
 
@@ -36,7 +38,7 @@ def declared_rate(env: object) -> Fraction:
         return rate_from_timestep(timestep)
     fps = (getattr(env, "metadata", None) or {}).get("render_fps")
     if fps is not None:
-        return to_rate(fps)
+        return _checked(fps, env)
     logger.warning(
         "%s does not say how fast its videos are to play (no control timestep, no "
         "render_fps): %d frames a second are taken. Give fps= to choose.",
@@ -44,6 +46,16 @@ def declared_rate(env: object) -> Fraction:
         _DEFAULT_RATE,
     )
     return _DEFAULT_RATE
+
+
+def _checked(fps: Any, env: object) -> Fraction:
+    try:
+        return to_rate(fps)
+    except InvalidArgument as error:
+        raise InvalidArgument(
+            f'metadata["render_fps"] of {type(env).__name__} is no rate: {error} '
+            "Give fps= to choose another."
+        ) from error
 
 
 def _declared_timestep(env: object) -> float | None:

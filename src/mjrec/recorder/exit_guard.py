@@ -46,20 +46,12 @@ class ExitGuard:
     def close(self) -> None:
         """Call `close`, unless that was done already.
 
-        Where it is interrupted (Ctrl-C), the next call calls it again.
+        Where it raised or was interrupted (Ctrl-C), the next call calls it again.
         """
-        if not self._finalize.alive:
-            return
-        try:
+        if self._finalize.alive:
             self._close()
-        except Exception:
-            self._retire()
-            raise
-        self._retire()
-
-    def _retire(self) -> None:
-        self._finalize.detach()
-        atexit.unregister(self._finalize)
+            self._finalize.detach()
+            atexit.unregister(self._finalize)
 
 
 def _in_process(pid: int, close: Callable[[], None]) -> Callable[[], None]:

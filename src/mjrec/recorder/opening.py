@@ -115,8 +115,8 @@ def open_directory(
 @contextlib.contextmanager
 def _made(path: Path) -> Iterator[None]:
     """Make `path` and its parents; remove those made if the block raises."""
-    missing = [p for p in (path, *path.parents) if not p.exists()]
     try:
+        missing = [p for p in (path, *path.parents) if not p.exists()]
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DirectoryNotWritable(path, error.strerror) from error
@@ -169,7 +169,8 @@ def _next_episode_id(path: Path, *, uid: str | None) -> int:
     """Return the number after the highest of the monitors that are not open."""
     highest = -1
     open_monitors: dict[str, bool] = {}
-    for file in iter_monitor_files(path):
+    # Also unfinished ones: an episode in flight when a process died has a number.
+    for file in iter_monitor_files(path, hidden=True):
         text = infix_of(file.name)
         infix = Infix.parse(text) if text else None
         if infix is None or (uid is not None and infix.uid != uid):

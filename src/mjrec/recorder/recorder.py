@@ -251,6 +251,7 @@ class Recorder:
 
         Raises:
             EncoderError: the video could not be finished; the rest is written.
+            FileNotWritten: the disk is full; the next call tries again.
         """
         if self.closed:
             return
@@ -263,13 +264,12 @@ class Recorder:
         logger.info("Finished writing results. They are in %s.", self.directory)
 
     def _let_go(self) -> None:
-        try:
-            self._flush()
-        finally:
-            self.closed = True
-            self.stats_recorder.closed = True
-            self._journal.close()
-            self._place.lock.release()
+        # Where it fails, all stays open, and the next close tries again.
+        self._flush()
+        self.closed = True
+        self.stats_recorder.closed = True
+        self._journal.close()
+        self._place.lock.release()
 
     def _check_process(self) -> None:
         if os.getpid() != self._pid:

@@ -121,7 +121,9 @@ class VideoRecorder:
         # Frames wait here until the second capture tells the rate.
         self._waiting: list[Any] = []
         self._captures = 0
-        self._first_time: float | None = None
+        self._first: tuple[int, float | None] | None = None
+        self._measured = False
+        self._frames_per_capture = 1
         self._timestep: Fraction | None = None
         self._rate: Fraction | None = None
         self._steps = _Runs()
@@ -148,7 +150,7 @@ class VideoRecorder:
 
     @property
     def empty(self) -> bool:
-        """Whether no frame was recorded."""
+        """Whether there is no frame: none came, or the encoder lost them."""
         return self._steps.total == 0
 
     @property
@@ -172,14 +174,15 @@ class VideoRecorder:
         """
         if not self.functional or self._closed:
             return
+        # Counted also where `render` raises: frames belong to steps.
+        step, self._captures = self._captures, self._captures + 1
         rendered = self.env.render()
         frames = rendered if isinstance(rendered, list) else [rendered]
-        step, self._captures = self._captures, self._captures + 1
         try:
             for frame in frames:
                 self._add(self._take(frame))
                 self._steps.add(step)
-            self._settle_rate(len(frames))
+            self._settle_rate(step, len(frames))
         except InvalidFrame as error:
             self._break(str(error))
         except Exception as error:
@@ -262,15 +265,17 @@ class VideoRecorder:
             # The environment may draw the next picture into the same array.
             self._waiting.append(frame.copy())
 
-    def _settle_rate(self, frames: int) -> None:
-        if self._captures == 1:
-            self._first_time = self._clock()
-            if self._fps is not None:
-                self._open_writer(self._fps)
-        elif self._captures == 2:
-            time = self._clock()
-            if time is not None and self._first_time is not None:
-                self._timestep = _step_between(self._first_time, time)
+    def _settle_rate(self, step: int, frames: int) -> None:
+        """Measure the time of a step, from the first two pictures that there are."""
+        if self._writer is None and self._fps is not None:
+            self._open_writer(self._fps)
+        if self._first is None:
+            self._first = (step, self._clock())
+        elif not self._measured:
+            self._measured = True
+            # That of the reset may be another one.
+            self._frames_per_capture = max(frames, 1)
+            self._timestep = _time_of_a_step(self._first, (step, self._clock()))
             if self._writer is None:
                 self._open_writer(self._real_time(frames))
 
@@ -308,6 +313,7 @@ class VideoRecorder:
         self.finished = False
         self.metadata["broken_reason"] = str(error)
         self._waiting.clear()
+        self._steps = _Runs()
         if self._writer is not None:
             self._writer.abort()
 
@@ -319,7 +325,7 @@ class VideoRecorder:
             self.finished = True
 
     def _write_metadata(self) -> None:
-        if self._steps.total:
+        if self.finished:
             self.metadata.update(self._description())
             self.metadata.update(self._facts() if self._facts else {})
         else:
@@ -349,9 +355,7 @@ class VideoRecorder:
         """Simulated seconds that pass in a second of the video."""
         if self._timestep is None or self._rate is None:
             return None
-        frames_per_capture = Fraction(self._steps.total, max(self._captures, 1))
-        # The exact figure for one frame a capture, the usual case.
-        return float(self._rate * self._timestep / round(frames_per_capture or 1))
+        return float(self._rate * self._timestep / self._frames_per_capture)
 
 
 class _Runs:
@@ -370,10 +374,14 @@ class _Runs:
             self.ranges.append([step, step])
 
 
-def _step_between(earlier: float, later: float) -> Fraction | None:
-    if later <= earlier:
+def _time_of_a_step(
+    earlier: tuple[int, float | None], later: tuple[int, float | None]
+) -> Fraction | None:
+    """Return the seconds between two steps, by what the clock showed at two others."""
+    (first, start), (last, end) = earlier, later
+    if start is None or end is None or end <= start:
         return None
-    return 1 / rate_from_timestep(later - earlier)
+    return 1 / rate_from_timestep((end - start) / (last - first))
 
 
 def _file_facts(file: VideoFile) -> dict[str, Any]:
