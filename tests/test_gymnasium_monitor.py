@@ -5,6 +5,7 @@ import atexit
 import gc
 import json
 import logging
+import os
 import subprocess
 import sys
 import threading
