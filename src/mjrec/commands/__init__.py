@@ -51,6 +51,8 @@ def _run(argv: Sequence[str] | None) -> int:
             args=argv,
             config=(tyro.conf.FlagCreatePairsOff,),
         )
+        # Here, and not at exit, so that a reader who has left is noticed here.
+        sys.stdout.flush()
     except Error as error:
         # The one place where an error becomes text and a number.
         print(f"mjrec: {error}", file=sys.stderr)  # noqa: T201

@@ -83,7 +83,7 @@ class GLThread:
     def __init__(self, *, finish: Callable[[], None]) -> None:
         _refuse_fork_of_gl()
         self._requests: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
-        self._unanswered: queue.SimpleQueue[_Outcome] | None = None
+        self._interrupted = False
         self._closed = False
         self._hangs = False
         self._process_id = os.getpid()
@@ -140,9 +140,13 @@ class GLThread:
             ClosedError, GLError: as `call`.
         """
         self.check_usable()
-        if self._unanswered is not None:
-            self._wait_for(self._unanswered)
-            self._unanswered = None
+        if self._interrupted:
+            # Requests are answered in order. Not the answer that was given up is waited
+            # for, which the interruption may have swallowed.
+            reply: queue.SimpleQueue[_Outcome] = queue.SimpleQueue()
+            self._requests.put(_Request(lambda: None, reply))
+            self._wait_for(reply)
+            self._interrupted = False
 
     def close(self, patience_s: float = _PATIENCE_S) -> None:
         """Call `finish`, free the context and end the thread. Idempotent.
@@ -182,7 +186,7 @@ class GLThread:
             outcome = self._wait_for(reply)
         except BaseException:
             # Raised by a signal's handler, as Ctrl-C does.
-            self._unanswered = reply
+            self._interrupted = True
             raise
         if outcome.error is None:
             return outcome.value
