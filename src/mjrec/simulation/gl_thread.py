@@ -11,6 +11,7 @@ with a thread of its own disturbs nobody.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import importlib
 import logging
@@ -18,6 +19,7 @@ import os
 import queue
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from typing import Any, NamedTuple, ParamSpec, TypeVar
@@ -37,6 +39,7 @@ T = TypeVar("T")
 # No picture takes this long, not even one of 16384x16384 pixels on a busy machine
 # without a GPU; a driver that hangs does.
 _PATIENCE_S = 300.0
+_SLICE_S = 0.5
 _PATIENCE_AT_EXIT_S = 10.0
 
 # What mujoco allocates for the window, which is never drawn into: everything goes to
@@ -197,14 +200,17 @@ class GLThread:
             del outcome
 
     def _wait_for(self, reply: queue.SimpleQueue[_Outcome]) -> _Outcome:
-        try:
-            return reply.get(timeout=_PATIENCE_S)
-        except queue.Empty:
-            self._hangs = True
-            raise GLError(
-                f"The OpenGL driver gave no answer within {_PATIENCE_S:.0f} seconds. "
-                "Run `mjrec doctor` to see which backend works; end this process."
-            ) from None
+        deadline = time.monotonic() + _PATIENCE_S
+        while (left := deadline - time.monotonic()) > 0:
+            # In slices: a signal that comes just before the wait does not end it, and
+            # Ctrl-C would be noticed only after it.
+            with contextlib.suppress(queue.Empty):
+                return reply.get(timeout=min(left, _SLICE_S))
+        self._hangs = True
+        raise GLError(
+            f"The OpenGL driver gave no answer within {_PATIENCE_S:.0f} seconds. "
+            "Run `mjrec doctor` to see which backend works; end this process."
+        )
 
 
 def gl_error(what: str, reason: object, *, remedy: str = "") -> GLError:
