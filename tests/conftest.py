@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from processes import children
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
@@ -105,12 +106,7 @@ def play() -> Callable[..., None]:
 
 def kill_children(name: str) -> int:
     """Kill this process's children of that name, and return how many there were."""
-    children = {
-        int(pid)
-        for task in Path("/proc/self/task").iterdir()
-        for pid in (task / "children").read_text().split()
-    }
-    named = [p for p in children if name in Path(f"/proc/{p}/comm").read_text()]
+    named = [p for p in children() if name in Path(f"/proc/{p}/comm").read_text()]
     for pid in named:
         os.kill(pid, signal.SIGKILL)
     return len(named)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import signal
@@ -17,6 +16,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from interruption import ctrl_c_soon
 
 from mjrec.errors import ClosedError, GLError, InvalidArgument, UnknownName
 from mjrec.simulation import gl_thread
@@ -757,18 +757,6 @@ def test_a_driver_that_hangs_is_not_waited_for(
         thread.call(driver.wait)
     thread.close()
     driver.set()
-
-
-@contextlib.contextmanager
-def ctrl_c_soon() -> Iterator[None]:
-    """Raise KeyboardInterrupt from a signal's handler, a hundredth of a second on."""
-    earlier = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.01)
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, earlier)
 
 
 def test_what_ctrl_c_interrupted_is_waited_for(thread: GLThread) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import itertools
@@ -23,6 +22,8 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from interruption import ctrl_c_soon
+from processes import children
 
 from mjrec.errors import (
     ClosedError,
@@ -88,16 +89,6 @@ def read(path: Path, pixel_format: str = "rgb24") -> list[Frame]:
     with av.open(str(path)) as container:
         frames = container.decode(video=0)
         return [frame.to_ndarray(format=pixel_format) for frame in frames]
-
-
-def children() -> set[int]:
-    """Return the processes that this one has started and that are still there."""
-    threads = Path("/proc/self/task").iterdir()
-    return {
-        int(pid)
-        for thread in threads
-        for pid in (thread / "children").read_text().split()
-    }
 
 
 @pytest.fixture
@@ -601,18 +592,6 @@ def test_frame_hashes_are_of_the_frames_as_given(tmp_path: Path) -> None:
     raw = b"".join(frame.tobytes() for frame in originals)
     theirs = run_ffmpeg(arguments.split(), standard_input=raw).stdout
     assert result.frame_hash_path.read_bytes() == theirs
-
-
-@contextlib.contextmanager
-def ctrl_c_soon() -> Iterator[None]:
-    """Raise KeyboardInterrupt from a signal's handler, a hundredth of a second on."""
-    earlier = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.01)
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, earlier)
 
 
 # Shell, before the real ffmpeg runs. The encoder is known by its output's name.

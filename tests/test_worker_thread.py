@@ -3,16 +3,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import subprocess
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
+from interruption import ctrl_c_soon
 
 from mjrec.errors import ClosedError
 from mjrec.worker_thread import WorkerThread
@@ -37,18 +36,6 @@ def before_waiting(worker: WorkerThread[Any], act: Callable[[], object]) -> None
         return wait(timeout)
 
     condition.wait = act_and_wait  # type: ignore[method-assign]  # only this one's
-
-
-@contextlib.contextmanager
-def ctrl_c_soon() -> Iterator[None]:
-    """Raise KeyboardInterrupt from a signal's handler, a hundredth of a second on."""
-    earlier = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.01)
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, earlier)
 
 
 def until_error(worker: WorkerThread[int]) -> None:
