@@ -24,6 +24,7 @@ ROWS = (
     {"results"},
     {"simulation"},
     {"recorder"},
+    {"rendering"},
     {"environments"},
     {"monitors"},
     {"sessions", "machine_report"},
@@ -38,11 +39,15 @@ CONFINED = {
     "dm_env": {"environments", "monitors"},
     "dm_control": {"environments"},
     "imageio_ffmpeg": {"formats"},
+    "h5py": {"formats"},
     "tyro": {"commands"},
     "rich": {"commands"},
 }
 
-HEAVY = ("mujoco", "gymnasium", "dm_control", "dm_env", "OpenGL", "imageio_ffmpeg")
+HEAVY = (
+    *("mujoco", "gymnasium", "dm_control", "dm_env", "OpenGL", "imageio_ffmpeg"),
+    "h5py",
+)
 
 
 def modules() -> Iterator[tuple[str, Path]]:

@@ -14,6 +14,7 @@
     ├── DifferentEnvironment                resume over another environment
     ├── EnvironmentNotMade                  it is known, and making it failed
     ├── NoPictures                          the environment cannot be drawn
+    ├── PicturesDiffer                      from its state it would look otherwise
     ├── ResetNeeded                         step before reset or after the end
     ├── ResetNotAllowed                     reset in mid-episode
     ├── ClosedError                         used after close()
@@ -52,6 +53,7 @@ __all__ = [
     "InvalidFrame",
     "MissingDependency",
     "NoPictures",
+    "PicturesDiffer",
     "PolicyError",
     "ResetNeeded",
     "ResetNotAllowed",
@@ -196,6 +198,10 @@ class EnvironmentNotMade(Error):
 
 class NoPictures(Error):
     """Videos were asked for of an environment that gives no pictures."""
+
+
+class PicturesDiffer(Error):
+    """What an environment shows cannot be drawn from its recorded state."""
 
 
 class ResetNeeded(Error):

@@ -9,7 +9,7 @@ from fractions import Fraction
 
 from .errors import InvalidArgument
 
-__all__ = ["MAX_DENOMINATOR", "rate_from_timestep", "to_rate"]
+__all__ = ["MAX_DENOMINATOR", "rate_from_timestep", "stride_for", "to_rate"]
 
 # Floats are binary; this finds the fraction that was meant (0.05 is 1/20) and errs by
 # less than a millionth of a millionth of a second.
@@ -61,3 +61,18 @@ def rate_from_timestep(timestep: float) -> Fraction:
     rate = 1 / Fraction(timestep).limit_denominator(MAX_DENOMINATOR)
     # Steps of more than a second have numerators that no video file takes.
     return to_rate(rate.limit_denominator(MAX_DENOMINATOR))
+
+
+def stride_for(rate: Fraction, max_fps: float | Fraction | None) -> int:
+    """Return the smallest whole number of steps from one video frame to the next.
+
+    Args:
+        rate: steps per second.
+        max_fps: the most frames per second that are wanted; None for every step.
+
+    Raises:
+        InvalidArgument: `max_fps` is no rate.
+    """
+    if max_fps is None:
+        return 1
+    return math.ceil(rate / to_rate(max_fps)) or 1

@@ -11,7 +11,13 @@
     ├── openaigym.video.<infix>.video000027.meta.json   ... and all about it
     ├── openaigym.video.<infix>.video000027.framehash   ... and its pictures' hashes
     ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
-    └── .openaigym.<infix>.lock                         while its monitor is open
+    ├── openaigym.trajectory.<infix>.episode000027.log  a recorded episode in flight
+    ├── openaigym.trajectory.<infix>.episode000027.h5   ... and finished
+    ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
+    ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
+    ├── .openaigym.<infix>.lock                         while its monitor is open
+    ├── .openaigym.video.<infix>.video000027.lock       while somebody renders it
+    └── .openaigym.render.<number>.lock                 while somebody uses that CPU
 
 `<infix>` is `<monitor id>.<uid or process id>`. It stands for one monitor: no two
 monitors ever share one in a directory. Names that start with a dot and end in
@@ -38,7 +44,10 @@ __all__ = [
     "journal_name",
     "lock_name",
     "manifest_name",
+    "render_lock_name",
     "stats_prefix",
+    "trajectory_prefix",
+    "video_lock_name",
     "video_prefix",
 ]
 
@@ -64,6 +73,8 @@ _PATTERNS = (
     re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
 )
 _HIDDEN = (
+    re.compile(r"\.openaigym\.video\.(?P<infix>.+)\.video(?P<episode>\d{6,})\.lock"),
+    re.compile(r"\.openaigym\.render\.\d+\.lock"),
     re.compile(r"\.openaigym\.(?P<infix>.+)\.lock"),
     re.compile(
         r"\.openaigym\.video\.(?P<infix>.+)\.video(?P<episode>\d{6,})\.[^/]*\.part"
@@ -129,6 +140,21 @@ def journal_name(infix: Infix) -> str:
 def video_prefix(infix: Infix, episode_id: int) -> str:
     """Return the name of an episode's video without its extensions."""
     return f"{FILE_PREFIX}.video.{infix}.video{episode_id:06d}"
+
+
+def trajectory_prefix(infix: Infix, episode_id: int) -> str:
+    """Return the name of an episode's trajectory without `.log` or `.h5`."""
+    return f"{FILE_PREFIX}.trajectory.{infix}.episode{episode_id:06d}"
+
+
+def video_lock_name(infix: Infix, episode_id: int) -> str:
+    """Return the name of the file that whoever renders an episode holds locked."""
+    return f".{video_prefix(infix, episode_id)}.lock"
+
+
+def render_lock_name(number: int) -> str:
+    """Return the name of the file that stands for one of the machine's CPUs."""
+    return f".{FILE_PREFIX}.render.{number}.lock"
 
 
 def lock_name(infix: Infix) -> str:

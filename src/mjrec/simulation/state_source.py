@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a recorder asks of a simulation, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..formats.trajectory import RowLayout, StateComponent
+
+__all__ = ["EpisodeStart", "StateSource"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeStart:
+    """What is known of a simulation when an episode begins.
+
+    Attributes:
+        state: the components of a state.
+        snapshot: of what pictures are made from; without fields where `refusal` says
+            why there are none.
+        model: where the model is stored, for the facts of a trajectory.
+        scene: how it is shown, likewise; None where there are no snapshots.
+        model_fields: what is other than in the stored model.
+        refusal: why no picture can be made from snapshots of this model; None where
+            it can, which was checked.
+    """
+
+    state: tuple[StateComponent, ...]
+    snapshot: RowLayout
+    model: Mapping[str, Any]
+    scene: Mapping[str, Any] | None
+    model_fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    refusal: str | None = None
+
+
+class StateSource(Protocol):
+    """The states of a simulation, episode by episode, as bytes."""
+
+    def open(self, directory: Path) -> None:
+        """Store models in `directory` from here on."""
+
+    def resetting(self) -> AbstractContextManager[None]:
+        """Return what to put around the reset of the environment."""
+
+    def begin_episode(self) -> EpisodeStart:
+        """Return what is there now, just after a reset."""
+
+    def capture_state(self, out: NDArray[np.uint8]) -> None:
+        """Write the state of this moment into `out`.
+
+        Args:
+            out: `(8 * the numbers of a state,)`, contiguous.
+        """
+
+    def capture_snapshot(
+        self, out: NDArray[np.uint8]
+    ) -> Mapping[str, NDArray[Any]] | None:
+        """Write what a picture of this moment is made from into `out`.
+
+        Args:
+            out: `(snapshot.size,)`, contiguous.
+
+        Returns:
+            Model and view fields that are other than at the capture before (or at the
+            beginning of the episode); None, which is usual, where all are the same.
+        """
+
+    def model_changed(self) -> None:
+        """Note that anything in the model may be another; the next capture looks."""
+
+    def finish(self) -> None:
+        """Wait until every model is stored.
+
+        Raises:
+            FileNotWritten: one could not be.
+        """
+
+    def close(self) -> None:
+        """Let go of what was acquired; idempotent."""
