@@ -16,7 +16,8 @@ from .. import json_text
 from ..atomic_files import write_text
 from ..errors import InvalidArgument, InvalidFrame
 from ..formats.asciicast import AsciicastWriter, text_of_frame
-from ..formats.video_writer import VideoFile, VideoWriter
+from ..formats.video_metadata import StepRuns, file_facts, timing_facts
+from ..formats.video_writer import VideoWriter
 from ..frames import Frame, check_frame
 from ..rates import rate_from_timestep, to_rate
 from ..simulation.inside import simulation_time
@@ -126,7 +127,7 @@ class VideoRecorder:
         self._frames_per_capture = 1
         self._timestep: Fraction | None = None
         self._rate: Fraction | None = None
-        self._steps = _Runs()
+        self._steps = StepRuns()
         self._closed = False
         if not self.enabled:
             if enabled:
@@ -313,7 +314,7 @@ class VideoRecorder:
         self.finished = False
         self.metadata["broken_reason"] = str(error)
         self._waiting.clear()
-        self._steps = _Runs()
+        self._steps = StepRuns()
         if self._writer is not None:
             self._writer.abort()
 
@@ -336,42 +337,18 @@ class VideoRecorder:
         write_text(Path(self.metadata_path), json_text.dumps(self.metadata))
 
     def _description(self) -> dict[str, Any]:
-        description: dict[str, Any] = {
-            "fps": str(self._rate),
-            "timestep": None if self._timestep is None else str(self._timestep),
-            "playback_speed": self._playback_speed(),
-            "stride": 1,
-            "frame_count": self.frame_count,
-            "frame_steps": self._steps.ranges,
-        }
+        description = timing_facts(
+            self._steps,
+            fps=self._rate,
+            timestep=self._timestep,
+            frames_per_step=self._frames_per_capture,
+        )
         if isinstance(self._writer, AsciicastWriter):
             encoder = {"backend": "TextEncoder", "version": 1}
             return {"encoder_version": encoder, **description}
         if isinstance(self._writer, VideoWriter) and self._writer.result is not None:
-            return {**description, **_file_facts(self._writer.result)}
+            return {**description, **file_facts(self._writer.result)}
         return description
-
-    def _playback_speed(self) -> float | None:
-        """Simulated seconds that pass in a second of the video."""
-        if self._timestep is None or self._rate is None:
-            return None
-        return float(self._rate * self._timestep / self._frames_per_capture)
-
-
-class _Runs:
-    """The step of every frame, as runs, so that memory does not grow with frames."""
-
-    def __init__(self) -> None:
-        self.ranges: list[list[int]] = []
-        self.total = 0
-
-    def add(self, step: int) -> None:
-        """Note a frame of `step`."""
-        self.total += 1
-        if self.ranges and self.ranges[-1][1] == step - 1:
-            self.ranges[-1][1] = step
-        else:
-            self.ranges.append([step, step])
 
 
 def _time_of_a_step(
@@ -382,24 +359,3 @@ def _time_of_a_step(
     if start is None or end is None or end <= start:
         return None
     return 1 / rate_from_timestep((end - start) / (last - first))
-
-
-def _file_facts(file: VideoFile) -> dict[str, Any]:
-    return {
-        # gym's three keys; the command line names no directory, so that it stays true
-        # when the recordings are moved.
-        "encoder_version": {
-            "backend": "ffmpeg",
-            "version": file.encoder["version"],
-            "cmdline": [file.encoder["ffmpeg"], *file.encoder["arguments"]],
-        },
-        "ffmpeg_sha256": file.encoder["sha256"],
-        "height": file.height,
-        "width": file.width,
-        "padded_height": file.padded_height,
-        "padded_width": file.padded_width,
-        "codec": file.codec,
-        "pixel_format": file.pixel_format,
-        "file_sha256": file.file_sha256,
-        "decoded_sha256": file.decoded_sha256,
-    }

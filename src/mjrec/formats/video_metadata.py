@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the metadata file of a video says about the video itself.
+
+A video that was made while its episode ran and one that was rendered later say it with
+the same keys, because both take it from here. Who made the video adds what it knows
+besides: of the episode, of the pictures, of what went wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from fractions import Fraction
+from typing import Any
+
+from .video_writer import VideoFile
+
+__all__ = ["StepRuns", "file_facts", "playback_speed", "timing_facts"]
+
+
+class StepRuns:
+    """The step of every frame, as runs, so that memory does not grow with frames.
+
+    Args:
+        steps: of the frames so far, in their order.
+        stride: the usual number of steps from one frame to the next.
+
+    Attributes:
+        ranges: the first and the last step of each run; the frames of a run are a
+            stride apart.
+        total: the number of frames.
+    """
+
+    def __init__(self, steps: Iterable[int] = (), *, stride: int = 1) -> None:
+        self.ranges: list[list[int]] = []
+        self.total = 0
+        self._stride = stride
+        for step in steps:
+            self.add(step)
+
+    def add(self, step: int) -> None:
+        """Note a frame of `step`."""
+        self.total += 1
+        if self.ranges and self.ranges[-1][1] == step - self._stride:
+            self.ranges[-1][1] = step
+        else:
+            self.ranges.append([step, step])
+
+
+def timing_facts(
+    steps: StepRuns,
+    *,
+    fps: Fraction | None,
+    timestep: Fraction | None,
+    stride: int = 1,
+    frames_per_step: int = 1,
+) -> dict[str, Any]:
+    """Return what is said about time.
+
+    Args:
+        steps: the step of every frame.
+        fps: the rate in the file.
+        timestep: simulated seconds of a step, where they are known.
+        stride: the usual number of steps from one frame to the next.
+        frames_per_step: how many frames a step gives; 1 with any other stride.
+    """
+    speed = playback_speed(fps, timestep, Fraction(stride, frames_per_step))
+    return {
+        "fps": str(fps),
+        "timestep": None if timestep is None else str(timestep),
+        "playback_speed": speed,
+        "stride": stride,
+        "frame_count": steps.total,
+        "frame_steps": steps.ranges,
+    }
+
+
+def playback_speed(
+    fps: Fraction | None, timestep: Fraction | None, steps_per_frame: Fraction
+) -> float | None:
+    """Return the simulated seconds that pass in a second of the video, if known."""
+    if fps is None or timestep is None:
+        return None
+    return float(fps * timestep * steps_per_frame)
+
+
+def file_facts(file: VideoFile) -> dict[str, Any]:
+    """Return what is said about a finished file and how it was encoded."""
+    return {
+        # gym's three keys; the command line names no directory, so that it stays true
+        # when the recordings are moved.
+        "encoder_version": {
+            "backend": "ffmpeg",
+            "version": file.encoder["version"],
+            "cmdline": [file.encoder["ffmpeg"], *file.encoder["arguments"]],
+        },
+        "ffmpeg_sha256": file.encoder["sha256"],
+        "height": file.height,
+        "width": file.width,
+        "padded_height": file.padded_height,
+        "padded_width": file.padded_width,
+        "codec": file.codec,
+        "pixel_format": file.pixel_format,
+        "file_sha256": file.file_sha256,
+        "decoded_sha256": file.decoded_sha256,
+    }
