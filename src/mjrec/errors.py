@@ -20,6 +20,7 @@
     ├── ClosedError                         used after close()
     ├── EncoderError                        ffmpeg failed or died
     │   └── FrameCountError                 the finished file lacks or doubles frames
+    ├── RenderError                         videos could not be made of their states
     ├── GLError                             no backend renders, or the wrong one
     ├── PolicyError                         a policy raised or gave a bad action
     ├── ArchiveError                        write_archive's checks
@@ -32,7 +33,7 @@ Every message says what was asked, what is there, and what to do.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,7 @@ __all__ = [
     "NoPictures",
     "PicturesDiffer",
     "PolicyError",
+    "RenderError",
     "ResetNeeded",
     "ResetNotAllowed",
     "UnknownName",
@@ -202,6 +204,24 @@ class NoPictures(Error):
 
 class PicturesDiffer(Error):
     """What an environment shows cannot be drawn from its recorded state."""
+
+
+class RenderError(Error):
+    """Videos could not be rendered from their recorded states.
+
+    Attributes:
+        directory: where the recordings are.
+        failures: the reasons, by the names of the videos.
+    """
+
+    def __init__(self, directory: Path, failures: Mapping[str, str]) -> None:
+        self.directory = directory
+        self.failures = dict(failures)
+        reasons = "; ".join(f"{name}: {why}" for name, why in self.failures.items())
+        super().__init__(
+            f"{len(self.failures)} of the videos in {directory} could not be rendered: "
+            f"{reasons}. Their states are kept; to try again: mjrec render {directory}"
+        )
 
 
 class ResetNeeded(Error):

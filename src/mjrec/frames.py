@@ -8,11 +8,14 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InvalidArgument, InvalidFrame
+from .errors import InvalidArgument, InvalidFrame, UnknownName
 
-__all__ = ["Frame", "check_frame", "check_size", "pad_to_even"]
+__all__ = ["QUALITIES", "Frame", "check_frame", "check_quality", "check_size", "pad_to_even"]
 
 Frame: TypeAlias = NDArray[np.uint8]
+
+# The model's own settings; or no multisampling and a small shadow map.
+QUALITIES = ("full", "draft")
 
 # H.264 level 6.2 ends here.
 _MAX_SIDE = 16384
@@ -46,6 +49,17 @@ def check_frame(frame: object, *, size: tuple[int, int] | None = None) -> Frame:
             f"{size}, this one is {frame.shape[:2]}."
         )
     return frame
+
+
+def check_quality(quality: object) -> str:
+    """Return `quality` if pictures can be drawn so: "full" or "draft".
+
+    Raises:
+        UnknownName: it is something else.
+    """
+    if quality not in QUALITIES:
+        raise UnknownName("quality", str(quality), QUALITIES)
+    return str(quality)
 
 
 def check_size(height: int, width: int) -> tuple[int, int]:
