@@ -3,16 +3,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from mjrec.formats.locks import Lock, is_locked
+from mjrec.formats.locks import Lock, is_locked, try_lock
 
 # Holds the lock at argv[1], says so, and waits for its input to end. With a second
 # argument it also starts a process that outlives it.
@@ -24,6 +26,17 @@ if sys.argv[2:] == ["exec"]:
     subprocess.Popen(["cat"], stdout=subprocess.DEVNULL, close_fds=False)
 print("held", flush=True)
 sys.stdin.read()
+"""
+# Adds one to the number in the file at argv[2], so many times, each time under the
+# lock at argv[1], which is removed and made again all the while.
+COUNTER = """
+import pathlib, sys
+from mjrec.formats.locks import wait_for_lock
+lock, number = map(pathlib.Path, sys.argv[1:3])
+for _ in range(int(sys.argv[3])):
+    held = wait_for_lock(lock, "")
+    number.write_text(str(int(number.read_text()) + 1))
+    held.release()
 """
 # Holds the lock, forks, and lets the child print its number and wait.
 FORKER = """
@@ -132,15 +145,16 @@ def test_the_lock_of_another_process_is_seen(
     assert not is_locked(path)
 
 
+@pytest.mark.parametrize("way", ["Lock", "try_lock"])
 @pytest.mark.parametrize("left", ["exec", "fork"])
 def test_a_process_left_behind_does_not_keep_the_lock(
-    path: Path, left: str, processes: list[subprocess.Popen[str]]
+    path: Path, left: str, way: str, processes: list[subprocess.Popen[str]]
 ) -> None:
     """Neither a started program nor a forked child holds it after a kill.
 
     The child's own `release` does not take it from the parent either.
     """
-    code = FORKER if left == "fork" else HOLDER
+    code = (FORKER if left == "fork" else HOLDER).replace("Lock", way)
     holder = start(processes, code, str(path), left)
     assert holder.stdout is not None
     holder.stdout.readline()
@@ -148,3 +162,54 @@ def test_a_process_left_behind_does_not_keep_the_lock(
     holder.kill()
     holder.wait()
     assert not is_locked(path)
+
+
+def test_a_lock_that_somebody_holds_is_not_got(path: Path) -> None:
+    """Trying tells; the file is there as long as it is held."""
+    first = try_lock(path, "first")
+    assert first is not None
+    assert try_lock(path, "second") is None
+    assert path.read_text() == "first"
+    first.release()
+    assert not path.exists()
+
+
+def test_what_a_dead_process_left_is_taken_over(
+    path: Path, processes: list[subprocess.Popen[str]]
+) -> None:
+    """With the new holder's content, however long the old one was."""
+    holder = start(processes, HOLDER, str(path))
+    assert holder.stdout is not None
+    holder.stdout.readline()
+    assert try_lock(path, "") is None
+    holder.kill()
+    holder.wait()
+    lock = try_lock(path, "me")
+    assert lock is not None
+    assert path.read_text() == "me"
+    assert is_locked(path)
+    lock.release()
+
+
+def test_being_looked_at_does_not_keep_a_lock_from_being_got(path: Path) -> None:
+    """`is_locked` holds a left-over for a moment, which is waited for."""
+    path.write_text("left behind")
+    looking = path.open()
+    fcntl.flock(looking, fcntl.LOCK_SH)
+    threading.Timer(0.003, looking.close).start()
+    lock = try_lock(path, "")
+    assert lock is not None
+    lock.release()
+
+
+def test_one_at_a_time_has_a_lock(
+    path: Path, tmp_path: Path, processes: list[subprocess.Popen[str]]
+) -> None:
+    """Though each removes the file that the others wait for."""
+    number = tmp_path / "number"
+    number.write_text("0")
+    counters = [
+        start(processes, COUNTER, str(path), str(number), "300") for _ in range(3)
+    ]
+    assert [counter.wait() for counter in counters] == [0, 0, 0]
+    assert number.read_text() == "900"

@@ -4,16 +4,27 @@
 An open monitor holds `.openaigym.<infix>.lock` locked (`flock`). The kernel drops
 that when the process ends, however it ends, so a lock file that nobody holds is what
 a dead monitor left. Process numbers come round again, in containers all the time.
+
+A monitor's lock is a name that is given once. The others (who renders a video, who
+uses a CPU, who rewrites a manifest) go from hand to hand, and what a dead process left
+is taken over.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
+import time
 import weakref
 from pathlib import Path
+from typing import Self
 
-__all__ = ["Lock", "is_locked"]
+__all__ = ["Lock", "is_locked", "try_lock", "wait_for_lock"]
+
+# Whoever asks `is_locked` holds a lock for a moment, which is no reason to give up.
+_MOMENTS = 5
+_MOMENT = 0.002
 
 # A forked child shares the lock, which would outlive a killed parent in it.
 _held: weakref.WeakSet[Lock] = weakref.WeakSet()
@@ -31,14 +42,15 @@ class Lock:
         OSError: it cannot be made there.
     """
 
+    _path: Path
+    _descriptor: int | None = None
+
     def __init__(self, path: Path, content: str) -> None:
         self._path = path
-        self._descriptor: int | None = None
         # Python opens every descriptor close-on-exec: an encoder that outlives this
         # process does not keep the lock.
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
-        self._descriptor = descriptor
-        _held.add(self)
+        self._hold(descriptor)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             os.write(descriptor, content.encode())
@@ -48,6 +60,18 @@ class Lock:
         except BaseException:
             self.release()
             raise
+
+    @classmethod
+    def _of(cls, path: Path, descriptor: int) -> Self:
+        """Return the lock of a file that this process has open and locked."""
+        lock = cls.__new__(cls)
+        lock._path = path
+        lock._hold(descriptor)
+        return lock
+
+    def _hold(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        _held.add(self)
 
     def release(self) -> None:
         """Remove the file and let it go; further calls do nothing.
@@ -63,6 +87,50 @@ class Lock:
                 self._path.unlink(missing_ok=True)
         finally:
             os.close(descriptor)
+
+
+def try_lock(path: Path, content: str) -> Lock | None:
+    """Return a lock at `path`, or None where somebody else holds it.
+
+    A file that nobody holds is taken over, whoever left it.
+
+    Args:
+        path: the file; made where it is missing.
+        content: what others may read about its holder.
+
+    Raises:
+        OSError: it cannot be made or opened.
+    """
+    for _ in range(_MOMENTS):
+        with contextlib.suppress(BlockingIOError):
+            return _taken(path, content, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        time.sleep(_MOMENT)
+    return None
+
+
+def wait_for_lock(path: Path, content: str) -> Lock:
+    """Return a lock at `path`, as soon as nobody else holds it.
+
+    It is `try_lock` with patience, for what is never held for long.
+    """
+    return _taken(path, content, fcntl.LOCK_EX)
+
+
+def _taken(path: Path, content: str, operation: int) -> Lock:
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
+        try:
+            fcntl.flock(descriptor, operation)
+            # Its holder may have removed it between the two lines above, and somebody
+            # else have made another: then this one guards nothing.
+            if _is_at(descriptor, path):
+                os.ftruncate(descriptor, 0)
+                os.write(descriptor, content.encode())
+                return Lock._of(path, descriptor)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
 
 
 def is_locked(path: Path) -> bool:

@@ -17,6 +17,7 @@
     ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
     ├── .openaigym.<infix>.lock                         while its monitor is open
     ├── .openaigym.video.<infix>.video000027.lock       while somebody renders it
+    ├── .openaigym.manifest.<infix>.lock                while somebody rewrites it
     └── .openaigym.render.<number>.lock                 while somebody uses that CPU
 
 `<infix>` is `<monitor id>.<uid or process id>`. It stands for one monitor: no two
@@ -43,6 +44,7 @@ __all__ = [
     "iter_monitor_files",
     "journal_name",
     "lock_name",
+    "manifest_lock_name",
     "manifest_name",
     "render_lock_name",
     "stats_prefix",
@@ -75,6 +77,7 @@ _PATTERNS = (
 _HIDDEN = (
     re.compile(r"\.openaigym\.video\.(?P<infix>.+)\.video(?P<episode>\d{6,})\.lock"),
     re.compile(r"\.openaigym\.render\.\d+\.lock"),
+    re.compile(r"\.openaigym\.manifest\.(?P<infix>.+)\.lock"),
     re.compile(r"\.openaigym\.(?P<infix>.+)\.lock"),
     re.compile(
         r"\.openaigym\.video\.(?P<infix>.+)\.video(?P<episode>\d{6,})\.[^/]*\.part"
@@ -160,6 +163,14 @@ def render_lock_name(number: int) -> str:
 def lock_name(infix: Infix) -> str:
     """Return the name of the file that an open monitor holds locked."""
     return f".{FILE_PREFIX}.{infix}.lock"
+
+
+def manifest_lock_name(infix: Infix) -> str:
+    """Return the name of the file that whoever rewrites a manifest holds locked.
+
+    It is another one than the monitor's: a monitor that is closed stays closed.
+    """
+    return f".{MANIFEST_PREFIX}.{infix}.lock"
 
 
 def is_manifest(name: str) -> bool:
