@@ -18,7 +18,13 @@ import numpy as np
 import pytest
 from interruption import ctrl_c_soon
 
-from mjrec.errors import ClosedError, GLError, InvalidArgument, UnknownName
+from mjrec.errors import (
+    ClosedError,
+    GLError,
+    InvalidArgument,
+    InvalidFrame,
+    UnknownName,
+)
 from mjrec.simulation import gl_thread
 from mjrec.simulation.gl_strings import current_gl_strings
 from mjrec.simulation.gl_thread import GLThread
@@ -235,6 +241,125 @@ def test_the_simulation_is_left_alone() -> None:
     assert np.array_equal(data.sensordata, alone.sensordata)
     assert np.array_equal(data.geom_xpos, alone.geom_xpos)
     assert content(model) == before
+
+
+def test_a_draft_is_the_model_with_less(
+    table: tuple[mujoco.MjModel, mujoco.MjData],
+) -> None:
+    """No multisampling, a shadow map of at most 1024; the model is left alone."""
+    model, data = table
+    model.vis.quality.shadowsize = 2048
+    before = content(model)
+    with SceneRenderer(model, camera="above", quality="draft", **SIZE) as renderer:
+        draft = renderer.render(data)
+    assert content(model) == before
+
+    model.vis.quality.shadowsize = 1024
+    model.vis.quality.offsamples = 0
+    assert np.array_equal(draft, drawn_anew(model, data))
+
+
+def test_a_draft_does_not_raise_what_is_low(
+    renderer: SceneRenderer, table: tuple[mujoco.MjModel, mujoco.MjData]
+) -> None:
+    """A shadow map smaller than a draft's stays as it is."""
+    model, data = table
+    with SceneRenderer(model, camera="above", quality="draft", **SIZE) as draft:
+        drawn = draft.render(data)
+    model.vis.quality.offsamples = 0
+    renderer.model_changed()
+    assert np.array_equal(drawn, renderer.render(data))
+
+
+def test_a_picture_can_be_drawn_into_given_memory(
+    renderer: SceneRenderer, table: tuple[mujoco.MjModel, mujoco.MjData]
+) -> None:
+    """Which is returned; memory of another size is refused."""
+    out = np.zeros((50, 70, 3), np.uint8)
+    assert renderer.render(table[1], out=out) is out
+    assert np.array_equal(out, renderer.render(table[1]))
+    with pytest.raises(InvalidFrame, match=r"\(50, 70\)"):
+        renderer.render(table[1], out=np.zeros((50, 71, 3), np.uint8))
+
+
+# The floor is drawn around the camera of the picture before.
+ENDLESS = """
+<mujoco>
+  <visual><quality shadowsize="256"/><map zfar="50"/></visual>
+  <asset>
+    <texture name="checks" type="2d" builtin="checker" rgb1="1 0 0" rgb2="0 0 1"
+      width="32" height="32"/>
+    <material name="cloth" texture="checks" texrepeat="1.7 1.7"/>
+  </asset>
+  <worldbody>
+    <light directional="true" dir="0 .3 -1"/>
+    <geom type="plane" size="0 0 1" material="cloth"/>
+    <body pos="0 0 .5"><joint type="slide" axis="1 .3 0"/><geom size=".1"/>
+      <camera name="rider" pos="0 -2 1" xyaxes="1 0 0 0 .4 .9"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def ride() -> tuple[mujoco.MjModel, list[mujoco.MjData]]:
+    """A camera that jumps over an infinite plane, in four moments."""
+    model = mujoco.MjModel.from_xml_string(ENDLESS)
+    moments = []
+    for position in (0, 9.3, 17, 30):
+        data = mujoco.MjData(model)
+        data.qpos[:] = position
+        mujoco.mj_forward(model, data)
+        moments.append(data)
+    return model, moments
+
+
+def test_a_look_stands_for_the_picture_before(
+    ride: tuple[mujoco.MjModel, list[mujoco.MjData]],
+) -> None:
+    """An infinite plane is where it would be, without the drawing."""
+    model, moments = ride
+    with SceneRenderer(model, camera="rider", **SIZE) as one:
+        in_order = [one.render(data) for data in moments]
+        positions = one.camera_positions
+    with SceneRenderer(model, camera="rider", **SIZE) as other:
+        cold = other.render(moments[2])
+        other.look(moments[1])
+        after_a_look = other.render(moments[2])
+        other.look(moments[3])
+        assert np.array_equal(other.camera_positions, positions)
+
+    assert not np.array_equal(cold, in_order[2])
+    assert np.array_equal(after_a_look, in_order[2])
+
+
+def test_camera_positions_can_be_put_back(
+    ride: tuple[mujoco.MjModel, list[mujoco.MjData]],
+) -> None:
+    """As a recording has them."""
+    model, moments = ride
+    with SceneRenderer(model, camera="rider", **SIZE) as renderer:
+        assert not renderer.camera_positions.any()
+        first = renderer.render(moments[0])
+        left = renderer.camera_positions
+        second = renderer.render(moments[1])
+        assert not np.array_equal(renderer.render(moments[1]), second)
+        renderer.camera_positions = left
+        assert np.array_equal(renderer.render(moments[1]), second)
+        renderer.camera_positions = np.zeros((2, 3))
+        assert np.array_equal(renderer.render(moments[0]), first)
+
+
+def test_fresh_pictures_do_not_depend_on_others(
+    ride: tuple[mujoco.MjModel, list[mujoco.MjData]],
+) -> None:
+    """Each is what a new renderer draws first, as with dm_control."""
+    model, moments = ride
+    with SceneRenderer(model, camera="rider", fresh=True, **SIZE) as fresh:
+        pictures = [fresh.render(data) for data in moments]
+    for data, picture in zip(moments, pictures, strict=True):
+        with SceneRenderer(model, camera="rider", **SIZE) as cold:
+            assert np.array_equal(cold.render(data), picture)
 
 
 # What changes in the model
@@ -484,6 +609,7 @@ def test_a_renderer_that_cannot_be_made_leaves_no_thread(
         ({"camera": "abve"}, "no camera 'abve'"),
         ({"camera": 7}, "no camera number 7"),
         ({"max_geom": 0}, "max_geom must be"),
+        ({"quality": "high"}, "no quality 'high'"),
     ],
 )
 def test_arguments_are_checked_before_a_context_is_made(

@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import threading
+from collections.abc import Iterator
 from types import TracebackType
 from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InvalidArgument
-from ..frames import Frame, check_size
+from ..frames import Frame, check_frame, check_quality, check_size
 from .baked_fields import BakedFields
 from .cameras import FREE_CAMERA, Camera, raw_data, raw_model, resolve_camera
 from .gl_thread import GLStrings, GLThread, gl_error, opengl
@@ -27,12 +30,15 @@ class SceneRenderer:
     thread is left alone; it may be used from any thread, and several at once may
     exist. The scene is put together on the caller's thread from the model and data as
     they are at that moment, and only the drawing is handed over. Neither the model nor
-    the data is written to; a picture larger than the model's offscreen buffer gets a
-    larger buffer on a copy.
+    the data is written to; a picture larger than the model's offscreen buffer, or of
+    another quality, is drawn with a copy's settings.
 
     Most changes to the model show in the next picture. Those to height fields,
     textures, meshes, sizes of planes, textures of materials, fog and rendering quality
     show after `model_changed`, and so does another model: call it at each reset.
+
+    An infinite plane is drawn around the place where the cameras stood in the picture
+    before. `camera_positions` and `look` give pictures in any order the same planes.
 
     ::
 
@@ -50,9 +56,12 @@ class SceneRenderer:
             finders.
         max_geom: how many geoms a scene may have; the rest is not drawn. Environments'
             own renderers have other limits (Gymnasium's 1000).
+        quality: `"full"` is what the model asks for. `"draft"` is the model without
+            multisampling and with a shadow map of at most 1024x1024.
+        fresh: draw each picture as if it were the first, as dm_control does.
 
     Raises:
-        UnknownName: the model has no such camera.
+        UnknownName: the model has no such camera, or there is no such quality.
         InvalidArgument: a camera number or a size that cannot be, also a size that the
             driver cannot draw.
         GLError: no OpenGL backend works here, or this process was forked from one that
@@ -68,17 +77,21 @@ class SceneRenderer:
         camera: Camera = FREE_CAMERA,
         scene_option: mujoco.MjvOption | None = None,
         max_geom: int = 10000,
+        quality: str = "full",
+        fresh: bool = False,
     ) -> None:
         self._height, self._width = check_size(height, width)
+        check_quality(quality)
         self._model = raw_model(model)
         self._camera = camera
         self._scene_option = scene_option or mujoco.MjvOption()
         self._max_geom = _check_max_geom(max_geom)
+        self._fresh = fresh
         resolve_camera(self._model, camera)
         self._scene = mujoco.MjvScene(self._model, maxgeom=self._max_geom)
         # Nothing of what the caller sees is shared with the thread, except while a call
         # lasts: dropping the renderer ends the thread.
-        self._canvas = _Canvas(self._height, self._width)
+        self._canvas = _Canvas(self._height, self._width, quality)
         self._one_at_a_time = threading.Lock()
         self._thread = GLThread(finish=self._canvas.free)
         try:
@@ -98,7 +111,33 @@ class SceneRenderer:
         """Who draws: OpenGL's vendor, renderer and version."""
         return self._thread.strings
 
-    def render(self, data: Any) -> Frame:
+    @property
+    def camera_positions(self) -> NDArray[np.float32]:
+        """Where the two cameras stood in the last picture, `(2, 3)`, in metres.
+
+        All zeros before the first. Set it to draw the next picture as if another one
+        had been drawn before.
+        """
+        return np.array([camera.pos for camera in self._scene.camera])
+
+    @camera_positions.setter
+    def camera_positions(self, positions: ArrayLike) -> None:
+        for camera, position in zip(
+            self._scene.camera, np.asarray(positions), strict=True
+        ):
+            camera.pos = position
+
+    def look(self, data: Any) -> None:
+        """Leave in the scene what a picture of `data` would, without drawing one.
+
+        Raises:
+            InvalidArgument, ClosedError, GLError: as `render`.
+        """
+        with self._scene_of(raw_data(data)) as data:
+            camera = resolve_camera(self._model, self._camera)
+            mujoco.mjv_updateCamera(self._model, data, camera, self._scene)
+
+    def render(self, data: Any, *, out: Frame | None = None) -> Frame:
         """Return the picture of `data`, a new `(height, width, 3) uint8` array.
 
         The first row is the top one.
@@ -107,22 +146,21 @@ class SceneRenderer:
             data: the `mujoco.MjData` of the model, or dm_control's wrapper of it. Its
                 derived quantities are drawn as they are: after `mj_step` they belong to
                 the state before the last substep, see `mj_forward`.
+            out: an array to draw into and return, instead of a new one.
 
         Raises:
             InvalidArgument: the data belongs to a model of another structure.
+            InvalidFrame: `out` is no picture of this size.
             ClosedError: after `close`.
             GLError: in a forked child, or the driver hangs.
         """
-        data = raw_data(data)
-        # Before the lock, which another thread may have held at the time of a fork.
-        self._thread.check_usable()
-        with self._one_at_a_time:
-            # Memory beyond the arrays of smaller data would be read.
-            _check_belongs(data, self._model)
-            # The thread may still be drawing the last scene, after Ctrl-C.
-            self._thread.settle()
+        if out is not None:
+            check_frame(out, size=self.size)
+        with self._scene_of(raw_data(data)) as data:
+            if self._fresh:
+                self.camera_positions = np.zeros((2, 3))
             self._update_scene(data)
-            return self._thread.call(self._canvas.draw, self._scene)
+            return self._thread.call(self._canvas.draw, self._scene, out)
 
     def model_changed(self, model: Any = None) -> None:
         """Bring the renderer up to date with its model, or go over to another one.
@@ -170,6 +208,18 @@ class SceneRenderer:
             f"camera={self._camera!r}, gl={self.gl_strings.renderer!r})"
         )
 
+    @contextlib.contextmanager
+    def _scene_of(self, data: mujoco.MjData) -> Iterator[mujoco.MjData]:
+        """Have the scene for oneself, to put `data` into it."""
+        # Before the lock, which another thread may have held at the time of a fork.
+        self._thread.check_usable()
+        with self._one_at_a_time:
+            # Memory beyond the arrays of smaller data would be read.
+            _check_belongs(data, self._model)
+            # The thread may still be drawing the last scene, after Ctrl-C.
+            self._thread.settle()
+            yield data
+
     def _update_scene(self, data: mujoco.MjData) -> None:
         mujoco.mjv_updateScene(
             self._model,
@@ -207,7 +257,8 @@ _UPLOADS = {
 class _Canvas:
     """What lives on the GL thread; every method is called there."""
 
-    def __init__(self, height: int, width: int) -> None:
+    def __init__(self, height: int, width: int, quality: str) -> None:
+        self._quality = quality
         self._context: mujoco.MjrContext | None = None
         self._rectangle = mujoco.MjrRect(0, 0, width, height)
         self._bottom_up = np.empty((height, width, 3), np.uint8)
@@ -216,12 +267,14 @@ class _Canvas:
         """Make the context for `model`, in place of an earlier one."""
         rectangle = self._rectangle
         _check_driver_can_draw(rectangle.height, rectangle.width)
-        # Only the context needs the larger buffer, and it keeps no reference.
-        with_buffer = _with_buffer(model, rectangle.height, rectangle.width)
+        # Only the context needs these settings, and it keeps no reference.
+        for_context = _with_settings(
+            model, rectangle.height, rectangle.width, self._quality
+        )
         self.free()
         try:
             context = mujoco.MjrContext(
-                with_buffer, int(mujoco.mjtFontScale.mjFONTSCALE_150)
+                for_context, int(mujoco.mjtFontScale.mjFONTSCALE_150)
             )
         except mujoco.FatalError as error:
             what = f"A {rectangle.width}x{rectangle.height} picture cannot be drawn"
@@ -239,11 +292,13 @@ class _Canvas:
             for index in range(getattr(model, count)):
                 upload(model, self._context, index)
 
-    def draw(self, scene: mujoco.MjvScene) -> Frame:
-        """Return the picture of `scene`."""
+    def draw(self, scene: mujoco.MjvScene, out: Frame | None) -> Frame:
+        """Return the picture of `scene`, in `out` if that is given."""
         mujoco.mjr_render(self._rectangle, scene, self._context)
         mujoco.mjr_readPixels(self._bottom_up, None, self._rectangle, self._context)
-        return self._bottom_up[::-1].copy()
+        frame = np.empty_like(self._bottom_up) if out is None else out
+        np.copyto(frame, self._bottom_up[::-1])
+        return frame
 
     def free(self) -> None:
         """Free the context. Idempotent."""
@@ -288,15 +343,25 @@ def _check_belongs(data: mujoco.MjData, model: mujoco.MjModel) -> None:
         )
 
 
-def _with_buffer(model: mujoco.MjModel, height: int, width: int) -> mujoco.MjModel:
-    """Return `model`, or a copy with an offscreen buffer of at least that size."""
+_DRAFT_SHADOW_MAP = 1024
+
+
+def _with_settings(
+    model: mujoco.MjModel, height: int, width: int, quality: str
+) -> mujoco.MjModel:
+    """Return `model`, or a copy with a large enough buffer and of that quality."""
     buffer = model.vis.global_
-    if height <= buffer.offheight and width <= buffer.offwidth:
+    is_large_enough = height <= buffer.offheight and width <= buffer.offwidth
+    if is_large_enough and quality == "full":
         return model
-    enlarged = copy.copy(model)
-    enlarged.vis.global_.offheight = max(height, buffer.offheight)
-    enlarged.vis.global_.offwidth = max(width, buffer.offwidth)
-    return enlarged
+    changed = copy.copy(model)
+    changed.vis.global_.offheight = max(height, buffer.offheight)
+    changed.vis.global_.offwidth = max(width, buffer.offwidth)
+    if quality == "draft":
+        settings = changed.vis.quality
+        settings.offsamples = 0
+        settings.shadowsize = min(settings.shadowsize, _DRAFT_SHADOW_MAP)
+    return changed
 
 
 def _check_driver_can_draw(height: int, width: int) -> None:
