@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The file of a recorded episode, be it a log still or HDF5 already."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from ..errors import DirectoryNotWritable, InvalidArgument, UnreadableFile
+from .json_fields import unreadable
+from .monitor_directory import Infix, trajectory_prefix
+from .trajectory_hdf5 import SIGNATURE, TrajectoryHdf5Reader, write_hdf5
+from .trajectory_log_reader import TrajectoryLogReader
+from .trajectory_reader import TrajectoryReader
+
+__all__ = [
+    "TrajectoryReader",
+    "find_trajectory",
+    "finish_trajectory",
+    "open_trajectory",
+]
+
+_LOG = ".log"
+_FINISHED = ".h5"
+
+
+def open_trajectory(path: Path) -> TrajectoryReader:
+    """Open a trajectory for reading, whichever of its two forms it has.
+
+    What a file is, its first bytes tell. A log that was finished meanwhile is opened
+    as what it has become.
+
+    Raises:
+        UnreadableFile: there is no such file, or it is none, or damaged, or of a
+            newer format version.
+    """
+    if path.suffix == _LOG and not path.exists():
+        finished = path.with_suffix(_FINISHED)
+        path = finished if finished.exists() else path
+    with unreadable(path):
+        # Opening a pipe would wait for ever.
+        if path.exists() and not path.is_file():
+            raise ValueError("it is not a regular file")
+        with path.open("rb") as file:
+            is_finished = file.read(len(SIGNATURE)) == SIGNATURE
+    return TrajectoryHdf5Reader(path) if is_finished else TrajectoryLogReader(path)
+
+
+def find_trajectory(
+    directory: Path, infix: Infix | str, episode_id: int
+) -> Path | None:
+    """Return the file of an episode: finished if it is, else the log, else None."""
+    known = infix if isinstance(infix, Infix) else Infix.parse(infix)
+    if known is None:
+        return None
+    prefix = trajectory_prefix(known, episode_id)
+    log, finished = (directory / f"{prefix}{end}" for end in (_LOG, _FINISHED))
+    # The log is looked for first: while one becomes the other there is always one.
+    is_log = log.is_file()
+    if finished.is_file():
+        return finished
+    return log if is_log else None
+
+
+def finish_trajectory(log: Path) -> Path:
+    """Make the HDF5 file of an ended log, and remove the log.
+
+    It may be killed at any point and run again, and two may do it at the same time:
+    the log is there until the file is.
+
+    Returns:
+        The path of the HDF5 file.
+
+    Raises:
+        InvalidArgument: its name is not that of a log.
+        UnreadableFile: there is neither, or the log cannot be read; it stays.
+        FileNotWritten: the disk is full; the log stays.
+        DirectoryNotWritable: the log cannot be removed.
+    """
+    if log.suffix != _LOG:
+        raise InvalidArgument(
+            f"The name of a trajectory's log ends in {_LOG}, got {str(log)!r}."
+        )
+    finished = log.with_suffix(_FINISHED)
+    if not _is_whole(finished):
+        _convert(log, finished)
+    try:
+        log.unlink(missing_ok=True)
+    except OSError as error:
+        raise DirectoryNotWritable(log.parent, error) from error
+    return finished
+
+
+def _convert(log: Path, finished: Path) -> None:
+    try:
+        with TrajectoryLogReader(log) as reader:
+            write_hdf5(reader, finished)
+    except UnreadableFile:
+        # Somebody else may have done it and removed the log meanwhile.
+        if not _is_whole(finished):
+            raise
+
+
+def _is_whole(path: Path) -> bool:
+    """Tell whether there is a finished trajectory that can be opened."""
+    with contextlib.suppress(UnreadableFile), TrajectoryHdf5Reader(path):
+        return True
+    return False
