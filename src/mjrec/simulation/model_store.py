@@ -208,12 +208,13 @@ def _not_loadable(
             "the model of the recording is missing; it belongs beside the recording, "
             "and whatever was copied without it needs it too",
         )
+    source = facts.get("xml")
     return UnreadableFile(
         directory / name,
         f"the model was written by mujoco {facts.get('mujoco')}, this is "
         f"{mujoco.__version__}, and what it was made from is not there. Install that "
-        f"version (pip install mujoco=={facts.get('mujoco')}), or put "
-        f"{facts.get('xml') or 'the zip of its XML'} beside it",
+        f"version: pip install mujoco=={facts.get('mujoco')}"
+        + (f"; or put {source} beside it" if source else ""),
     )
 
 

@@ -1,0 +1,417 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models are stored once, whole, and come back as they were; nothing else is read."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import io
+import json
+import shutil
+import threading
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from mjrec.errors import FileNotWritten, UnreadableFile
+from mjrec.simulation.model_store import (
+    AuthoredModel,
+    ModelStore,
+    authored_from_file,
+    load_model,
+)
+
+MAIN = """
+<mujoco>
+  <compiler meshdir="../meshes" texturedir="tex"/>
+  <include file="parts/body.xml"/>
+  <asset>
+    <mesh file="m.obj"/>
+    <texture name="t" type="2d" file="t.png"/>
+    <material name="t" texture="t"/>
+  </asset>
+  <worldbody><geom type="mesh" mesh="m" material="t"/></worldbody>
+</mujoco>
+"""
+BODY = """
+<mujoco>
+  <worldbody><body><joint/><geom size=".1" pos=".123456789123 0 0"/></body></worldbody>
+</mujoco>
+"""
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
+
+
+def picture() -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def mjcf(tmp_path: Path) -> Path:
+    """A model of five files in three directories."""
+    root = tmp_path / "authors"
+    for name, content in {
+        "model/main.xml": MAIN.encode(),
+        "model/parts/body.xml": BODY.encode(),
+        "model/tex/t.png": picture(),
+        "meshes/m.obj": TETRAHEDRON.encode(),
+        "meshes/unused.obj": b"",
+    }.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(content)
+    return root / "model/main.xml"
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    path = tmp_path / "recordings"
+    path.mkdir()
+    return path
+
+
+def content_of(model: Any) -> bytes:
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def stored(directory: Path, model: Any, authored: AuthoredModel | None = None) -> Any:
+    store = ModelStore(directory)
+    facts = store.add(model, authored)
+    store.finish()
+    return json.loads(json.dumps(facts))
+
+
+def sphere() -> Any:
+    return mujoco.MjModel.from_xml_string(SPHERE)
+
+
+def from_source(directory: Path, facts: Any) -> Any:
+    """Load as another version of MuJoCo has to."""
+    return load_model(directory, {**facts, "mujoco": "3.1.4"})
+
+
+def test_a_model_comes_back_exactly(directory: Path, mjcf: Path) -> None:
+    """The facts say where it is, and what it is."""
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    facts = stored(directory, model)
+    stem = f"openaigym.model.{facts['sha256'][:16]}"
+    assert facts == {
+        "sha256": hashlib.sha256(content_of(model)).hexdigest(),
+        "bytes": len(content_of(model)),
+        "mjb": f"{stem}.mjb.gz",
+        "xml": None,
+        "mujoco": mujoco.__version__,
+    }
+    assert content_of(load_model(directory, facts)) == content_of(model)
+
+
+def test_the_same_content_makes_the_same_files_once(
+    directory: Path, tmp_path: Path, mjcf: Path
+) -> None:
+    """Whoever writes them, and whenever; a file that is there is left alone."""
+    authored = authored_from_file(mjcf)
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    stored(directory, model, authored)
+    files = {path.name: path.read_bytes() for path in directory.iterdir()}
+    assert sorted(name.rpartition(".")[2] for name in files) == ["gz", "zip"]
+    other = tmp_path / "other"
+    other.mkdir()
+    stored(other, model, authored)
+    assert {path.name: path.read_bytes() for path in other.iterdir()} == files
+    times = [path.stat().st_mtime_ns for path in directory.iterdir()]
+    stored(directory, model, authored)
+    assert [path.stat().st_mtime_ns for path in directory.iterdir()] == times
+
+
+def test_adding_does_not_write_on_the_callers_thread(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing half-written ever has a final name."""
+    threads: set[str] = set()
+    rename = Path.replace
+
+    def watched(path: Path, target: Path) -> Path:
+        threads.add(threading.current_thread().name)
+        assert gzip.decompress(path.read_bytes()) == content_of(sphere())
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", watched)
+    stored(directory, sphere())
+    assert threads == {"mjrec-model store"}
+
+
+def test_a_model_that_changes_later_is_stored_as_it_was(directory: Path) -> None:
+    """Also while it is being written."""
+    model = sphere()
+    store = ModelStore(directory)
+    facts = store.add(model)
+    model.geom_size[0] = 7
+    again = store.add(model)
+    store.finish()
+    assert load_model(directory, facts).geom_size[0, 0] == 0.1
+    assert load_model(directory, again).geom_size[0, 0] == 7
+
+
+def test_a_full_disk_is_one_error_and_can_be_tried_again(directory: Path) -> None:
+    """The error names the file; the store goes on."""
+    shutil.rmtree(directory)
+    store = ModelStore(directory)
+    facts = store.add(sphere())
+    with pytest.raises(FileNotWritten, match=facts["mjb"]):
+        store.finish()
+    store.finish()
+    directory.mkdir()
+    store.add(sphere())
+    store.finish()
+    assert load_model(directory, facts).ngeom == 1
+
+
+def test_sources_are_gathered_as_they_lie(mjcf: Path) -> None:
+    """Included, mesh and texture files, `..` in references, and nothing else."""
+    authored = authored_from_file(mjcf)
+    assert authored is not None
+    assert authored.main == "model/main.xml"
+    assert sorted(authored.files) == [
+        *("meshes/m.obj", "model/main.xml", "model/parts/body.xml", "model/tex/t.png")
+    ]
+
+
+def test_another_version_compiles_the_sources(directory: Path, mjcf: Path) -> None:
+    """To the same model, wherever the authors' files are now."""
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    facts = stored(directory, model, authored_from_file(mjcf))
+    shutil.rmtree(mjcf.parents[1])
+    again = from_source(directory, facts)
+    # `_sizes` and these addresses depend on where the files were.
+    names = [n for n in dir(model) if isinstance(getattr(model, n), np.ndarray)]
+    for name in names:
+        if not name.endswith("pathadr") and name != "_sizes":
+            expected = getattr(model, name)
+            np.testing.assert_array_equal(getattr(again, name), expected, name)
+
+
+def test_what_was_set_by_hand_comes_back_too(directory: Path, mjcf: Path) -> None:
+    """Gymnasium sets the buffer's size, other environments colours and positions."""
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    model.vis.global_.offwidth = 1234
+    model.opt.gravity[:] = [0, 1, 2]
+    model.geom_rgba[0] = [0.1, 0.2, 0.3, 1]
+    model.geom_contype[0] = 5
+    model.stat.extent = 3.5
+    facts = stored(directory, model, authored_from_file(mjcf))
+    again = from_source(directory, facts)
+    assert again.vis.global_.offwidth == 1234
+    assert (again.stat.extent, again.geom_contype[0]) == (3.5, 5)
+    np.testing.assert_array_equal(again.opt.gravity, [0, 1, 2])
+    np.testing.assert_array_equal(again.geom_rgba, model.geom_rgba)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda model: model.geom_type.__setitem__(0, 3),
+        lambda model: mujoco.MjModel.from_xml_string("<mujoco/>"),
+    ],
+    ids=["other kind", "other model"],
+)
+def test_sources_of_another_model_are_not_stored(
+    directory: Path, mjcf: Path, change: Callable[[Any], Any]
+) -> None:
+    """The compiled model is, and the error says what would help."""
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    model = change(model) or model
+    facts = stored(directory, model, authored_from_file(mjcf))
+    assert [path.name for path in directory.iterdir()] == [facts["mjb"]]
+    assert content_of(load_model(directory, facts)) == content_of(model)
+    with pytest.raises(UnreadableFile, match=r"written by mujoco 3\.1\.4, this is"):
+        from_source(directory, facts)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('file="m.obj"', 'file="/m.obj"'),
+        ('file="m.obj"', 'file="gone.obj"'),
+        ("<asset>", '<extension><plugin plugin="mujoco.pid"/></extension><asset>'),
+        ("<mujoco>", "<mujoco"),
+        ("<mujoco>", '<!DOCTYPE m [<!ENTITY a "b">]><mujoco>'),
+    ],
+    ids=["absolute", "missing", "plugin", "broken", "entities"],
+)
+def test_what_cannot_be_stored_safely_is_left_out(
+    mjcf: Path, old: str, new: str
+) -> None:
+    """None, and the recording goes on without."""
+    mjcf.write_text(MAIN.replace(old, new))
+    assert authored_from_file(mjcf) is None
+
+
+def write_zip(path: Path, members: dict[str, str | bytes]) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+def foreign(directory: Path, members: dict[str, str | bytes]) -> Any:
+    """Load the model of a zip that somebody made to look like one of ours."""
+    facts = stored(directory, sphere())
+    facts["xml"] = facts["mjb"].replace(".mjb.gz", ".zip")
+    contents = {"contents.json": '{"format": 1, "main": "main.xml"}'}
+    write_zip(directory / facts["xml"], {**contents, **members})
+    return from_source(directory, facts)
+
+
+def test_a_plain_foreign_zip_is_compiled(directory: Path) -> None:
+    """What the refusals below are refusals of."""
+    assert foreign(directory, {"source/main.xml": SPHERE}).ngeom == 1
+
+
+SECRET = "<mujoco><include file='{}'/></mujoco>"
+
+
+@pytest.mark.parametrize(
+    ("members", "said"),
+    [
+        ({"source/main.xml": SECRET.format("/secret.xml")}, "plain relative"),
+        ({"source/main.xml": SECRET.format("../" * 9 + "secret.xml")}, "outside"),
+        ({"source/main.xml": SECRET.format("../secret.xml")}, "secret.xml"),
+        ({"source/main.xml": SECRET.format("..\\\\secret.xml")}, "plain relative"),
+        (
+            {
+                "source/main.xml": SECRET.format("a/part"),
+                "source/a/part": SECRET.format("/secret.xml"),
+            },
+            "plain relative",
+        ),
+        ({"source/main.xml": SPHERE, "source/../../x": ""}, "called"),
+        ({"source/main.xml": SPHERE, "source//x": ""}, "plain relative"),
+        ({"source/main.xml": "<robot name='r'/>"}, "not MJCF"),
+        (
+            {"source/main.xml": "<mujoco><extension>< plugin/></extension></mujoco>"},
+            "plugin",
+        ),
+        ({"source/main.xml": SPHERE.encode("utf-16")}, "utf-8"),
+        ({"source/other.xml": SPHERE}, "main.xml"),
+        ({"contents.json": "[]", "source/main.xml": SPHERE}, "format"),
+        ({"contents.json": '{"format": 2}'}, "format"),
+    ],
+)
+def test_a_hostile_zip_reads_and_writes_nothing_elsewhere(
+    directory: Path, members: dict[str, str | bytes], said: str
+) -> None:
+    """One clear error that names the file."""
+    with pytest.raises(UnreadableFile, match=said):
+        foreign(directory, members)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("geom_bodyid", np.array([10**6], np.int32), "only compiling"),
+        ("geom_rgba", np.zeros((9, 4), np.float32), "another size"),
+        ("aura", np.zeros(1), "no field aura"),
+        ("opt.__class__", np.zeros(()), "no field"),
+        ("geom_rgba", np.array([[None] * 4]), "allow_pickle"),
+    ],
+)
+def test_hostile_fields_are_refused(
+    directory: Path, name: str, value: Any, said: str
+) -> None:
+    """Indices that MuJoCo would trust, objects, names of anything else."""
+    buffer = io.BytesIO()
+    np.save(buffer, value)
+    members = {"source/main.xml": SPHERE, f"fields/{name}.npy": buffer.getvalue()}
+    with pytest.raises(UnreadableFile, match=said):
+        foreign(directory, members)
+
+
+def test_a_bomb_of_a_zip_is_not_unpacked(directory: Path) -> None:
+    """Also where it lies about its size."""
+    with pytest.raises(UnreadableFile, match="no model needs that"):
+        foreign(directory, {"source/main.xml": SPHERE, "source/x": bytes(80 << 20)})
+
+
+def test_a_bomb_of_a_compiled_model_is_not_unpacked(directory: Path) -> None:
+    """It is read up to the size that was recorded."""
+    facts = stored(directory, sphere())
+    (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(1 << 20)))
+    with pytest.raises(UnreadableFile, match="it holds more, not the recorded"):
+        load_model(directory, facts)
+    with pytest.raises(UnreadableFile, match="recorded size is"):
+        load_model(directory, {**facts, "bytes": 1 << 50})
+
+
+@pytest.mark.parametrize("kind", ["mjb", "xml"])
+@pytest.mark.parametrize("damage", ["truncated", "changed", "empty"])
+def test_a_damaged_file_is_one_clear_error(
+    directory: Path, mjcf: Path, kind: str, damage: str
+) -> None:
+    """MuJoCo itself never sees it."""
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    facts = stored(directory, model, authored_from_file(mjcf))
+    path = directory / facts[kind]
+    content = path.read_bytes()
+    middle = len(content) // 2
+    changed = {
+        "truncated": content[:middle],
+        "changed": content[:middle] + b"\xff\x00\xff" + content[middle + 3 :],
+        "empty": b"",
+    }
+    path.write_bytes(changed[damage])
+    load = load_model if kind == "mjb" else from_source
+    with pytest.raises(UnreadableFile, match=path.name):
+        load(directory, {**facts, "xml": facts["xml"] if kind == "xml" else None})
+
+
+def test_a_damaged_compiled_model_is_compiled_again(
+    directory: Path, mjcf: Path
+) -> None:
+    """Where its sources are there and sound."""
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    facts = stored(directory, model, authored_from_file(mjcf))
+    (directory / facts["mjb"]).write_bytes(b"?")
+    assert load_model(directory, facts).nmesh == 1
+
+
+@pytest.mark.parametrize(
+    "name", ["../openaigym.model.0123456789abcdef.zip", "/etc/passwd", 7, "model.zip"]
+)
+def test_facts_cannot_name_a_file_elsewhere(directory: Path, name: object) -> None:
+    """Only a model's name, in the recording's directory."""
+    facts = stored(directory, sphere())
+    for kind in ("mjb", "xml"):
+        with pytest.raises(UnreadableFile, match="which is no name"):
+            load_model(directory, {**facts, kind: name})
+
+
+def test_a_missing_model_says_where_it_belongs(directory: Path) -> None:
+    """The recording was copied without it."""
+    facts = stored(directory, sphere())
+    (directory / facts["mjb"]).unlink()
+    with pytest.raises(UnreadableFile, match="belongs beside the recording"):
+        load_model(directory, facts)
+
+
+@pytest.mark.skipif(
+    not hasattr(mujoco, "mj_embedAssets"), reason="no textures by reference before 3.17"
+)
+def test_textures_by_reference_are_stored_with_the_model(
+    directory: Path, mjcf: Path
+) -> None:
+    """The files that it refers to may be gone when it is loaded."""
+    mjcf.write_text(MAIN.replace("<compiler ", '<compiler passthrough="textures" '))
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    assert model.ntexdata == 0
+    facts = stored(directory, model, authored_from_file(mjcf))
+    shutil.rmtree(mjcf.parents[1])
+    for again in (load_model(directory, facts), from_source(directory, facts)):
+        assert again.ntexdata == 48
