@@ -15,7 +15,12 @@ from ..simulation.scene_pictures import (
     option_without_rangefinder,
 )
 
-__all__ = ["PhysicsPictures", "dm_control_pictures"]
+__all__ = [
+    "PhysicsPictures",
+    "dm_control_pictures",
+    "drawn_by_physics",
+    "picture_size",
+]
 
 # The size of `physics.render()` where none is asked for.
 _HEIGHT, _WIDTH = 240, 320
@@ -44,11 +49,8 @@ def dm_control_pictures(
         UnknownName: the model has no such camera.
         InvalidArgument: a number or a size that cannot be.
     """
-    height, width = check_size(
-        _HEIGHT if height is None else height, _WIDTH if width is None else width
-    )
-    named = camera is None or isinstance(camera, str | int)
-    if not named or not _fits(env.physics, height, width):
+    height, width = picture_size(height, width)
+    if not drawn_by_physics(env.physics, camera, height, width):
         return ScenePictures(
             lambda: (env.physics.model, env.physics.data),
             look=lambda: Look(scene_option=option_without_rangefinder()),
@@ -104,6 +106,19 @@ class PhysicsPictures:
         """Do nothing: the environment closes what it draws with."""
 
 
-def _fits(physics: Any, height: int, width: int) -> bool:
+def picture_size(height: int | None, width: int | None) -> tuple[int, int]:
+    """Return `(height, width)` with dm_control's default for what is None.
+
+    Raises:
+        InvalidArgument: a size that cannot be.
+    """
+    return check_size(
+        _HEIGHT if height is None else height, _WIDTH if width is None else width
+    )
+
+
+def drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> bool:
+    """Tell whether `physics.render()` draws such pictures."""
     buffer = physics.model.vis.global_
-    return bool(height <= buffer.offheight and width <= buffer.offwidth)
+    named = camera is None or isinstance(camera, str | int)
+    return bool(named and height <= buffer.offheight and width <= buffer.offwidth)

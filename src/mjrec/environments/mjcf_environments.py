@@ -84,6 +84,12 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         UnreadableFile: MuJoCo refuses the file.
         UnknownName: the model has no such camera.
         InvalidArgument: a camera, size or render mode that cannot be.
+
+    Attributes:
+        path: of the MJCF file.
+        camera: that is shown.
+        height: of the pictures, in pixels.
+        width: likewise.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 60}  # noqa: RUF012  Gymnasium's own declaration
@@ -103,13 +109,14 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
                 f'render_mode must be "rgb_array" or None, got {render_mode!r}.'
             )
         self.render_mode = render_mode
-        self._size = check_size(height, width)
-        self.simulation = MjcfSimulation(Path(path))
+        self.height, self.width = check_size(height, width)
+        self.path = Path(path)
+        self.simulation = MjcfSimulation(self.path)
         model = self.simulation.model
         self.camera = default_camera(model) if camera is None else camera
         resolve_camera(model, self.camera)
         self.metadata = {**self.metadata, "render_fps": _plain(self._frame_rate)}
-        self.spec = _spec(Path(path))
+        self.spec = _spec(self.path)
         self.observation_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (model.nq + model.nv + model.na,), np.float64
         )
@@ -152,9 +159,11 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
                 'Make the environment with render_mode="rgb_array" to render it.'
             )
         if self._renderer is None:
-            height, width = self._size
             self._renderer = SceneRenderer(
-                self.simulation.model, height=height, width=width, camera=self.camera
+                self.simulation.model,
+                height=self.height,
+                width=self.width,
+                camera=self.camera,
             )
         return self._renderer.render(self.simulation.data)
 

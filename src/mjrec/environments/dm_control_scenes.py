@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The states of a dm_control environment, from which its pictures follow."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dm_control.mujoco import wrapper
+
+from ..simulation.cameras import FREE_CAMERA, raw_data, raw_model, resolve_camera
+from ..simulation.episode_states import EpisodeStates
+from ..simulation.model_store import AuthoredModel
+from ..simulation.scene_pictures import camera_label, option_without_rangefinder
+from ..simulation.scene_view import SceneView
+from ..simulation.viewer_settings import place_free_camera
+from .dm_control_contexts import ContextsOnDemand
+from .dm_control_pictures import drawn_by_physics, picture_size
+from .scenes import Scenes, class_name, generator_state, is_defined_by, overriding_class
+
+__all__ = ["dm_control_scenes"]
+
+_SUITE = "dm_control/"
+
+# Of ScenePictures, which draws what `physics.render()` cannot.
+_MAX_GEOM = 10000
+
+
+def dm_control_scenes(
+    env: Any,
+    *,
+    camera: Any = None,
+    height: int | None = None,
+    width: int | None = None,
+    env_id: str | None = None,
+) -> Scenes:
+    """Return how the states of a dm_control environment are recorded.
+
+    Args:
+        env: an environment with dm_control's `physics`.
+        camera: a name or number, or an `MjvCamera`; None is dm_control's default, the
+            free camera.
+        height: in pixels; None is 240, dm_control's default.
+        width: in pixels; None is 320, likewise.
+        env_id: `dm_control/<domain>-<task>`, of a task of the suite.
+
+    The pictures are those of `physics.render()`, or where that draws no such picture
+    (see `dm_control_pictures`) those of the same scene.
+
+    Raises:
+        UnknownName: the model has no such camera.
+        InvalidArgument: a camera number, or a size, that cannot be.
+    """
+    height, width = picture_size(height, width)
+    by_physics = drawn_by_physics(env.physics, camera, height, width)
+    scene = _PhysicsScene(
+        env,
+        camera=FREE_CAMERA if camera is None else camera,
+        size=(height, width),
+        by_physics=by_physics,
+    )
+    return Scenes(
+        states=EpisodeStates(
+            lambda: (raw_model(env.physics.model), raw_data(env.physics.data)),
+            view=scene,
+            resetting=ContextsOnDemand(env).resetting,
+            authored=lambda: _authored(env),
+        ),
+        obstacle=_obstacle(env.physics) if by_physics else None,
+        environment=_environment(env_id),
+        random_state=lambda: _random_state(env),
+    )
+
+
+class _PhysicsScene:
+    """The scene as `physics.render()` shows it.
+
+    Args:
+        env: the environment; its physics may be another one at each call.
+        camera: a name or number, or an `MjvCamera`.
+        size: `(height, width)` in pixels.
+        by_physics: whether it is `physics.render()` that draws such pictures.
+    """
+
+    def __init__(
+        self, env: Any, *, camera: Any, size: tuple[int, int], by_physics: bool
+    ) -> None:
+        self._env = env
+        self._camera = camera
+        self._size = size
+        self._by_physics = by_physics
+        self._option = option_without_rangefinder()
+        self._start(env.physics.model)
+
+    def __call__(self) -> SceneView:
+        """Return what is shown now; the same object as long as the model is."""
+        model = self._env.physics.model
+        if raw_model(model) is not self._model:
+            self._start(model)
+        if self._camera == FREE_CAMERA:
+            # It moves with the model's fields, at every picture.
+            place_free_camera(self._model, self._view.camera)
+        return self._view
+
+    def _start(self, model: Any) -> None:
+        self._model = raw_model(model)
+        height, width = self._size
+        self._view = SceneView(
+            camera=resolve_camera(self._model, self._camera),
+            option=self._option,
+            max_geom=_max_geom(model) if self._by_physics else _MAX_GEOM,
+            # Each `physics.render()` makes one.
+            fresh=self._by_physics,
+            height=height,
+            width=width,
+            label=camera_label(self._model, self._camera),
+        )
+
+
+def _max_geom(model: Any) -> int:
+    # What dm_control chooses is known only to its scenes.
+    return int(wrapper.MjvScene(model).maxgeom)
+
+
+def _obstacle(physics: Any) -> str | None:
+    # Composer's is a weak proxy, whose own class says nothing.
+    kind = physics.__class__
+    if "render" in physics.__dict__:
+        return f"the physics {class_name(kind)} overrides render()"
+    if is_defined_by(kind.render, "dm_control.mujoco.engine", "Physics.render"):
+        return None
+    return f"the physics {overriding_class(kind, 'render')} overrides render()"
+
+
+def _authored(env: Any) -> AuthoredModel | None:
+    """Return the MJCF that composer has compiled; suite tasks keep none."""
+    root = getattr(getattr(env, "task", None), "root_entity", None)
+    if root is None:
+        return None
+    mjcf = root.mjcf_model
+    text = mjcf.to_xml_string().encode()
+    return AuthoredModel("model.xml", {"model.xml": text, **mjcf.get_assets()})
+
+
+def _environment(env_id: str | None) -> dict[str, Any] | None:
+    if env_id is None or not env_id.startswith(_SUITE):
+        return None
+    # With which arguments it was made, it does not say.
+    return {"framework": "dm_control", "id": env_id, "kwargs": None}
+
+
+def _random_state(env: Any) -> Any:
+    """Return the state of what the environment draws its random numbers from."""
+    # Of the suite's tasks, and of composer's environments.
+    for holder, name in ((getattr(env, "task", None), "random"), (env, "random_state")):
+        state = generator_state(getattr(holder, name, None))
+        if state is not None:
+            return state
+    return None

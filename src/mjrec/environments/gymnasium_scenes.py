@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The states of a Gymnasium environment, and whether its pictures follow from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+from ..simulation.inside import simulation_in
+from .robotics_scenes import drawn_part, has_known_render, picture_moment
+from .scenes import (
+    Scenes,
+    class_name,
+    generator_state,
+    is_defined_by,
+    overriding_class,
+    plain_arguments,
+)
+
+if TYPE_CHECKING:
+    from ..simulation.episode_states import EpisodeStates
+    from ..simulation.model_store import AuthoredModel
+    from .viewer_scene import ViewerScene
+
+__all__ = ["gymnasium_scenes"]
+
+_MUJOCO_ENV = ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render")
+_RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
+_RENDERER = (_RENDERING, "MujocoRenderer.render")
+
+# Wrappers whose `render` gives what it gets. RecordVideo's does so for single
+# pictures; array conversion changes what holds the numbers, not the numbers.
+_PASSING_ON = (
+    ("gymnasium.core", "Wrapper.render"),
+    ("gymnasium.wrappers.common", "OrderEnforcing.render"),
+    ("gymnasium.wrappers.common", "PassiveEnvChecker.render"),
+    ("gymnasium.wrappers.rendering", "RecordVideo.render"),
+    ("gymnasium.wrappers.array_conversion", "ArrayConversion.render"),
+)
+
+
+def gymnasium_scenes(
+    env: gymnasium.Env[Any, Any],
+    *,
+    camera: Any = None,
+    height: int | None = None,
+    width: int | None = None,
+) -> Scenes:
+    """Return how the states of a Gymnasium environment are recorded.
+
+    Args:
+        env: the environment as the user wrapped it.
+        camera: a name or number, or an `MjvCamera`; None is the one that the
+            environment itself shows.
+        height: in pixels; None is the environment's own.
+        width: likewise.
+
+    With none of the three the pictures are those of `env.render()`, and what overrides
+    `render` is an obstacle. With one of them the pictures are of the scene, and
+    nothing that a wrapper draws on top is in them, live or later.
+
+    Raises:
+        UnknownName: the model has no such camera.
+        InvalidArgument: a camera number, or a size, that cannot be.
+    """
+    view = {"camera": camera, "height": height, "width": width}
+    own_view = any(asked is not None for asked in view.values())
+    base: Any = env.unwrapped
+    scenes = _mjcf(base, view) if _is_mjcf(base) else _scenes(env, base, view)
+    obstacle = None if own_view else _override_above(env) or scenes.obstacle
+    return dataclasses.replace(scenes, obstacle=obstacle)
+
+
+def _is_mjcf(base: Any) -> bool:
+    # Not imported: the module loads mujoco.
+    module = sys.modules.get("mjrec.environments.mjcf_environments")
+    return module is not None and isinstance(base, module.MjcfEnvironment)
+
+
+def _mjcf(base: Any, view: dict[str, Any]) -> Scenes:
+    from .mjcf_scenes import mjcf_scenes
+
+    return mjcf_scenes(base, **view)
+
+
+def _scenes(env: gymnasium.Env[Any, Any], base: Any, view: dict[str, Any]) -> Scenes:
+    shown = drawn_part(base)
+    simulated = shown if simulation_in(shown) is shown else simulation_in(env)
+    return Scenes(
+        states=None if simulated is None else _states(simulated, view),
+        obstacle=_obstacle(base, shown),
+        environment=_environment(base),
+        random_state=lambda: _random_state(base, shown),
+    )
+
+
+def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
+    """Return which wrapper of an environment does not show what is inside it."""
+    mode = env.render_mode
+    while isinstance(env, gymnasium.Wrapper):
+        if "render" in vars(env):
+            return f"the wrapper {class_name(type(env))} overrides render()"
+        render = type(env).render
+        if not any(is_defined_by(render, *known) for known in _PASSING_ON):
+            kind = overriding_class(type(env), "render")
+            return f"the wrapper {kind} overrides render()"
+        env = env.env
+    return _wrong_mode(mode)
+
+
+def _obstacle(base: Any, shown: Any) -> str | None:
+    """Return why an environment without wrappers does not show just its simulation."""
+    for part in (base, shown):
+        if "render" in vars(part):
+            return f"the environment {class_name(type(part))} overrides render()"
+    render = type(shown).render
+    if not (has_known_render(shown) or is_defined_by(render, *_MUJOCO_ENV)):
+        kind = overriding_class(type(shown), "render")
+        return f"the environment {kind} overrides render()"
+    renderer = getattr(shown, "mujoco_renderer", None)
+    return _wrong_mode(shown.render_mode) or _foreign_renderer(renderer)
+
+
+def _wrong_mode(mode: str | None) -> str | None:
+    if mode in (None, "rgb_array"):
+        return None
+    return (
+        f"its render_mode is {mode!r}, and only the pictures of 'rgb_array' follow "
+        "from states"
+    )
+
+
+def _foreign_renderer(renderer: Any) -> str | None:
+    kind = type(renderer)
+    own = is_defined_by(getattr(kind, "render", None), *_RENDERER)
+    if own and kind.__module__ == _RENDERING and "render" not in vars(renderer):
+        return None
+    return f"the renderer {class_name(kind)} is not Gymnasium's own"
+
+
+def _states(simulated: Any, view: dict[str, Any]) -> EpisodeStates:
+    # Loaded where there is a simulation, and so mujoco, already: importing mujoco
+    # settles its OpenGL backend, which is not ours to do for a CartPole.
+    from ..simulation.episode_states import EpisodeStates
+    from .viewer_scene import ViewerScene
+
+    scene = ViewerScene(simulated, **view)
+    own_view = any(asked is not None for asked in view.values())
+    return EpisodeStates(
+        lambda: (simulated.model, simulated.data),
+        view=scene,
+        at_picture=_at_picture(simulated, scene),
+        authored=lambda: _authored(simulated),
+        obstacle=None if own_view else scene.obstacle,
+    )
+
+
+def _at_picture(
+    simulated: Any, scene: ViewerScene
+) -> Callable[[Callable[[], None]], None]:
+    moment = picture_moment(simulated)
+
+    def settle_and_capture(capture: Callable[[], None]) -> None:
+        scene.settle()
+        capture()
+
+    if moment is None:
+        return settle_and_capture
+    return lambda capture: moment(lambda: settle_and_capture(capture))
+
+
+def _authored(simulated: Any) -> AuthoredModel | None:
+    from ..simulation.model_store import authored_from_file
+
+    path = getattr(simulated, "fullpath", None)
+    return None if path is None else authored_from_file(Path(path))
+
+
+def _environment(base: gymnasium.Env[Any, Any]) -> dict[str, Any] | None:
+    # The innermost environment has the spec itself; wrappers copy it.
+    if base.spec is None:
+        return None
+    return {
+        "framework": "gymnasium",
+        "id": base.spec.id,
+        "kwargs": plain_arguments(base.spec.kwargs),
+    }
+
+
+def _random_state(base: Any, shown: Any) -> Any:
+    """Return the state of the environment's generator, and of one inside it."""
+    # Gymnasium's own property would make one.
+    own = generator_state(base._np_random)
+    if shown is base:
+        return own
+    return {"env": own, "inner": generator_state(shown._np_random)}

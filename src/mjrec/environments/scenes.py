@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a monitor needs to know of an environment to record its states."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..simulation.episode_states import EpisodeStates
+
+__all__ = [
+    "Scenes",
+    "class_name",
+    "generator_state",
+    "is_defined_by",
+    "overriding_class",
+    "plain_arguments",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenes:
+    """How an environment's states are recorded, and whether pictures follow from them.
+
+    Attributes:
+        states: takes them down; None where no MuJoCo simulation can be seen.
+        obstacle: why what the environment shows cannot be drawn from its states, as a
+            clause that names the class that overrides; None where nothing but a lack
+            of states is in the way.
+        environment: what it takes to make the environment again: `framework`
+            (`"gymnasium"`, `"dm_control"` or `"mjcf"`), `id` and `kwargs` (None where
+            they are unknown, or more than JSON can hold); None where it has no name.
+        random_state: returns the state of the environment's random generators now, as
+            JSON can hold it; None where there is none yet. It makes none.
+    """
+
+    states: EpisodeStates | None = None
+    obstacle: str | None = None
+    environment: dict[str, Any] | None = None
+    random_state: Callable[[], Any] = lambda: None
+
+
+def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
+    """Tell whether a function is the one that a module's own source defines.
+
+    What was put in its place (a function of that name from elsewhere, also under a
+    decorator that copies names) is not.
+
+    Args:
+        function: a function, or anything.
+        module: its full name. It is not imported: what is in use is loaded.
+        qualified_name: of the function in it, for example `Wrapper.render`.
+    """
+    loaded = sys.modules.get(module)
+    code = getattr(function, "__code__", None)
+    return (
+        loaded is not None
+        and getattr(function, "__globals__", None) is vars(loaded)
+        and getattr(code, "co_qualname", None) == qualified_name
+    )
+
+
+def overriding_class(kind: type, name: str) -> str:
+    """Return the full name of the class that gives `kind` its method `name`."""
+    return class_name(next((k for k in kind.__mro__ if name in vars(k)), kind))
+
+
+def class_name(kind: type) -> str:
+    """Return the full name of a class."""
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def generator_state(generator: Any) -> Any:
+    """Return the state of one of NumPy's random generators, as JSON can hold it.
+
+    Args:
+        generator: a `Generator`, a `RandomState`, or None, whose state is None.
+    """
+    if isinstance(generator, np.random.Generator):
+        return _lists(generator.bit_generator.state)
+    if isinstance(generator, np.random.RandomState):
+        return _lists(generator.get_state(legacy=False))
+    return None
+
+
+def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return arguments as JSON can hold them; None if one of them is more than that.
+
+    Tuples become lists, and NumPy's scalars the numbers that they hold.
+    """
+    try:
+        return {_text(name): _plain(value) for name, value in arguments.items()}
+    except TypeError:
+        return None
+
+
+def _lists(value: Any) -> Any:
+    """Return `value` with lists and plain numbers for NumPy's."""
+    if isinstance(value, dict):
+        return {name: _lists(item) for name, item in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, Mapping):
+        return {_text(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float) and math.isfinite(value):
+        return value
+    raise TypeError(value)
+
+
+def _text(name: Any) -> str:
+    if not isinstance(name, str):
+        raise TypeError(name)
+    return name

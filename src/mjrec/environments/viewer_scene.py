@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scene that Gymnasium's off-screen viewer shows, whether there is one or not.
+
+Imports mujoco, by way of the simulation: load it only where there is a simulation.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..frames import check_size
+from ..simulation.cameras import FREE_CAMERA, resolve_camera
+from ..simulation.scene_pictures import camera_label
+from ..simulation.scene_view import SceneView
+from ..simulation.viewer_settings import (
+    new_scene_flags,
+    place_free_camera,
+    shown_camera,
+    viewer_camera,
+    viewer_option,
+)
+from .scenes import class_name, is_defined_by
+
+__all__ = ["ViewerScene"]
+
+_MODE = "rgb_array"
+_RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
+
+# Gymnasium's default, for environments that do not say.
+_SIDE = 480
+
+# Of our own renderer, where the environment has none.
+_MAX_GEOM = 10000
+
+
+class ViewerScene:
+    """What an environment's viewer shows.
+
+    Where the environment has a viewer for `rgb_array`, that is the viewer's own camera
+    and options, whatever the user makes of them. Until then it is what a viewer made
+    at the first picture would show, for as long as the environment lives.
+
+    Args:
+        simulated: has MuJoCo's `model` and `data` and, if it is one of Gymnasium's
+            environments, `mujoco_renderer`.
+        camera: a name or number, or an `MjvCamera`; None is the environment's own.
+        height: in pixels; None is the environment's own.
+        width: likewise.
+
+    Raises:
+        UnknownName: the model has no such camera.
+        InvalidArgument: a camera number, or a size, that cannot be.
+    """
+
+    def __init__(
+        self, simulated: Any, *, camera: Any, height: int | None, width: int | None
+    ) -> None:
+        self._simulated = simulated
+        self._asked = camera
+        self._named: Any = None
+        self._first: Any = None
+        self._view: SceneView | None = None
+        self._height, self._width = check_size(
+            _own_side(simulated, "height") if height is None else height,
+            _own_side(simulated, "width") if width is None else width,
+        )
+        self._start()
+
+    def __call__(self) -> SceneView:
+        """Return what is shown now; the same object as long as nothing is another."""
+        self._follow()
+        camera, option = self._camera(), self._shown_option()
+        view = self._view
+        if view is None or view.camera is not camera or view.option is not option:
+            view = self._view = self._made(camera, option)
+        return view
+
+    def settle(self) -> None:
+        """Keep the camera of this moment, if it is the first picture's."""
+        self._follow()
+        if self._first is None:
+            self._first = self._new_camera()
+
+    def obstacle(self) -> str | None:
+        """Return why the viewer's picture of this moment would show something else."""
+        self._follow()
+        renderer, viewer = self._renderer, self._viewer()
+        if renderer is not None and renderer.model is not self._model:
+            return "the renderer draws another model than the environment simulates"
+        return None if viewer is None else _addition(viewer, self._new_flags)
+
+    def _start(self) -> None:
+        self._model = self._simulated.model
+        self._renderer = getattr(self._simulated, "mujoco_renderer", None)
+        if self._asked is not None:
+            self._named = resolve_camera(self._model, self._asked)
+        self._option = viewer_option(getattr(self._renderer, "_vopt", None))
+        self._new_flags = new_scene_flags(self._model)
+        self._first = None
+        self._view = None
+
+    def _follow(self) -> None:
+        """Start anew where the environment has another model, or renderer."""
+        renderer = getattr(self._simulated, "mujoco_renderer", None)
+        if renderer is not self._renderer or self._simulated.model is not self._model:
+            self._start()
+
+    def _viewer(self) -> Any:
+        # Other modes' viewers have cameras of their own.
+        viewers = getattr(self._renderer, "_viewers", None)
+        return viewers.get(_MODE) if viewers else None
+
+    def _camera(self) -> Any:
+        if self._asked is None:
+            return self._own_camera()
+        if self._asked == FREE_CAMERA:
+            place_free_camera(self._model, self._named)
+        return self._named
+
+    def _own_camera(self) -> Any:
+        viewer = self._viewer()
+        if viewer is None:
+            return shown_camera(self._first or self._new_camera(), self._camera_id)
+        return shown_camera(viewer.cam, self._camera_id)
+
+    def _new_camera(self) -> Any:
+        renderer = self._renderer
+        if renderer is None:
+            return resolve_camera(self._model, FREE_CAMERA)
+        config = getattr(renderer, "default_cam_config", None)
+        camera = viewer_camera(self._model, self._simulated.data, config)
+        return shown_camera(camera, self._camera_id)
+
+    @property
+    def _camera_id(self) -> int | None:
+        return getattr(self._renderer, "camera_id", None)
+
+    def _shown_option(self) -> Any:
+        viewer = self._viewer()
+        return self._option if viewer is None else viewer.vopt
+
+    def _made(self, camera: Any, option: Any) -> SceneView:
+        return SceneView(
+            camera=camera,
+            option=option,
+            max_geom=getattr(self._renderer, "max_geom", _MAX_GEOM),
+            fresh=False,
+            height=self._height,
+            width=self._width,
+            label=camera_label(
+                self._model, camera if self._asked is None else self._asked
+            ),
+        )
+
+
+def _own_side(simulated: Any, name: str) -> int:
+    renderer = getattr(simulated, "mujoco_renderer", None)
+    side = getattr(renderer, name, None) or getattr(simulated, name, None)
+    return int(side or _SIDE)
+
+
+def _addition(viewer: Any, new_flags: bytes) -> str | None:
+    """Return what a viewer shows besides the scene; None for nothing."""
+    if viewer._markers:
+        return "markers were added to the viewer"
+    if viewer._overlays:
+        return "text was laid over the viewer's pictures"
+    if viewer.pert.select or viewer.pert.active:
+        return "a body is selected in the viewer"
+    if viewer.scn.flags.tobytes() != new_flags:
+        return "rendering flags of the viewer's scene were changed"
+    render = type(viewer).render
+    if "render" in vars(viewer) or not is_defined_by(
+        render, _RENDERING, "OffScreenViewer.render"
+    ):
+        return f"the viewer {class_name(type(viewer))} is not Gymnasium's own"
+    return None
