@@ -55,6 +55,8 @@ if TYPE_CHECKING:
     from .results import merge_stats_files as merge_stats_files
     from .schedules import capped_cubic_video_schedule as capped_cubic_video_schedule
     from .schedules import disable_videos as disable_videos
+    from .simulation.trajectories import Trajectory as Trajectory
+    from .simulation.trajectories import load_trajectory as load_trajectory
 
 _LAZY = {
     "DmEnvMonitor": "monitors.dm_env_monitor",
@@ -62,6 +64,7 @@ _LAZY = {
     "GymnasiumMonitor": "monitors.gymnasium_monitor",
     "Monitor": "monitors",
     "StatsRecorder": "recorder.stats_recorder",
+    "Trajectory": "simulation.trajectories",
     "VideoRecorder": "recorder.video_recorder",
     "VideoWriter": "formats.video_writer",
     "capped_cubic_video_schedule": "schedules",
@@ -71,6 +74,7 @@ _LAZY = {
     "disable_videos": "schedules",
     "iter_episodes": "results",
     "load_results": "results",
+    "load_trajectory": "simulation.trajectories",
     "merge_stats_files": "results",
     "save_video": "formats.frames_to_videos",
     "use_gl": "gl",
@@ -105,6 +109,7 @@ __all__ = [
     "ResetNeeded",
     "ResetNotAllowed",
     "StatsRecorder",
+    "Trajectory",
     "UnknownName",
     "UnreadableFile",
     "VideoRecorder",
@@ -116,6 +121,7 @@ __all__ = [
     "disable_videos",
     "iter_episodes",
     "load_results",
+    "load_trajectory",
     "merge_stats_files",
     "save_video",
     "use_gl",

@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded episodes are read back as arrays, and replayed bit for bit."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+import mjrec
+from mjrec.errors import InvalidArgument, UnknownName, UnreadableFile
+from mjrec.formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
+from mjrec.formats.trajectory_file import finish_trajectory
+from mjrec.formats.trajectory_log import TrajectoryLogWriter
+from mjrec.simulation.integration_state import STATE_SPEC, state_components
+from mjrec.simulation.model_store import ModelStore
+
+HALF_CHEETAH = (
+    Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml"
+).read_text()
+
+# Without the solver's warm start the next step is another one: a heap, few iterations.
+HEAP = """
+<mujoco>
+  <option iterations="3" solver="CG" timestep="0.005"/>
+  <worldbody>
+    <geom type="plane" size="1 1 .1"/>
+    <body pos="0 0 .2"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+    <body pos=".05 0 .4"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+    <body name="arm" pos="0 .05 .6">
+      <joint name="turn" axis="0 1 0"/><geom type="box" size=".1 .1 .1"/>
+    </body>
+  </worldbody>
+  <actuator><general joint="turn" dyntype="filter" dynprm=".1" gainprm="5"/></actuator>
+</mujoco>
+"""
+MODELS = {"half_cheetah": HALF_CHEETAH, "heap": HEAP}
+
+SUBSTEPS = 5
+SNAPSHOT = RowLayout.packed([("geom_xpos", Array("<f8", (2, 3)))])
+
+
+def state(model: Any, data: Any) -> Any:
+    row = np.empty(mujoco.mj_stateSize(model, STATE_SPEC))
+    mujoco.mj_getState(model, data, row, STATE_SPEC)
+    return row
+
+
+class Recording:
+    """The log of an episode with random controls, as a recorder writes it.
+
+    A frame is taken after every second step; changes are of the model, by steps.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        model: Any,
+        *,
+        steps: int = 12,
+        changes: Mapping[int, Mapping[str, Any]] | None = None,
+        **facts: Any,
+    ) -> None:
+        self.states: list[Any] = []
+        self.actions = np.random.default_rng(5).uniform(-1, 1, (steps, model.nu))
+        store = ModelStore(directory)
+        header = TrajectoryHeader(
+            facts={"model": store.add(model), "env_id": "Heap-v0", **facts},
+            state=state_components(model),
+            snapshot=SNAPSHOT,
+            action=Array("<f8", (model.nu,)),
+            observation=Array("<f4", (3,)),
+        )
+        store.finish()
+        self.path = directory / "openaigym.trajectory.0.7.episode000003.log"
+        self._writer = TrajectoryLogWriter(self.path, header)
+        for step, fields in (changes or {}).items():
+            values = {name: np.asarray(value) for name, value in fields.items()}
+            self._writer.add_model_change(ModelChange(step=step, fields=values))
+        self._simulate(model, steps)
+        self._writer.add_facts({"complete": True})
+        self._writer.close()
+
+    def _simulate(self, model: Any, steps: int) -> None:
+        data = mujoco.MjData(model)
+        # As a reset that lets things settle: it leaves a warm start behind.
+        mujoco.mj_step(model, data, nstep=40)
+        self._add(model, data, 0)
+        for step in range(1, steps + 1):
+            data.ctrl[:] = self.actions[step - 1]
+            mujoco.mj_step(model, data, nstep=SUBSTEPS)
+            self._add(model, data, step)
+
+    def _add(self, model: Any, data: Any, step: int) -> None:
+        row = self._writer.step_row(step, 0.5 * step, step == 12, False)
+        self.states.append(state(model, data))
+        action = self.actions[max(step - 1, 0)]
+        observation = np.full(3, step, np.float32)
+        parts = (self.states[-1], action, observation)
+        row[:] = np.frombuffer(b"".join(map(bytes, parts)), np.uint8)
+        if step % 2 == 0:
+            frame = self._writer.frame_row(step)
+            frame[:] = np.full((2, 3), step, np.float64).reshape(-1).view(np.uint8)
+
+
+def model_of(name: str) -> Any:
+    return mujoco.MjModel.from_xml_string(MODELS[name])
+
+
+def finished(recording: Recording) -> Path:
+    return finish_trajectory(recording.path)
+
+
+def as_is(recording: Recording) -> Path:
+    return recording.path
+
+
+@pytest.mark.parametrize("form", [as_is, finished])
+def test_everything_is_there_as_arrays(tmp_path: Path, form: Any) -> None:
+    """Of the log and of the finished file alike, with the documented shapes."""
+    environment = {"framework": "gymnasium", "id": "Heap-v0", "kwargs": {}}
+    facts = {"episode_id": 3, "seed": 7, "environment": environment}
+    recording = Recording(tmp_path, model_of("heap"), **facts)
+    trajectory = mjrec.load_trajectory(str(form(recording)))
+    assert trajectory.path == form(recording)
+    assert isinstance(trajectory, mjrec.Trajectory)
+    assert len(trajectory) == 12
+    np.testing.assert_array_equal(trajectory.states, recording.states)
+    np.testing.assert_array_equal(trajectory.actions, recording.actions)
+    np.testing.assert_array_equal(trajectory.rewards, 0.5 * np.arange(1, 13))
+    assert trajectory.terminated.tolist() == [False] * 11 + [True]
+    assert not trajectory.truncated.any()
+    np.testing.assert_array_equal(
+        trajectory.observations,
+        np.repeat(np.arange(13, dtype=np.float32), 3).reshape(13, 3),
+    )
+    assert trajectory.frame_steps.tolist() == [0, 2, 4, 6, 8, 10, 12]
+    np.testing.assert_array_equal(
+        trajectory.snapshots["geom_xpos"][:, 1, 2], trajectory.frame_steps
+    )
+    assert trajectory.snapshots["geom_xpos"].shape == (7, 2, 3)
+    assert (trajectory.episode_id, trajectory.seed) == (3, 7)
+    assert (trajectory.env_id, trajectory.environment) == ("Heap-v0", environment)
+    assert trajectory.complete
+    assert trajectory.dropped == 0
+    assert "Heap-v0, 12 steps" in repr(trajectory)
+
+
+def test_states_are_told_by_component(tmp_path: Path) -> None:
+    """By MuJoCo's names; another name is an error that lists them."""
+    model = model_of("heap")
+    trajectory = mjrec.load_trajectory(Recording(tmp_path, model).path)
+    assert trajectory.component("qpos").shape == (13, model.nq)
+    assert trajectory.component("warmstart").shape == (13, model.nv)
+    np.testing.assert_array_equal(trajectory.component("ctrl")[1:], trajectory.actions)
+    assert trajectory.time is not None
+    start = 40 * model.opt.timestep
+    expected = start + np.arange(13) * SUBSTEPS * model.opt.timestep
+    np.testing.assert_allclose(trajectory.time, expected)
+    assert {"time", "qpos", "qvel", "act", "ctrl"} <= set(trajectory.components)
+    with pytest.raises(UnknownName, match=r"no state component 'qqpos'.*qpos"):
+        trajectory.component("qqpos")
+
+
+@pytest.mark.parametrize("form", [as_is, finished])
+@pytest.mark.parametrize("name", MODELS)
+def test_each_state_follows_from_the_one_before(
+    tmp_path: Path, name: str, form: Any
+) -> None:
+    """Bit for bit, replayed as `Trajectory` says, in data that held something else."""
+    trajectory = mjrec.load_trajectory(form(Recording(tmp_path, model_of(name))))
+    model = trajectory.model()
+    data = mujoco.MjData(model)
+    for k in reversed(range(len(trajectory))):
+        trajectory.set_state(data, k)
+        np.testing.assert_array_equal(state(model, data), trajectory.states[k])
+        data.ctrl[:] = trajectory.component("ctrl")[k + 1]
+        mujoco.mj_step(model, data, nstep=SUBSTEPS)
+        np.testing.assert_array_equal(state(model, data), trajectory.states[k + 1])
+
+
+def test_the_warm_start_is_part_of_the_state(tmp_path: Path) -> None:
+    """Without it the heap goes on otherwise: what the test above is worth."""
+    trajectory = mjrec.load_trajectory(Recording(tmp_path, model_of("heap")).path)
+    model = trajectory.model()
+    data = mujoco.MjData(model)
+    trajectory.set_state(data, 5)
+    data.qacc_warmstart[:] = 0
+    data.ctrl[:] = trajectory.component("ctrl")[6]
+    mujoco.mj_step(model, data, nstep=SUBSTEPS)
+    assert (state(model, data) != trajectory.states[6]).any()
+
+
+def test_the_model_is_that_of_the_step(tmp_path: Path) -> None:
+    """Step 0 is what the reset set; later changes hold from their steps on."""
+    model = model_of("heap")
+    changes = {
+        0: {"geom_size": np.full((4, 3), 0.25), "opt.gravity": [0, 0, -1.5]},
+        4: {"geom_rgba": np.full((4, 4), 0.5, np.float32), "camera.distance": 2.0},
+        6: {"geom_rgba": np.full((4, 4), 0.75, np.float32)},
+    }
+    recording = Recording(tmp_path, model, changes=changes)
+    for form in (as_is, finished):
+        trajectory = mjrec.load_trajectory(form(recording))
+        first = trajectory.model()
+        np.testing.assert_array_equal(first.geom_size, np.full((4, 3), 0.25))
+        assert first.opt.gravity[2] == -1.5
+        np.testing.assert_array_equal(first.geom_rgba, model.geom_rgba)
+        shades = [trajectory.model(step=k).geom_rgba[0, 0] for k in (3, 4, 5, 6, -1)]
+        assert shades == [model.geom_rgba[0, 0], 0.5, 0.5, 0.75, 0.75]
+
+
+def test_steps_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    """The message says how many there are."""
+    trajectory = mjrec.load_trajectory(Recording(tmp_path, model_of("heap")).path)
+    data = mujoco.MjData(trajectory.model())
+    trajectory.set_state(data, -1)
+    assert data.time == trajectory.time[-1]
+    for step in (13, -14):
+        with pytest.raises(InvalidArgument, match="holds 13 states"):
+            trajectory.set_state(data, step)
+        with pytest.raises(InvalidArgument, match="holds 13 states"):
+            trajectory.model(step)
+
+
+def test_data_of_another_model_is_refused(tmp_path: Path) -> None:
+    """Nothing is set in it."""
+    trajectory = mjrec.load_trajectory(Recording(tmp_path, model_of("heap")).path)
+    data = mujoco.MjData(model_of("half_cheetah"))
+    with pytest.raises(InvalidArgument, match="qpos: 15, and this model has 9"):
+        trajectory.set_state(data, 0)
+
+
+def test_a_killed_recording_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    """Torn rows are counted, and it is incomplete."""
+    path = Recording(tmp_path, model_of("heap")).path
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    trajectory = mjrec.load_trajectory(path)
+    assert not trajectory.complete
+    assert len(trajectory.states) < 13
+    assert "incomplete" in repr(trajectory)
+
+
+def test_a_log_that_was_finished_meanwhile_goes_on(tmp_path: Path) -> None:
+    """Snapshots and model changes are read late."""
+    recording = Recording(tmp_path, model_of("heap"))
+    trajectory = mjrec.load_trajectory(recording.path)
+    finished(recording)
+    assert len(trajectory.snapshots["geom_xpos"]) == 7
+    assert trajectory.model().ngeom == 4
+
+
+def test_a_recording_without_a_simulation_has_no_model(tmp_path: Path) -> None:
+    """Its rewards are there all the same."""
+    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
+    writer = TrajectoryLogWriter(path, TrajectoryHeader(facts={"model": None}))
+    writer.step_row(0, 0.0, False, False)
+    writer.step_row(1, 2.5, True, False)
+    writer.close()
+    trajectory = mjrec.load_trajectory(path)
+    assert trajectory.rewards.tolist() == [2.5]
+    assert trajectory.time is None
+    assert trajectory.actions is None
+    with pytest.raises(UnreadableFile, match="without a MuJoCo simulation"):
+        trajectory.model()
+
+
+def test_a_directory_is_answered_with_what_is_in_it(tmp_path: Path) -> None:
+    """The names that could have been meant."""
+    with pytest.raises(InvalidArgument, match="holds no trajectories"):
+        mjrec.load_trajectory(tmp_path)
+    name = Recording(tmp_path, model_of("heap")).path.name
+    with pytest.raises(InvalidArgument, match=f"Name one of .*: {name}\\."):
+        mjrec.load_trajectory(tmp_path)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"something else"])
+def test_what_is_no_trajectory_is_one_clear_error(
+    tmp_path: Path, content: bytes | None
+) -> None:
+    """It names the file."""
+    path = tmp_path / "openaigym.trajectory.0.7.episode000000.h5"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UnreadableFile, match=path.name):
+        mjrec.load_trajectory(path)
+
+
+def test_reading_needs_no_simulator(tmp_path: Path) -> None:
+    """Arrays are read on a machine without mujoco; a model is not."""
+    path = finished(Recording(tmp_path, model_of("heap")))
+    code = (
+        "import sys; sys.modules.update(mujoco=None, gymnasium=None)\n"
+        "import mjrec\n"
+        f"t = mjrec.load_trajectory({str(path)!r})\n"
+        "print(len(t), t.component('qpos').shape, len(t.snapshots['geom_xpos']))\n"
+        "try: t.model()\n"
+        "except ModuleNotFoundError as error: print(error.name)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "12 (13, 15) 7\nmujoco\n"
