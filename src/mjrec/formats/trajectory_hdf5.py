@@ -11,6 +11,7 @@ that was the smallest form and the fastest to write: docs/decisions.md.)
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -82,13 +83,19 @@ def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
         FileNotWritten: the disk is full, or the directory is gone.
         UnreadableFile: what is read turned out to be damaged.
     """
+    # In memory, compressed as it will be in the file: the HDF5 library does not survive
+    # a write that fails (it crashes the process when it closes what is left).
+    image = io.BytesIO()
+    with h5py.File(image, "w", libver=_LIBVER) as file:
+        _write(file, reader)
     try:
-        with replacing(path) as temporary:
-            with h5py.File(temporary, "w", libver=_LIBVER, locking=False) as file:
-                _write(file, reader)
-            _synchronise(temporary)
-    except (OSError, RuntimeError) as error:
-        raise FileNotWritten(path, _reason(error)) from error
+        with replacing(path) as temporary, temporary.open("xb") as output:
+            output.write(image.getbuffer())
+            output.flush()
+            # The log is removed next: what it held must not be in a cache alone.
+            os.fsync(output.fileno())
+    except OSError as error:
+        raise FileNotWritten(path, error.strerror or error) from error
 
 
 class TrajectoryHdf5Reader(TrajectoryReader):
@@ -442,9 +449,3 @@ def _parts(dataset: Any) -> Iterator[tuple[int, int]]:
 
 def _rows_at_once(size: int) -> int:
     return max(1, _BUFFER_BYTES // max(1, size))
-
-
-def _synchronise(path: Path) -> None:
-    # The log is removed next: what it held must not be in a cache alone.
-    with path.open("rb") as file:
-        os.fsync(file.fileno())

@@ -83,7 +83,6 @@ STEP_PREFIX = struct.Struct("<qd??6x")
 FRAME_PREFIX = struct.Struct("<q")
 CHANGE_PREFIX = struct.Struct("<qQ")
 
-_CHECKSUM = struct.Struct("<I")
 _CHECKSUM_OFFSET = 4
 
 _Bytes = bytes | bytearray | memoryview
@@ -438,7 +437,6 @@ class _Block:
     def __init__(self, kind: bytes, prefix_size: int, filled: int) -> None:
         self._kind = kind
         self._prefix_size = prefix_size
-        self._filled = filled
         self._length = prefix_size + filled
         self._stride = RECORD_PREFIX.size + padded(self._length)
         self._seed = checksum_seed(kind, self._length)
@@ -450,6 +448,14 @@ class _Block:
         first = RECORD_PREFIX.size
         self.starts = range(first, first + len(self._bytes), self._stride)
         self.rows: list[NDArray[np.uint8]] = []
+        self._payloads: list[memoryview] = []
+        self._checksums: NDArray[np.uint32] = np.ndarray(
+            (self.capacity,),
+            np.dtype("<u4"),
+            buffer=self._bytes,
+            offset=_CHECKSUM_OFFSET,
+            strides=(self._stride,),
+        )
 
     def next_row(self) -> NDArray[np.uint8]:
         """Return the first row that was not used so far."""
@@ -457,19 +463,19 @@ class _Block:
         RECORD_PREFIX.pack_into(
             self.memory, start - RECORD_PREFIX.size, self._kind, 0, self._length
         )
-        start += self._prefix_size
-        row = self._bytes[start : start + self._filled]
+        end = start + self._length
+        row = self._bytes[start + self._prefix_size : end]
+        self._payloads[len(self.rows) :] = [self.memory[start:end]]
         self.rows.append(row)
         return row
 
     def finished(self, count: int) -> memoryview:
         """Return the first `count` records, with their checksums."""
-        memory, seed, length = self.memory, self._seed, self._length
-        for start in self.starts[:count]:
-            checksum = zlib.crc32(memory[start : start + length], seed)
-            offset = start - RECORD_PREFIX.size + _CHECKSUM_OFFSET
-            _CHECKSUM.pack_into(memory, offset, checksum)
-        return memory[: count * self._stride]
+        crc32, seed = zlib.crc32, self._seed
+        self._checksums[:count] = [
+            crc32(payload, seed) for payload in self._payloads[:count]
+        ]
+        return self.memory[: count * self._stride]
 
 
 _RowShape = tuple[tuple[StateComponent, ...], RowLayout, "Array | None", "Array | None"]
