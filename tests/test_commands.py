@@ -17,6 +17,9 @@ from recordings import frames_in, metadata_of
 
 from mjrec import load_results
 from mjrec.commands import main
+from mjrec.formats.journal import JournalEntry, JournalWriter
+from mjrec.formats.trajectory import TrajectoryHeader
+from mjrec.formats.trajectory_log import TrajectoryLogWriter
 
 PENDULUM = """
 <mujoco>
@@ -308,6 +311,37 @@ def test_list_json_is_a_line_for_each_episode(mjrec: Any, tmp_path: Path) -> Non
     assert [line["episode_id"] for line in lines] == [0, 1]
     assert lines[0]["video"].endswith("video000000.mp4")
     assert isinstance(lines[0]["seed"], int)
+
+
+def test_list_says_which_videos_are_pending(mjrec: Any, tmp_path: Path) -> None:
+    """In place of the name that there is not yet."""
+    journal = JournalWriter(tmp_path / "openaigym.episodes.0.7.jsonl")
+    for number in range(2):
+        journal.append(
+            JournalEntry(
+                episode_id=number,
+                length=5,
+                reward=0.5,
+                type="e",
+                start_time=1.0,
+                end_time=2.0,
+                seed=None,
+                options=None,
+                terminated=True,
+                truncated=False,
+            )
+        )
+    journal.close()
+    trajectory = tmp_path / "openaigym.trajectory.0.7.episode000001.log"
+    facts = {"video": {"recording": "deferred"}}
+    TrajectoryLogWriter(trajectory, TrajectoryHeader(facts=facts)).close()
+    _, out, _ = mjrec("list", tmp_path)
+    assert out.count("pending") == 1
+    _, out, _ = mjrec("list", tmp_path, "--json")
+    first, second = (json.loads(line) for line in out.splitlines())
+    assert (first["pending"], first["trajectory"]) == (False, None)
+    assert (second["pending"], second["trajectory"]) == (True, trajectory.name)
+    assert second["video"] is None
 
 
 def test_list_of_nothing_is_an_error(mjrec: Any, tmp_path: Path) -> None:

@@ -66,9 +66,15 @@ def episode_table(episodes: Iterator[Episode]) -> rich.table.Table:
             str(episode.length),
             f"{episode.reward:.6g}",
             _end(episode),
-            "" if episode.video is None else rich.markup.escape(episode.video.name),
+            _video(episode),
         )
     return table
+
+
+def _video(episode: Episode) -> str:
+    if episode.video is not None:
+        return rich.markup.escape(episode.video.name)
+    return "pending" if episode.pending else ""
 
 
 def _end(episode: Episode) -> str:

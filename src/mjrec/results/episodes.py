@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ from ..formats.journal import read_journal
 from ..formats.manifest import read_manifest
 from ..formats.monitor_directory import (
     Infix,
+    episode_of,
     infix_of,
     is_manifest,
     iter_monitor_files,
 )
 from ..formats.stats_file import read_stats_file
+from ..formats.trajectory_log_reader import TrajectoryLogReader
 
 __all__ = ["Episode", "iter_episodes"]
 
@@ -49,6 +52,12 @@ class Episode:
         monitor: the infix of its monitor's files.
         video: its video, where there is one.
         metadata: its video's metadata, where there is one.
+        trajectory: its recorded states, where there are some; the finished file rather
+            than the log.
+        pending: its video is promised and not there; `mjrec render` makes it. Where a
+            monitor was killed, a finished trajectory without a video counts as a
+            promise, though its monitor may have recorded no videos: that stands inside
+            the file, which is not opened here.
     """
 
     episode_id: int
@@ -64,6 +73,8 @@ class Episode:
     monitor: str
     video: Path | None
     metadata: Path | None
+    trajectory: Path | None = None
+    pending: bool = False
 
 
 class _Files:
@@ -81,6 +92,7 @@ class _Files:
         self.journal: Path | None = None
         self.videos: dict[int, Path] = {}
         self.metadata: dict[int, Path] = {}
+        self.trajectories: dict[int, Path] = {}
         for path in paths:
             self._sort_in(path)
 
@@ -95,6 +107,54 @@ class _Files:
         elif video is not None:
             kind = self.metadata if video["kind"] == "meta.json" else self.videos
             kind[int(video["episode"])] = path
+        elif path.suffix in (".h5", ".log"):
+            self._sort_in_trajectory(path)
+
+    def _sort_in_trajectory(self, path: Path) -> None:
+        number = episode_of(path.name)
+        if number is not None and (
+            path.suffix == ".h5" or number not in self.trajectories
+        ):
+            self.trajectories[number] = path
+
+    def is_pending(self, episode_id: int) -> bool:
+        """Tell whether an episode's video is promised and not there."""
+        trajectory = self.trajectories.get(episode_id)
+        # Metadata without a video is what is left of one that could not be made.
+        if trajectory is None or episode_id in (*self.videos, *self.metadata):
+            return False
+        details = self._details
+        next_episode_id = details.get("next_episode_id")
+        if isinstance(next_episode_id, int) and episode_id < next_episode_id:
+            return episode_id in _pending_ids(details)
+        # Its monitor is open, or was killed.
+        return trajectory.suffix == ".h5" or _says_deferred(trajectory)
+
+    @functools.cached_property
+    def _details(self) -> Mapping[str, Any]:
+        """What this package adds to a manifest; nothing where there is no sound one."""
+        try:
+            manifest = None if self.manifest is None else read_manifest(self.manifest)
+        except UnreadableFile:
+            return {}
+        return {} if manifest is None or manifest.mjrec is None else manifest.mjrec
+
+
+def _pending_ids(details: Mapping[str, Any]) -> list[Any]:
+    entries = details.get("pending")
+    if not isinstance(entries, list):
+        return []
+    return [entry.get("episode_id") for entry in entries if isinstance(entry, dict)]
+
+
+def _says_deferred(log: Path) -> bool:
+    try:
+        with TrajectoryLogReader(log) as reader:
+            video = reader.header.facts.get("video")
+    except UnreadableFile:
+        # Damaged, or finished just now.
+        return False
+    return isinstance(video, dict) and video.get("recording") == "deferred"
 
 
 def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
@@ -160,6 +220,8 @@ def _from_journal(files: _Files, journal: Path) -> Iterator[Episode]:
             monitor=files.infix,
             video=files.videos.get(entry.episode_id),
             metadata=files.metadata.get(entry.episode_id),
+            trajectory=files.trajectories.get(entry.episode_id),
+            pending=files.is_pending(entry.episode_id),
         )
 
 
