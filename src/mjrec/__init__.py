@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from .monitors.gymnasium_monitor import GymnasiumMonitor as GymnasiumMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
+    from .rendering.pictures import render as render
+    from .rendering.pictures import render_states as render_states
     from .results import Episode as Episode
     from .results import clear_monitor_files as clear_monitor_files
     from .results import detect_monitor_files as detect_monitor_files
@@ -76,6 +78,8 @@ _LAZY = {
     "load_results": "results",
     "load_trajectory": "simulation.trajectories",
     "merge_stats_files": "results",
+    "render": "rendering.pictures",
+    "render_states": "rendering.pictures",
     "save_video": "formats.frames_to_videos",
     "use_gl": "gl",
     "write_archive": "formats.archive",
@@ -123,6 +127,8 @@ __all__ = [
     "load_results",
     "load_trajectory",
     "merge_stats_files",
+    "render",
+    "render_states",
     "save_video",
     "use_gl",
     "write_archive",

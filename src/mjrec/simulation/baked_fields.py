@@ -16,7 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-__all__ = ["BakedFields"]
+__all__ = ["BakedFields", "is_kept_by_context"]
 
 _HFIELD = ("hfield_data", "hfield_size")
 _TEXTURE = ("tex_data",)
@@ -78,6 +78,22 @@ class BakedFields:
         """Return the names of the attributes that differ."""
         names = (field.name for field in fields(self))
         return {name for name in names if getattr(self, name) != getattr(earlier, name)}
+
+
+def is_kept_by_context(name: str) -> bool:
+    """Tell whether a context may keep a field of this name.
+
+    Args:
+        name: of an array of `MjModel` (`tex_data`), or of a member of its structs
+            (`vis.map.haze`).
+    """
+    struct, _, member = name.partition(".")
+    if struct == "vis":
+        group, _, last = member.partition(".")
+        return last in _VISUAL.get(group, ())
+    arrays = (*_HFIELD, *_TEXTURE, *_MESH, *_WHOLE)
+    # Of planes only, which its name does not tell.
+    return name in (*arrays, "geom_type", "geom_size")
 
 
 def _needing_new_context(model: mujoco.MjModel) -> Iterable[Any]:

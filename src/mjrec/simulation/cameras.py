@@ -7,6 +7,7 @@ dm_control's do.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import mujoco
@@ -17,6 +18,7 @@ from ..errors import InvalidArgument, UnknownName
 __all__ = [
     "FREE_CAMERA",
     "Camera",
+    "camera_from_members",
     "camera_names",
     "raw_data",
     "raw_model",
@@ -87,6 +89,48 @@ def resolve_camera(model: Any, camera: Camera) -> mujoco.MjvCamera:
         resolved.type = mujoco.mjtCamera.mjCAMERA_FIXED
         resolved.fixedcamid = index
     return resolved
+
+
+def camera_from_members(
+    model: mujoco.MjModel, members: Mapping[str, Any]
+) -> mujoco.MjvCamera:
+    """Return a camera with these members; those left out are MuJoCo's default.
+
+    Args:
+        model: the model that the camera is for.
+        members: values of the public members of `mujoco.MjvCamera` by their names.
+
+    Raises:
+        UnknownName: there is no such member.
+        InvalidArgument: it follows, or is fixed to, something that the model lacks.
+    """
+    camera = mujoco.MjvCamera()
+    for name, value in members.items():
+        if name.startswith("_") or not hasattr(camera, name):
+            known = [known for known in dir(camera) if not known.startswith("_")]
+            raise UnknownName("member of mujoco.MjvCamera", name, known)
+        setattr(camera, name, value)
+    _check_camera(model, camera)
+    return camera
+
+
+def _check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
+    kind, count = int(camera.type), 0
+    if kind == int(mujoco.mjtCamera.mjCAMERA_FREE):
+        return
+    if kind == int(mujoco.mjtCamera.mjCAMERA_FIXED):
+        what, number, count = "fixedcamid", camera.fixedcamid, model.ncam
+    elif kind == int(mujoco.mjtCamera.mjCAMERA_TRACKING):
+        what, number, count = "trackbodyid", camera.trackbodyid, model.nbody
+    else:
+        raise InvalidArgument(
+            f"A camera's type is free (0), tracking (1) or fixed (2), got {kind}."
+        )
+    if not 0 <= number < count:
+        raise InvalidArgument(
+            f"A camera's {what} is {number}, and this model has {count} of these: 0 to "
+            f"{count - 1}."
+        )
 
 
 def tracking_camera(model: Any) -> str | int | None:

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Running a module of ours in a Python process of its own.
+
+Not with multiprocessing, whose children import the caller's main module (a script
+without a guard would run again), cannot be started from daemonic processes, and with
+"fork" inherit OpenGL's locks without its threads.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+__all__ = ["environment_of_child", "python_command"]
+
+
+def python_command(module: str) -> list[str]:
+    """Return the command that runs `module`, which finds what this process finds.
+
+    To be run with `environment_of_child`. `-P` keeps the working directory, which may
+    hold a file called `random.py`, from being searched first.
+    """
+    return [sys.executable, "-P", "-m", module]
+
+
+def environment_of_child(environ: Mapping[str, str]) -> dict[str, str]:
+    """Return `environ` with this process's module search path in `PYTHONPATH`.
+
+    The whole of it, in its order, so that the child has the same mujoco and the same
+    mjrec, by whatever means this process came to them. The directory of the main
+    script, or the working directory, which Python puts first, is searched last.
+    """
+    first, rest = sys.path[:1], sys.path[1:]
+    path = [*rest, *first] if first and _is_of_main(first[0]) else sys.path
+    entries = (str(Path(entry).absolute()) for entry in path if isinstance(entry, str))
+    # What has the separator in its name cannot be said there.
+    entries_said = [entry for entry in entries if os.pathsep not in entry]
+    return {**environ, "PYTHONPATH": os.pathsep.join(entries_said)}
+
+
+def _is_of_main(entry: str) -> bool:
+    file = getattr(sys.modules.get("__main__"), "__file__", None)
+    return entry == "" or (
+        file is not None and Path(entry).resolve() == Path(file).resolve().parent
+    )

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of recorded episodes and of given states, for whoever wants arrays."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import ArrayLike
+
+from ..errors import InvalidArgument
+from ..formats.trajectory_file import open_trajectory
+from ..frames import Frame
+from ..rates import stride_for, to_rate
+from .views import View, plain_camera
+from .workers import DrawingWorkers
+
+if TYPE_CHECKING:
+    from ..simulation.cameras import Camera
+    from ..simulation.trajectories import Trajectory
+
+__all__ = ["chosen_frames", "render", "render_states"]
+
+
+def render(
+    trajectory: Trajectory | str | os.PathLike[str],
+    *,
+    camera: Camera | Mapping[str, Any] | None = None,
+    width: int | None = None,
+    height: int | None = None,
+    max_fps: float | Fraction | None = None,
+    quality: str | None = None,
+    workers: int = 1,
+) -> Iterator[Frame]:
+    """Return the pictures of a recorded episode, one after the other.
+
+    With every option None they are, byte for byte, what `env.render()` gave or would
+    have given (on the same driver). They are drawn in processes of their own, which
+    live until the iterator ends or is dropped; however long the episode is, only a few
+    pictures are in memory. The first is drawn before this returns.
+
+    ::
+
+        for frame in mjrec.render("videos/openaigym.trajectory.0.1.episode000027.h5"):
+            ...
+
+    Args:
+        trajectory: what `mjrec.load_trajectory` returned, or its path.
+        camera: the name or number of one of the model's cameras, -1 for the free
+            camera in the place that the model gives it, an `mujoco.MjvCamera`, or a
+            mapping of its members; None is as recorded.
+        width: in pixels; None is as recorded.
+        height: in pixels; None is as recorded.
+        max_fps: draw pictures 0, n, 2n ... with the smallest n that gives no more than
+            so many per second of the simulation, and the last; None draws all that the
+            recording has.
+        quality: `"full"` or `"draft"` (no multisampling, a shadow map of at most
+            1024x1024); None is as recorded.
+        workers: how many processes draw. The pictures do not depend on it.
+
+    Returns:
+        New arrays of `(height, width, 3) uint8`, the top row first.
+
+    Raises:
+        UnreadableFile: the trajectory or its model is missing, damaged, or made by a
+            MuJoCo that this one cannot read.
+        NoPictures: the trajectory has states and no snapshots.
+        UnknownName: its model has no camera of that name, or there is no such quality.
+        InvalidArgument: another value that cannot be, also a size that the driver
+            cannot draw.
+        GLError: no OpenGL backend works here.
+        Error: a worker died at a picture, and again at the second try.
+    """
+    path = Path(trajectory) if isinstance(trajectory, str | os.PathLike) else None
+    path = trajectory.path if path is None else path  # type: ignore[union-attr]
+    view = View(
+        camera=None if camera is None else plain_camera(camera),
+        height=height,
+        width=width,
+        quality=quality,
+    )
+    with open_trajectory(path) as reader:
+        indices = chosen_frames(reader.frame_count, reader.header.facts, max_fps)
+    pool = DrawingWorkers(workers)
+    return _Pictures(pool, lambda: pool.frames(path, indices, view))
+
+
+def render_states(
+    model: Any,
+    states: ArrayLike,
+    spec: int,
+    *,
+    height: int,
+    width: int,
+    camera: Camera | Mapping[str, Any] = -1,
+    quality: str = "full",
+    workers: int = 1,
+) -> Iterator[Frame]:
+    """Return pictures of physics states, one after the other.
+
+    Each is what `mujoco.Renderer` shows of a new `MjData` after `mj_setState` of the
+    row and `mj_forward`. So states from anywhere can be drawn: `mujoco.rollout`, MJX,
+    Warp. They are drawn in processes of their own, as in `render`; until the iterator
+    ends or is dropped, model and states lie in a temporary directory.
+
+    ::
+
+        states, _ = mujoco.rollout.rollout(model, data, initial_state, nstep=100)
+        spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        for frame in mjrec.render_states(
+            model, states[0], spec, height=480, width=640
+        ):
+            ...
+
+    Args:
+        model: a `mujoco.MjModel`, or dm_control's wrapper of one.
+        states: `(n, size)`, one row for each picture.
+        spec: which components a row has: a combination of `mujoco.mjtState`. What it
+            leaves out is as in a new `MjData`.
+        height: in pixels.
+        width: in pixels.
+        camera: the name or number of one of the model's cameras, -1 for the free
+            camera, an `mujoco.MjvCamera`, or a mapping of its members.
+        quality: `"full"` or `"draft"`.
+        workers: how many processes draw.
+
+    Returns:
+        New arrays of `(height, width, 3) uint8`, the top row first.
+
+    Raises:
+        InvalidArgument: the states have another shape; a size or a camera cannot be.
+        UnknownName: the model has no camera of that name, or there is no such quality.
+        FileNotWritten: the temporary directory has no room.
+        GLError, Error: as `render`.
+    """
+    # Here, because drawing recorded episodes needs no simulator in this process.
+    from ..simulation.given_states import check_states, save_states
+
+    view = View(
+        camera=plain_camera(camera), height=height, width=width, quality=quality
+    )
+    rows = check_states(model, states, spec)
+    pool = DrawingWorkers(workers)
+    directory = Path(tempfile.mkdtemp(prefix="mjrec-states-"))
+    drawing = {"states": str(directory), "spec": int(spec), "view": view.as_json()}
+
+    def begin() -> Iterator[Frame]:
+        save_states(directory, model, rows)
+        return pool.pictures(drawing, range(len(rows)))
+
+    return _Pictures(pool, begin, directory=directory)
+
+
+def chosen_frames(
+    count: int, facts: Mapping[str, Any], max_fps: float | Fraction | None
+) -> list[int]:
+    """Return the numbers of the recorded pictures that are no more than `max_fps`.
+
+    0, n, 2n ... with the smallest whole n that fits, and always the last.
+
+    Args:
+        count: how many the recording has.
+        facts: the trajectory's.
+        max_fps: pictures per second of the simulation; None is all there are.
+
+    Raises:
+        InvalidArgument: `max_fps` is no rate, or the recording does not know its own.
+    """
+    if max_fps is None:
+        return list(range(count))
+    wanted = to_rate(max_fps)
+    if facts.get("rate") is None:
+        raise InvalidArgument(
+            "max_fps needs to know how many control steps a second has, and this "
+            "recording ended before that was written. Leave max_fps out."
+        )
+    recorded = Fraction(facts["rate"]) / int(facts.get("stride", 1))
+    chosen = list(range(0, count, stride_for(recorded, wanted)))
+    if count and chosen[-1] != count - 1:
+        chosen.append(count - 1)
+    return chosen
+
+
+class _Pictures:
+    """An iterator that takes its workers and its files with it when it ends."""
+
+    def __init__(
+        self,
+        pool: DrawingWorkers,
+        begin: Callable[[], Iterator[Frame]],
+        *,
+        directory: Path | None = None,
+    ) -> None:
+        # In a forked child the files are not its to remove, nor the processes to end.
+        self._leave = weakref.finalize(self, _leave, pool, directory, os.getpid())
+        try:
+            self._frames = begin()
+        except BaseException:
+            self._leave()
+            raise
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self
+
+    def __next__(self) -> Frame:
+        try:
+            return next(self._frames)
+        except BaseException:
+            self._leave()
+            raise
+
+    def close(self) -> None:
+        """End the workers; nothing more is given. Idempotent."""
+        self._leave()
+        self._frames = iter(())
+
+
+def _leave(pool: DrawingWorkers, directory: Path | None, owner: int) -> None:
+    pool.close()
+    if directory is not None and os.getpid() == owner:
+        shutil.rmtree(directory, ignore_errors=True)
