@@ -13,12 +13,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from ..errors import DirectoryNotWritable
+from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name
 from ..machine import usable_cpus
 
-__all__ = ["CpuSlots"]
+__all__ = ["CpuSlots", "check_workers"]
 
 _SECONDS_BETWEEN_TRIES = 0.1
 
@@ -89,3 +89,18 @@ class CpuSlots:
             )
         except OSError as error:
             raise DirectoryNotWritable(self._directory, error.strerror) from error
+
+
+def check_workers(workers: int | None) -> int | None:
+    """Return `workers` if it is a number of processes, or None.
+
+    Raises:
+        InvalidArgument: it is something else.
+    """
+    whole = isinstance(workers, int) and not isinstance(workers, bool)
+    if workers is not None and not (whole and workers >= 1):
+        raise InvalidArgument(
+            "workers must be a positive whole number, or None for one on each CPU that "
+            f"can be used, got {workers!r}."
+        )
+    return workers

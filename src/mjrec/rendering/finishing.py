@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finishing episodes: the trajectory's final form, the video, the manifest.
+
+One episode after the other, each by all workers. What cannot be done is told, stays
+as it was, and stops nothing else.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from ..errors import Error, GLError
+from ..formats.trajectory_file import finish_trajectory
+from .crew import Crew
+from .pending import EpisodeKey, PendingEpisode, claim, look_at
+from .progress import Progress
+from .rendered_manifests import update_manifest
+from .videos import render_video
+
+__all__ = ["EpisodeFinisher", "Outcome"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of an episode.
+
+    Attributes:
+        key: which one.
+        name: of what was to be made of it, the video or the trajectory.
+        video: what was rendered; None where nothing was.
+        frame_count: how many frames that has.
+        failure: why it could not be done; None where it was, or needed nothing.
+        is_elsewhere: another process is at it.
+    """
+
+    key: EpisodeKey
+    name: str
+    video: Path | None = None
+    frame_count: int = 0
+    failure: str | None = None
+    is_elsewhere: bool = False
+
+
+class EpisodeFinisher:
+    """Finishes the episodes that are added to it.
+
+    Args:
+        directory: the monitor directory.
+        workers: how many processes draw; None is one for each free CPU.
+        on_progress: called after every frame, and when an episode is over. It may add
+            episodes.
+        wait: called with seconds to wait while no CPU is free.
+
+    Attributes:
+        progress: how far it is.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        workers: int | None,
+        on_progress: Callable[[Progress], object] = lambda _: None,
+        wait: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self.progress = Progress()
+        self._directory = directory
+        self._on_progress = on_progress
+        self._crew = Crew(directory, workers=workers, wait=wait)
+        # None stands for one that could not be read when it was added.
+        self._waiting: dict[EpisodeKey, PendingEpisode | None] = {}
+        self._gl_failure: GLError | None = None
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._crew.close()
+
+    def add(self, key: EpisodeKey) -> bool:
+        """Add an episode, and return whether there is anything to do about it."""
+        try:
+            episode = look_at(self._directory, key)
+        except Error:
+            # The same again when its turn comes, which is when it is told.
+            episode = None
+        else:
+            if episode is None:
+                return False
+        self._waiting[key] = episode
+        if episode is None or episode.video is not None:
+            frames = 0 if episode is None else episode.frame_count
+            self._count(videos=1, frames=frames)
+        return True
+
+    def is_ready(self) -> bool:
+        """Tell whether an episode waits whose model is there already."""
+        return any(map(_has_model, self._waiting.values()))
+
+    def finish_next(self) -> Outcome:
+        """Finish the first episode whose model is there, else the first."""
+        key = next(
+            (key for key, episode in self._waiting.items() if _has_model(episode)),
+            next(iter(self._waiting)),
+        )
+        episode = self._waiting.pop(key)
+        before = self.progress
+        outcome = self._finish(key)
+        if episode is None or episode.video is not None:
+            # Also the frames that were not drawn: nobody waits for them any more.
+            frames = 0 if episode is None else episode.frame_count
+            self.progress = replace(
+                self.progress, frames_done=before.frames_done + frames
+            )
+            self._count(videos_done=1)
+        return outcome
+
+    def rest(self) -> None:
+        """Let others use the CPUs: there is nothing to do."""
+        self._crew.rest()
+
+    def dismiss_workers(self) -> None:
+        """End the workers, who have had nothing to do for long."""
+        self._crew.dismiss()
+
+    def _count(self, **more: int) -> None:
+        now = {name: getattr(self.progress, name) + more[name] for name in more}
+        self.progress = replace(self.progress, **now)
+        self._on_progress(self.progress)
+
+    def _finish(self, key: EpisodeKey) -> Outcome:
+        name = key.video_name
+        try:
+            lock = claim(self._directory, key)
+            if lock is None:
+                return Outcome(key=key, name=name, is_elsewhere=True)
+            try:
+                return self._finish_claimed(key)
+            finally:
+                lock.release()
+        except (Error, OSError) as error:
+            return Outcome(key=key, name=name, failure=str(error))
+        except Exception as error:
+            logger.exception("%s cannot be finished.", key.trajectory_name)
+            failure = f"{type(error).__name__}: {error}"
+            return Outcome(key=key, name=name, failure=failure)
+
+    def _finish_claimed(self, key: EpisodeKey) -> Outcome:
+        # Somebody else may have done it since it was added.
+        episode = look_at(self._directory, key)
+        if episode is None:
+            return Outcome(key=key, name=key.video_name)
+        path = episode.trajectory
+        if episode.is_log and episode.is_kept:
+            path = finish_trajectory(path)
+        outcome = Outcome(key=key, name=path.name)
+        if episode.video is not None:
+            frame_count = self._render(path)
+            outcome = replace(
+                outcome,
+                name=episode.video.name,
+                video=episode.video if frame_count else None,
+                frame_count=frame_count,
+            )
+        if not episode.is_kept:
+            for suffix in (".log", ".h5"):
+                path.with_suffix(suffix).unlink(missing_ok=True)
+        update_manifest(self._directory, key.infix)
+        return outcome
+
+    def _render(self, trajectory: Path) -> int:
+        """Render the video of a trajectory, and return how many frames it has."""
+        if self._gl_failure is not None:
+            # The same for all of them, after a second of trying each.
+            raise self._gl_failure
+        try:
+            file = render_video(
+                trajectory,
+                workers=self._crew.at_work(),
+                on_frame=lambda: self._count(frames_done=1),
+            )
+        except GLError as error:
+            self._gl_failure = error
+            raise
+        return 0 if file is None else file.frame_count
+
+
+def _has_model(episode: PendingEpisode | None) -> bool:
+    return episode is None or all(path.exists() for path in episode.model_files)

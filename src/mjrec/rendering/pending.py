@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is left to do about the recorded episodes of a directory.
+
+An episode is left to do when its trajectory is still a log, though it has ended, or
+when its video was deferred and is not there. Whoever does it holds the episode's lock,
+so that any number of processes can share the work of a directory, and what a dead one
+left is taken over.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import DirectoryNotWritable
+from ..formats.locks import Lock, is_locked, try_lock
+from ..formats.monitor_directory import (
+    Infix,
+    episode_of,
+    infix_of,
+    iter_monitor_files,
+    lock_name,
+    trajectory_prefix,
+    video_lock_name,
+    video_prefix,
+)
+from ..formats.trajectory_file import find_trajectory, open_trajectory
+from .rendered_manifests import is_done
+from .videos import video_path
+
+__all__ = ["EpisodeKey", "PendingEpisode", "claim", "look_at", "recorded_episodes"]
+
+
+@dataclass(frozen=True)
+class EpisodeKey:
+    """Which episode of a directory.
+
+    Attributes:
+        infix: of its monitor.
+        episode_id: its number.
+    """
+
+    infix: Infix
+    episode_id: int
+
+    @classmethod
+    def of(cls, name: str) -> EpisodeKey | None:
+        """Return that of the episode whose file has this name; None for other files."""
+        infix = Infix.parse(infix_of(name) or "")
+        number = episode_of(name)
+        return None if infix is None or number is None else cls(infix, number)
+
+    @property
+    def trajectory_name(self) -> str:
+        """The base name of the trajectory without extension."""
+        return trajectory_prefix(self.infix, self.episode_id)
+
+    @property
+    def video_name(self) -> str:
+        """The base name that its video usually has."""
+        return f"{video_prefix(self.infix, self.episode_id)}.mp4"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PendingEpisode:
+    """An episode that is left to do.
+
+    Attributes:
+        key: which one.
+        trajectory: its file.
+        video: what is to be rendered; None where nothing is.
+        frame_count: how many frames the trajectory has.
+        is_kept: the trajectory stays once the video is there.
+        model_files: what has to be there for rendering.
+    """
+
+    key: EpisodeKey
+    trajectory: Path
+    video: Path | None
+    frame_count: int
+    is_kept: bool
+    model_files: tuple[Path, ...]
+
+    @property
+    def is_log(self) -> bool:
+        """Whether the trajectory has not got its final form yet."""
+        return self.trajectory.suffix == ".log"
+
+
+def recorded_episodes(directory: Path) -> list[EpisodeKey]:
+    """Return the episodes that have a trajectory, monitor by monitor, in order."""
+    keys = {
+        key
+        for path in iter_monitor_files(directory)
+        if path.suffix in (".log", ".h5")
+        and (key := EpisodeKey.of(path.name)) is not None
+    }
+    return sorted(
+        keys, key=lambda key: (key.infix.monitor_id, key.infix.uid, key.episode_id)
+    )
+
+
+def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
+    """Return what is left to do about an episode; None where it is nothing.
+
+    An episode that is still running is nobody's business but its monitor's: its log
+    does not say how it ended, and somebody holds the monitor's lock.
+
+    Raises:
+        UnreadableFile: its trajectory is damaged, or of a newer format.
+    """
+    trajectory = find_trajectory(directory, key.infix, key.episode_id)
+    if trajectory is None:
+        return None
+    is_log = trajectory.with_suffix(".log").exists()
+    if not is_log and is_done(directory / key.video_name):
+        # Most of a directory is done, and need not be opened.
+        return None
+    with open_trajectory(trajectory) as reader:
+        facts = reader.header.facts
+        if is_log and "complete" not in facts and _is_open(directory, key.infix):
+            return None
+        video = _deferred_video(trajectory, facts)
+        if not is_log and video is None:
+            return None
+        return PendingEpisode(
+            key=key,
+            # Where both are there, somebody died between making one and removing the
+            # other, and finishing the log does what is left of that.
+            trajectory=trajectory.with_suffix(".log") if is_log else trajectory,
+            video=video,
+            frame_count=0 if video is None else reader.frame_count,
+            is_kept=bool(facts.get("kept", True)),
+            model_files=_model_files(directory, facts),
+        )
+
+
+def claim(directory: Path, key: EpisodeKey) -> Lock | None:
+    """Return the lock of an episode, or None where another process has it.
+
+    Raises:
+        DirectoryNotWritable: there can be no lock in the directory.
+    """
+    path = directory / video_lock_name(key.infix, key.episode_id)
+    try:
+        return try_lock(path, f"{os.getpid()}\n")
+    except OSError as error:
+        raise DirectoryNotWritable(directory, error.strerror) from error
+
+
+def _is_open(directory: Path, infix: Infix) -> bool:
+    return is_locked(directory / lock_name(infix))
+
+
+def _deferred_video(trajectory: Path, facts: Mapping[str, Any]) -> Path | None:
+    video = facts.get("video") or {}
+    if video.get("recording") != "deferred":
+        return None
+    path = video_path(trajectory, facts)
+    return None if is_done(path) else path
+
+
+def _model_files(directory: Path, facts: Mapping[str, Any]) -> tuple[Path, ...]:
+    model = facts.get("model") or {}
+    names = (model.get("mjb"), model.get("xml"))
+    return tuple(directory / Path(name).name for name in names if isinstance(name, str))

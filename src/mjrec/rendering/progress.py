@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far a rendering is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["Progress"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a rendering is.
+
+    Attributes:
+        videos_done: how many videos are over, be it as failures.
+        videos: how many there are, as far as is known.
+        frames_done: how many frames of these videos are drawn.
+        frames: how many frames these videos have.
+    """
+
+    videos_done: int = 0
+    videos: int = 0
+    frames_done: int = 0
+    frames: int = 0

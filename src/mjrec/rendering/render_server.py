@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A process that finishes episodes beside a simulation.
+
+`python -m mjrec.rendering.render_server DIRECTORY --workers N|auto`. On its standard
+input it is told the base name of one ended trajectory a line, and at last
+`that was all`. On its standard output it says one JSON object a line::
+
+    {"progress": {"videos_done": 0, "videos": 2, "frames_done": 40, "frames": 2002}}
+    {"done": "<trajectory>", "name": "<video or trajectory>", "failure": null}
+    {"log": [30, "..."]}                                for the simulation's log
+
+It ends when all is done, and at once, leaving the rest as it is, when its standard
+input ends before: then nobody waits for it any more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import json
+import logging
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .finishing import EpisodeFinisher
+from .pending import EpisodeKey
+from .progress import Progress
+from .render_service import ALL_SAID
+
+__all__ = ["main"]
+
+_NICE = 10
+_SECONDS_BETWEEN_REPORTS = 0.2
+# How long workers without work keep their memory.
+_SECONDS_OF_PATIENCE = 20.0
+_SECONDS_BETWEEN_LOOKS = 0.05
+_SECONDS_TO_LEAVE = 2.0
+_READ_SIZE = 1 << 16
+
+
+class _Stopped(BaseException):
+    """Raised in the main thread, wherever it is: clean up and leave."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Finish what the standard input names; return the exit status."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("directory", type=Path)
+    parser.add_argument("--workers", required=True)
+    arguments = parser.parse_args(argv)
+    workers = None if arguments.workers == "auto" else int(arguments.workers)
+    signal.signal(signal.SIGTERM, _stop)
+    os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
+    answers = _Answers(sys.stdout.fileno())
+    logging.getLogger().addHandler(_ToSimulation(answers))
+    try:
+        _Service(arguments.directory, workers, _Inbox(), answers).run()
+    except _Stopped:
+        return 0
+    answers.flush()
+    return 0
+
+
+def _stop(signum: int, frame: object) -> None:
+    del frame
+    # One is enough, and cleaning up must not be disturbed.
+    signal.signal(signum, signal.SIG_IGN)
+    raise _Stopped
+
+
+class _Service:
+    """Does what the inbox says, and tells what came of it."""
+
+    def __init__(
+        self, directory: Path, workers: int | None, inbox: _Inbox, answers: _Answers
+    ) -> None:
+        self._inbox = inbox
+        self._answers = answers
+        self._last_report = 0.0
+        # By which names they were given.
+        self._names: dict[EpisodeKey, str] = {}
+        self._finisher = EpisodeFinisher(
+            directory, workers=workers, on_progress=self._look_up
+        )
+
+    def run(self) -> None:
+        """Return when everything is done."""
+        with self._finisher as finisher:
+            while finisher or not self._inbox.is_complete:
+                self._take_in()
+                if not finisher:
+                    self._wait_for_work()
+                elif finisher.is_ready() or self._inbox.is_complete:
+                    self._finish_next()
+                else:
+                    # The simulation is still writing the model.
+                    time.sleep(_SECONDS_BETWEEN_LOOKS)
+        self._report()
+
+    def _finish_next(self) -> None:
+        outcome = self._finisher.finish_next()
+        self._answers.say(
+            done=self._names.pop(outcome.key),
+            name=outcome.name,
+            failure=outcome.failure,
+        )
+
+    def _wait_for_work(self) -> None:
+        self._finisher.rest()
+        if not self._inbox.wait(_SECONDS_OF_PATIENCE):
+            self._finisher.dismiss_workers()
+            self._inbox.wait(None)
+
+    def _take_in(self) -> None:
+        for name in self._inbox.names():
+            key = EpisodeKey.of(name)
+            if key is not None and self._finisher.add(key):
+                self._names[key] = name
+            else:
+                self._answers.say(done=name, name=name, failure=None)
+
+    def _look_up(self, progress: Progress) -> None:
+        """Listen and report, in the midst of work."""
+        del progress
+        now = time.monotonic()
+        if now - self._last_report >= _SECONDS_BETWEEN_REPORTS:
+            self._last_report = now
+            self._take_in()
+            self._report()
+
+    def _report(self) -> None:
+        self._answers.say(progress=vars(self._finisher.progress))
+
+
+class _Inbox:
+    """What the simulation says; read on a thread, to notice at once when it ends."""
+
+    def __init__(self) -> None:
+        self._names: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._next: collections.deque[str] = collections.deque()
+        self._all_said = False
+        threading.Thread(target=self._read, name="mjrec-inbox", daemon=True).start()
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all names were said and taken out."""
+        return self._all_said and not self._next and self._names.empty()
+
+    def names(self) -> list[str]:
+        """Return the names that came since."""
+        while not self._names.empty():
+            self._take(self._names.get())
+        names = list(self._next)
+        self._next.clear()
+        return names
+
+    def wait(self, seconds: float | None) -> bool:
+        """Wait until something is said, and return whether it was."""
+        try:
+            self._take(self._names.get(timeout=seconds))
+        except queue.Empty:
+            return False
+        return True
+
+    def _take(self, name: str | None) -> None:
+        if name is None:
+            self._all_said = True
+        else:
+            self._next.append(name)
+
+    def _read(self) -> None:
+        # Not through `sys.stdin`, whose lock this thread would hold at exit.
+        unread = b""
+        while block := os.read(sys.stdin.fileno(), _READ_SIZE):
+            *lines, unread = (unread + block).split(b"\n")
+            for said in map(bytes.decode, lines):
+                self._names.put(None if said == ALL_SAID else said)
+        # To the main thread, wherever it waits. Should it not come out of that, it is
+        # of no use any more.
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(_SECONDS_TO_LEAVE)
+        os._exit(1)
+
+
+class _Answers:
+    """Says whole lines, and never waits for anybody to read them."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._unsaid = b""
+        self._one_at_a_time = threading.RLock()
+        os.set_blocking(descriptor, False)
+
+    def say(self, **answer: Any) -> None:
+        with self._one_at_a_time:
+            self._unsaid += json.dumps(answer).encode() + b"\n"
+            self._send()
+
+    def flush(self) -> None:
+        """Wait until all is said."""
+        os.set_blocking(self._descriptor, True)
+        self._send()
+
+    def _send(self) -> None:
+        try:
+            while self._unsaid:
+                sent = os.write(self._descriptor, self._unsaid)
+                self._unsaid = self._unsaid[sent:]
+        except BlockingIOError:
+            # With the next line.
+            return
+        except BrokenPipeError:
+            # The input will end as well.
+            self._unsaid = b""
+
+
+class _ToSimulation(logging.Handler):
+    """Lets the simulation's process log what is worth a warning here."""
+
+    def __init__(self, answers: _Answers) -> None:
+        super().__init__(logging.WARNING)
+        self._answers = answers
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._answers.say(log=[record.levelno, self.format(record)])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

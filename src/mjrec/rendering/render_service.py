@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rendering beside a simulation: the half that lives in the simulation's process.
+
+The other half is a process of its own, `render_server`, and this one does next to
+nothing: it starts that process, writes it names of trajectories, and listens when it
+is told to wait. No thread, no simulator and no OpenGL comes into this process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import select
+import signal
+import subprocess
+import tempfile
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from ..errors import Error
+from .child_python import environment_of_child, python_command
+from .cpu_slots import check_workers
+from .progress import Progress
+
+__all__ = ["ALL_SAID", "Progress", "RenderService"]
+
+logger = logging.getLogger(__name__)
+
+# The line that ends the names. It is none of a trajectory.
+ALL_SAID = "that was all"
+
+_MODULE = "mjrec.rendering.render_server"
+_READ_SIZE = 1 << 16
+_SECONDS_TO_STOP = 3.0
+_SECONDS_TO_LISTEN = 1.0
+_END_OF_STDERR = 1500
+
+# A forked child shares the pipes, which would then never end for the server.
+_services: weakref.WeakSet[RenderService] = weakref.WeakSet()
+
+
+class RenderService:
+    """Turns ended trajectories into finished ones and into videos, beside the caller.
+
+    The first trajectory starts the process that does it; one that dies is not started
+    again, and what it did not do is left pending. The service belongs to the process
+    that made it.
+
+    Args:
+        directory: the monitor directory.
+        workers: how many processes draw; None is one for each CPU that can be used,
+            shared by all who render into the directory.
+
+    Raises:
+        InvalidArgument: `workers` is no number of processes.
+
+    Attributes:
+        failures: why videos could not be rendered, by their base names; for an episode
+            without a video, that of the trajectory.
+    """
+
+    def __init__(self, directory: Path, *, workers: int | None) -> None:
+        self._directory = Path(directory).absolute()
+        self._workers = check_workers(workers)
+        self._process_id = os.getpid()
+        self._server: _Server | None = None
+        # A dictionary for its order.
+        self._waiting: dict[str, None] = {}
+        self._progress = Progress()
+        self._stopped = False
+        self._death: str | None = None
+        self.failures: dict[str, str] = {}
+        _services.add(self)
+
+    @property
+    def waiting(self) -> list[str]:
+        """The trajectories that were taken over and are not done, in their order."""
+        return list(self._waiting)
+
+    def submit(self, trajectory: Path) -> None:
+        """Take over an ended trajectory. Never waits, and raises no failure.
+
+        After `stop` nothing is done: the trajectory stays as it is.
+
+        Raises:
+            Error: in a process forked from the one that made the service.
+        """
+        self._check_process()
+        name = Path(trajectory).name
+        self._waiting[name] = None
+        if self._stopped or self._death is not None:
+            return
+        try:
+            if self._server is None:
+                self._server = _Server(self._directory, self._workers)
+            self._server.say(name)
+        except OSError as error:
+            self._note_death(f"it could not be started: {error}")
+            return
+        self._listen(self._server)
+
+    def wait(self, on_progress: Callable[[Progress], object] = lambda _: None) -> None:
+        """Return when all that was taken over is done, or the server has died.
+
+        What could not be done is in `failures`. May be interrupted (Ctrl-C); then
+        `stop` ends it, and another `wait` waits on.
+
+        Args:
+            on_progress: called now and then with a `Progress`.
+        """
+        if self._was_forked() or self._stopped:
+            return
+        server = self._server
+        if server is not None:
+            server.say(ALL_SAID)
+            while not server.has_ended():
+                on_progress(self._progress)
+                server.wait_for_news(_SECONDS_TO_LISTEN)
+                self._listen(server)
+            on_progress(self._progress)
+            server.stop()
+            self._server = None
+        if self._waiting:
+            self._fail_rest()
+
+    def stop(self) -> None:
+        """Stop at once; what is not done stays pending. Idempotent."""
+        self._stopped = True
+        if self._server is not None and not self._was_forked():
+            self._server.stop()
+            self._server = None
+
+    def _check_process(self) -> None:
+        if self._was_forked():
+            raise Error(
+                f"Process {self._process_id} renders into {self._directory}, and this "
+                f"is {os.getpid()}, forked from it. Make a monitor of its own here."
+            )
+
+    def _was_forked(self) -> bool:
+        return os.getpid() != self._process_id
+
+    def _listen(self, server: _Server) -> None:
+        for message in server.messages():
+            self._take(message)
+        if server.has_ended() and self._waiting:
+            self._note_death(server.obituary())
+
+    def _take(self, message: Mapping[str, Any]) -> None:
+        if "progress" in message:
+            self._progress = Progress(**message["progress"])
+        elif "log" in message:
+            logger.log(*message["log"])
+        elif "done" in message:
+            self._waiting.pop(message["done"], None)
+            if message.get("failure"):
+                self.failures[message["name"]] = message["failure"]
+
+    def _note_death(self, how: str) -> None:
+        if self._death is None:
+            self._death = how
+            logger.warning(
+                "The process that renders the videos of %s is gone: %s The videos "
+                "stay pending.",
+                self._directory,
+                how,
+            )
+
+    def _fail_rest(self) -> None:
+        first, *others = self._waiting
+        self.failures[first] = f"the process that renders is gone: {self._death}"
+        for name in others:
+            self.failures[name] = "likewise"
+        self._waiting.clear()
+
+    def _forget_server(self) -> None:
+        server, self._server = self._server, None
+        if server is not None:
+            server.forget()
+
+
+class _Server:
+    """The render server, from outside.
+
+    Raises:
+        OSError: it could not be started.
+    """
+
+    def __init__(self, directory: Path, workers: int | None) -> None:
+        self._stderr = _scratch_file()
+        self._unsaid = b""
+        self._unread = b""
+        self._ended = False
+        self._process = subprocess.Popen(
+            [
+                *python_command(_MODULE),
+                str(directory),
+                "--workers",
+                "auto" if workers is None else str(workers),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._stderr or subprocess.DEVNULL,
+            bufsize=0,
+            env=environment_of_child(os.environ),
+            # Ctrl-C in a terminal is the simulation's to handle.
+            start_new_session=True,
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._to: IO[bytes] = self._process.stdin
+        self._from: IO[bytes] = self._process.stdout
+        os.set_blocking(self._to.fileno(), False)
+        os.set_blocking(self._from.fileno(), False)
+
+    def say(self, line: str) -> None:
+        """Send a line, now or, where the pipe is full, with a later one."""
+        self._unsaid += f"{line}\n".encode()
+        self._send()
+
+    def messages(self) -> Iterator[Mapping[str, Any]]:
+        """Yield what it has said since; never waits."""
+        with contextlib.suppress(BlockingIOError):
+            while not self._ended:
+                block = os.read(self._from.fileno(), _READ_SIZE)
+                self._ended = not block
+                self._unread += block
+                # Before anything else is read: an interruption loses no line.
+                while b"\n" in self._unread:
+                    line, _, self._unread = self._unread.partition(b"\n")
+                    yield json.loads(line)
+
+    def wait_for_news(self, seconds: float) -> None:
+        """Wait until it says something or ends, or so many seconds have passed."""
+        poll = select.poll()
+        poll.register(self._from, select.POLLIN)
+        if self._unsaid:
+            poll.register(self._to, select.POLLOUT)
+        poll.poll(seconds * 1000)
+        self._send()
+
+    def has_ended(self) -> bool:
+        """Whether nothing more will come from it."""
+        return self._ended
+
+    def obituary(self) -> str:
+        """Return how it ended, and its last words."""
+        self._end()
+        status = self._process.returncode
+        if status < 0:
+            how = f"it was killed ({signal.Signals(-status).name})."
+        else:
+            how = f"its exit status is {status}."
+        words = self._last_words()
+        return f"{how} The end of what it said: {words}" if words else how
+
+    def stop(self) -> None:
+        """End it, by force where need be, and let go. May be called again."""
+        if not self._ended:
+            with contextlib.suppress(OSError):
+                self._to.close()
+            self._process.terminate()
+        self._end()
+        self.forget()
+
+    def forget(self) -> None:
+        """Close this process's ends of the pipes."""
+        with contextlib.suppress(OSError):
+            self._to.close()
+        self._from.close()
+        if self._stderr is not None:
+            self._stderr.close()
+        # In a forked child it is somebody else's process, which nobody here waits for.
+        if self._process.returncode is None:
+            self._process.returncode = 0
+
+    def _send(self) -> None:
+        # One that is gone is noticed when its end of the other pipe is read.
+        with contextlib.suppress(BlockingIOError, BrokenPipeError):
+            while self._unsaid:
+                sent = os.write(self._to.fileno(), self._unsaid)
+                self._unsaid = self._unsaid[sent:]
+
+    def _end(self) -> None:
+        try:
+            self._process.wait(_SECONDS_TO_STOP)
+        except subprocess.TimeoutExpired:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+
+    def _last_words(self) -> str:
+        if self._stderr is None:
+            return ""
+        size = self._stderr.seek(0, os.SEEK_END)
+        self._stderr.seek(max(0, size - _END_OF_STDERR))
+        return self._stderr.read().decode(errors="replace").strip()
+
+
+def _scratch_file() -> IO[bytes] | None:
+    """Return a file for what the server says; None where there is no room for one."""
+    try:
+        return tempfile.TemporaryFile()
+    except OSError:
+        return None
+
+
+def _forget_servers_of_the_parent() -> None:
+    for service in list(_services):
+        service._forget_server()
+
+
+os.register_at_fork(after_in_child=_forget_servers_of_the_parent)

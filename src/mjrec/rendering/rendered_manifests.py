@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Manifests of monitors that are closed, kept true while their videos come.
+
+An open monitor writes its manifest itself, when it closes, after a look at what is
+there; nobody else touches it until then. Afterwards it belongs to whoever has rendered
+one of its pending videos. Should both happen at once, the manifest may still call a
+video pending that is there: `reconcile` sees to that.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import DirectoryNotWritable, UnreadableFile
+from ..formats.json_fields import read_object
+from ..formats.locks import is_locked, wait_for_lock
+from ..formats.manifest import Manifest, read_manifest, write_manifest
+from ..formats.monitor_directory import (
+    Infix,
+    episode_of,
+    infix_of,
+    is_manifest,
+    iter_monitor_files,
+    lock_name,
+    manifest_lock_name,
+    manifest_name,
+)
+from .videos import metadata_path
+
+__all__ = ["is_broken", "is_done", "reconcile", "update_manifest"]
+
+
+def is_done(video: Path) -> bool:
+    """Tell whether nothing is left to do about a video: it is there, or given up."""
+    metadata = metadata_path(video)
+    return metadata.exists() and (video.exists() or is_broken(metadata))
+
+
+def is_broken(metadata: Path) -> bool:
+    """Tell whether a video's metadata says that it broke."""
+    try:
+        return bool(read_object(metadata).get("broken"))
+    except (OSError, ValueError):
+        return False
+
+
+def reconcile(directory: Path) -> list[str]:
+    """Update the manifests of all monitors that are closed.
+
+    Returns:
+        Why some could not be, by their names.
+    """
+    failures = []
+    for path in iter_monitor_files(directory):
+        infix = Infix.parse(infix_of(path.name) or "")
+        if infix is not None and is_manifest(path.name):
+            try:
+                update_manifest(directory, infix)
+            except (UnreadableFile, DirectoryNotWritable) as error:
+                failures.append(str(error))
+    return failures
+
+
+def update_manifest(directory: Path, infix: Infix) -> None:
+    """Move what is there from the pending to the finished videos of a manifest.
+
+    Nothing happens while the monitor is open, or where it left no manifest.
+
+    Raises:
+        UnreadableFile: the manifest is damaged.
+        DirectoryNotWritable: there can be no lock in the directory.
+        FileNotWritten: the disk is full; the manifest stays as it was.
+    """
+    path = directory / manifest_name(infix)
+    if not _has_news(path, infix):
+        return
+    try:
+        lock = wait_for_lock(directory / manifest_lock_name(infix), f"{os.getpid()}\n")
+    except OSError as error:
+        raise DirectoryNotWritable(directory, error.strerror) from error
+    try:
+        # Once more, because another process may have done it meanwhile.
+        if _has_news(path, infix):
+            write_manifest(path, _updated(read_manifest(path), directory))
+    finally:
+        lock.release()
+
+
+def _has_news(path: Path, infix: Infix) -> bool:
+    if not path.exists() or is_locked(path.with_name(lock_name(infix))):
+        return False
+    manifest = read_manifest(path)
+    return _updated(manifest, path.parent) != manifest
+
+
+def _updated(manifest: Manifest, directory: Path) -> Manifest:
+    if manifest.mjrec is None:
+        return manifest
+    pending = manifest.mjrec.get("pending") or []
+    waiting: list[Any] = []
+    broken = list(manifest.mjrec.get("broken") or [])
+    videos = list(manifest.videos)
+    for entry in pending:
+        video = _video_of(entry, directory)
+        if video is None or not is_done(video):
+            waiting.append(entry)
+        elif is_broken(metadata_path(video)):
+            broken.append(metadata_path(video).name)
+        else:
+            videos.append((video.name, metadata_path(video).name))
+    if len(waiting) == len(pending):
+        return manifest
+    return replace(
+        manifest,
+        videos=tuple(sorted(videos, key=_episode_of_pair)),
+        mjrec={**manifest.mjrec, "pending": waiting, "broken": broken},
+    )
+
+
+def _video_of(entry: Any, directory: Path) -> Path | None:
+    """Return the video that a manifest calls pending; None for one elsewhere."""
+    name = entry.get("video") if isinstance(entry, Mapping) else None
+    if not isinstance(name, str) or episode_of(name) is None:
+        return None
+    return directory / name
+
+
+def _episode_of_pair(names: tuple[str, str]) -> tuple[int, str]:
+    return episode_of(names[0]) or 0, names[0]

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Directories with trajectories in them, written without a simulation.
+
+Frame k of one is a grey picture of brightness `grey(k)`, which `Painter` draws from
+its snapshots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjrec.formats.manifest import Manifest, write_manifest
+from mjrec.formats.monitor_directory import (
+    Infix,
+    manifest_name,
+    trajectory_prefix,
+    video_prefix,
+)
+from mjrec.formats.trajectory import Array, RowLayout, StateComponent, TrajectoryHeader
+from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
+from mjrec.formats.trajectory_log import TrajectoryLogWriter
+from mjrec.rendering.views import View
+
+INFIX = Infix(0, "7")
+
+
+def grey(frame: int) -> int:
+    """Return the brightness of a frame."""
+    return 10 + 20 * frame
+
+
+class Painter:
+    """Draws pictures of trajectories of this module, as `DrawingWorkers` would."""
+
+    gl_strings = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
+
+    def __init__(self, size: tuple[int, int] = (16, 24)) -> None:
+        self.size = size
+        self.asked: list[tuple[Path, list[int], View]] = []
+
+    def frames(
+        self, trajectory: Path, indices: Sequence[int], view: View | None = None
+    ) -> Iterator[Any]:
+        self.asked.append((trajectory, list(indices), view or View()))
+        with open_trajectory(trajectory) as reader:
+            shown = [int(reader.snapshots(i, i + 1)[0, 0]) for i in indices]
+        return (np.full((*self.size, 3), value, np.uint8) for value in shown)
+
+    def close(self) -> None: ...
+
+
+def write_log(
+    directory: Path,
+    episode_id: int = 0,
+    *,
+    infix: Infix = INFIX,
+    steps: int = 4,
+    stride: int = 1,
+    frames: bool = True,
+    video: str | None = "deferred",
+    ended: bool = True,
+    fps: str | None = None,
+    **facts: Any,
+) -> Path:
+    """Write the log of an episode at 20 steps a second."""
+    path = directory / f"{trajectory_prefix(infix, episode_id)}.log"
+    header = TrajectoryHeader(
+        facts={
+            "episode_id": episode_id,
+            "infix": str(infix),
+            "env_id": "Grey-v0",
+            "type": "t",
+            "seed": 5,
+            "options": None,
+            "versions": {"mjrec": "0"},
+            "scene": {"label": "side"},
+            "video": video
+            and {
+                "name": f"{video_prefix(infix, episode_id)}.mp4",
+                "quality": "full",
+                "fps": fps,
+                "max_fps": None,
+                "recording": video,
+            },
+            "rate": "20",
+            "timestep": "1/20",
+            "stride": stride,
+            **facts,
+        },
+        state=(StateComponent("qpos", 0, 1),),
+        snapshot=RowLayout.packed([("geom_rgba", Array("|u1", (1,)))]),
+    )
+    writer = TrajectoryLogWriter(path, header)
+    taken = 0
+    for step in range(steps + 1):
+        writer.step_row(step, 0.5 * bool(step), False, ended and step == steps)[:] = 0
+        if frames and (step % stride == 0 or step == steps):
+            writer.frame_row(step)[:] = grey(taken)
+            taken += 1
+    if ended:
+        ending = {"complete": True, "terminated": False, "truncated": True}
+        writer.add_facts({**ending, "length": steps, "reward": 0.5 * steps})
+    writer.close()
+    return path
+
+
+def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:
+    """Write the finished trajectory of an episode."""
+    return finish_trajectory(write_log(directory, episode_id, **rest))
+
+
+def write_pending_manifest(
+    directory: Path, *episode_ids: int, infix: Infix = INFIX, **rest: Any
+) -> Path:
+    """Write the manifest of a closed monitor whose videos are all pending."""
+    path = directory / manifest_name(infix)
+    pending = [
+        {
+            "episode_id": episode_id,
+            "trajectory": trajectory_prefix(infix, episode_id),
+            "video": f"{video_prefix(infix, episode_id)}.mp4",
+        }
+        for episode_id in episode_ids
+    ]
+    write_manifest(
+        path,
+        Manifest(
+            stats="openaigym.episode_batch.0.7.stats.json",
+            videos=(),
+            env_info={"gym_version": "mjrec-1", "env_id": "Grey-v0"},
+            mjrec={"format_version": 1, "pending": pending, "broken": [], **rest},
+        ),
+    )
+    return path
