@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from dm_control.mujoco import wrapper
@@ -62,6 +63,7 @@ def dm_control_scenes(
         states=EpisodeStates(
             lambda: (raw_model(env.physics.model), raw_data(env.physics.data)),
             view=scene,
+            at_picture=scene.at_picture,
             resetting=ContextsOnDemand(env).resetting,
             authored=lambda: _authored(env),
         ),
@@ -92,14 +94,18 @@ class _PhysicsScene:
         self._start(env.physics.model)
 
     def __call__(self) -> SceneView:
-        """Return what is shown now; the same object as long as the model is."""
+        """Return what is shown from here on; `at_picture` keeps it up to date."""
         model = self._env.physics.model
         if raw_model(model) is not self._model:
             self._start(model)
-        if self._camera == FREE_CAMERA:
-            # It moves with the model's fields, at every picture.
-            place_free_camera(self._model, self._view.camera)
         return self._view
+
+    def at_picture(self, capture: Callable[[], None]) -> None:
+        """Call `capture` with the view as a picture of this moment has it."""
+        if self._camera == FREE_CAMERA:
+            # It moves with the model's fields.
+            place_free_camera(self._model, self._view.camera)
+        capture()
 
     def _start(self, model: Any) -> None:
         self._model = raw_model(model)

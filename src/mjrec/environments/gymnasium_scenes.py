@@ -164,14 +164,9 @@ def _at_picture(
     simulated: Any, scene: ViewerScene
 ) -> Callable[[Callable[[], None]], None]:
     moment = picture_moment(simulated)
-
-    def settle_and_capture(capture: Callable[[], None]) -> None:
-        scene.settle()
-        capture()
-
     if moment is None:
-        return settle_and_capture
-    return lambda capture: moment(lambda: settle_and_capture(capture))
+        return scene.at_picture
+    return lambda capture: moment(lambda: scene.at_picture(capture))
 
 
 def _authored(simulated: Any) -> AuthoredModel | None:

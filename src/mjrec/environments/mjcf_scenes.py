@@ -34,15 +34,17 @@ def mjcf_scenes(
         InvalidArgument: a camera number, or a size, that cannot be.
     """
     simulation = env.simulation
+    scene = ViewerScene(
+        simulation,
+        camera=env.camera if camera is None else camera,
+        height=env.height if height is None else height,
+        width=env.width if width is None else width,
+    )
     return Scenes(
         states=EpisodeStates(
             lambda: (simulation.model, simulation.data),
-            view=ViewerScene(
-                simulation,
-                camera=env.camera if camera is None else camera,
-                height=env.height if height is None else height,
-                width=env.width if width is None else width,
-            ),
+            view=scene,
+            at_picture=scene.at_picture,
             authored=lambda: authored_from_file(env.path),
         ),
         obstacle=_obstacle(env),

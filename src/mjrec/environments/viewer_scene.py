@@ -6,6 +6,7 @@ Imports mujoco, by way of the simulation: load it only where there is a simulati
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from ..frames import check_size
@@ -13,10 +14,11 @@ from ..simulation.cameras import FREE_CAMERA, resolve_camera
 from ..simulation.scene_pictures import camera_label
 from ..simulation.scene_view import SceneView
 from ..simulation.viewer_settings import (
+    copy_members,
     new_scene_flags,
     place_free_camera,
-    shown_camera,
-    viewer_camera,
+    place_viewer_camera,
+    select_camera,
     viewer_option,
 )
 from .scenes import class_name, is_defined_by
@@ -38,7 +40,7 @@ class ViewerScene:
 
     Where the environment has a viewer for `rgb_array`, that is the viewer's own camera
     and options, whatever the user makes of them. Until then it is what a viewer made
-    at the first picture would show, for as long as the environment lives.
+    at the first picture would show, for as long as the environment keeps its renderer.
 
     Args:
         simulated: has MuJoCo's `model` and `data` and, if it is one of Gymnasium's
@@ -57,9 +59,6 @@ class ViewerScene:
     ) -> None:
         self._simulated = simulated
         self._asked = camera
-        self._named: Any = None
-        self._first: Any = None
-        self._view: SceneView | None = None
         self._height, self._width = check_size(
             _own_side(simulated, "height") if height is None else height,
             _own_side(simulated, "width") if width is None else width,
@@ -67,90 +66,68 @@ class ViewerScene:
         self._start()
 
     def __call__(self) -> SceneView:
-        """Return what is shown now; the same object as long as nothing is another."""
-        self._follow()
-        camera, option = self._camera(), self._shown_option()
-        view = self._view
-        if view is None or view.camera is not camera or view.option is not option:
-            view = self._view = self._made(camera, option)
-        return view
+        """Return what is shown from here on; `at_picture` keeps it up to date."""
+        self._update()
+        asked = self._camera if self._asked is None else self._asked
+        return SceneView(
+            camera=self._camera,
+            option=self._option,
+            max_geom=getattr(self._renderer, "max_geom", _MAX_GEOM),
+            fresh=False,
+            height=self._height,
+            width=self._width,
+            label=camera_label(self._model, asked),
+        )
 
-    def settle(self) -> None:
-        """Keep the camera of this moment, if it is the first picture's."""
-        self._follow()
-        if self._first is None:
-            self._first = self._new_camera()
+    def at_picture(self, capture: Callable[[], None]) -> None:
+        """Call `capture` with the view as a picture of this moment has it."""
+        self._update()
+        self._is_settled = True
+        capture()
 
     def obstacle(self) -> str | None:
         """Return why the viewer's picture of this moment would show something else."""
-        self._follow()
         renderer, viewer = self._renderer, self._viewer()
-        if renderer is not None and renderer.model is not self._model:
+        if renderer is not None and renderer.model is not self._simulated.model:
             return "the renderer draws another model than the environment simulates"
         return None if viewer is None else _addition(viewer, self._new_flags)
 
     def _start(self) -> None:
-        self._model = self._simulated.model
-        self._renderer = getattr(self._simulated, "mujoco_renderer", None)
-        if self._asked is not None:
-            self._named = resolve_camera(self._model, self._asked)
+        simulated = self._simulated
+        self._model = simulated.model
+        self._renderer: Any = getattr(simulated, "mujoco_renderer", None)
+        own = FREE_CAMERA if self._asked is None else self._asked
+        self._camera = resolve_camera(self._model, own)
         self._option = viewer_option(getattr(self._renderer, "_vopt", None))
         self._new_flags = new_scene_flags(self._model)
-        self._first = None
-        self._view = None
+        self._is_settled = False
 
-    def _follow(self) -> None:
-        """Start anew where the environment has another model, or renderer."""
+    def _update(self) -> None:
         renderer = getattr(self._simulated, "mujoco_renderer", None)
         if renderer is not self._renderer or self._simulated.model is not self._model:
             self._start()
+        viewer = self._viewer()
+        if viewer is not None:
+            copy_members(viewer.vopt, self._option)
+        if self._asked is None and renderer is not None:
+            self._update_own_camera(viewer)
+        elif self._asked is None or self._asked == FREE_CAMERA:
+            # It moves with the model's fields.
+            place_free_camera(self._model, self._camera)
+
+    def _update_own_camera(self, viewer: Any) -> None:
+        if viewer is not None:
+            copy_members(viewer.cam, self._camera)
+        elif not self._is_settled:
+            config = self._renderer.default_cam_config
+            data = self._simulated.data
+            place_viewer_camera(self._model, data, config, self._camera)
+        select_camera(self._camera, self._renderer.camera_id)
 
     def _viewer(self) -> Any:
         # Other modes' viewers have cameras of their own.
         viewers = getattr(self._renderer, "_viewers", None)
         return viewers.get(_MODE) if viewers else None
-
-    def _camera(self) -> Any:
-        if self._asked is None:
-            return self._own_camera()
-        if self._asked == FREE_CAMERA:
-            place_free_camera(self._model, self._named)
-        return self._named
-
-    def _own_camera(self) -> Any:
-        viewer = self._viewer()
-        if viewer is None:
-            return shown_camera(self._first or self._new_camera(), self._camera_id)
-        return shown_camera(viewer.cam, self._camera_id)
-
-    def _new_camera(self) -> Any:
-        renderer = self._renderer
-        if renderer is None:
-            return resolve_camera(self._model, FREE_CAMERA)
-        config = getattr(renderer, "default_cam_config", None)
-        camera = viewer_camera(self._model, self._simulated.data, config)
-        return shown_camera(camera, self._camera_id)
-
-    @property
-    def _camera_id(self) -> int | None:
-        return getattr(self._renderer, "camera_id", None)
-
-    def _shown_option(self) -> Any:
-        viewer = self._viewer()
-        return self._option if viewer is None else viewer.vopt
-
-    def _made(self, camera: Any, option: Any) -> SceneView:
-        return SceneView(
-            camera=camera,
-            option=option,
-            max_geom=getattr(self._renderer, "max_geom", _MAX_GEOM),
-            fresh=False,
-            height=self._height,
-            width=self._width,
-            label=camera_label(
-                self._model, camera if self._asked is None else self._asked
-            ),
-        )
 
 
 def _own_side(simulated: Any, name: str) -> int:

@@ -6,7 +6,6 @@ A viewer makes an OpenGL context, and a recording of states must do without one.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,10 +13,11 @@ import mujoco
 import numpy as np
 
 __all__ = [
+    "copy_members",
     "new_scene_flags",
     "place_free_camera",
-    "shown_camera",
-    "viewer_camera",
+    "place_viewer_camera",
+    "select_camera",
     "viewer_option",
 ]
 
@@ -30,10 +30,13 @@ def place_free_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
     mujoco.mjv_defaultFreeCamera(model, camera)
 
 
-def viewer_camera(
-    model: mujoco.MjModel, data: mujoco.MjData, config: Mapping[str, Any] | None
-) -> mujoco.MjvCamera:
-    """Return the camera of a viewer that Gymnasium makes at this moment.
+def place_viewer_camera(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    config: Mapping[str, Any] | None,
+    camera: mujoco.MjvCamera,
+) -> None:
+    """Put a camera where a viewer that Gymnasium makes at this moment has its own.
 
     It looks at the median of where the geoms are now, and stays: a viewer made later
     shows another picture of the same state.
@@ -43,37 +46,46 @@ def viewer_camera(
         data: its data.
         config: members of the camera by their names, as environments give them
             (`default_camera_config`).
+        camera: is put there.
     """
-    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultCamera(camera)
     camera.type = _FREE
     camera.fixedcamid = -1
-    camera.lookat[:] = np.median(data.geom_xpos, axis=0) if model.ngeom else 0
+    camera.lookat[:] = np.median(data.geom_xpos, axis=0)
     camera.distance = model.stat.extent
     for name, value in (config or {}).items():
         if isinstance(value, np.ndarray):
             getattr(camera, name)[:] = value
         else:
             setattr(camera, name, value)
-    return camera
 
 
-def shown_camera(camera: mujoco.MjvCamera, camera_id: int | None) -> mujoco.MjvCamera:
-    """Return what Gymnasium's viewer with `camera` shows if asked for a number.
+def select_camera(camera: mujoco.MjvCamera, camera_id: int | None) -> None:
+    """Do to a viewer's camera what Gymnasium does when it draws.
 
     Args:
-        camera: is given back itself if it is what is shown, and never changed.
-        camera_id: of one of the model's cameras; -1 is a free camera, placed as
-            `camera` is; None is `camera`, whatever it is.
+        camera: of the viewer.
+        camera_id: of one of the model's cameras; -1 is a free camera, wherever it is;
+            None leaves it as it is.
     """
-    if camera_id is None:
-        return camera
-    kind = _FREE if camera_id == -1 else _FIXED
-    if camera.type == kind and camera.fixedcamid == camera_id:
-        return camera
-    shown = copy.copy(camera)
-    shown.type = kind
-    shown.fixedcamid = camera_id
-    return shown
+    if camera_id is not None:
+        camera.type = _FREE if camera_id == -1 else _FIXED
+        camera.fixedcamid = camera_id
+
+
+def copy_members(source: object, target: object) -> None:
+    """Make a camera, or an option, say what another says.
+
+    Args:
+        source: an `MjvCamera` or `MjvOption`.
+        target: another of the same.
+    """
+    for name in _MEMBERS[type(target)]:
+        value = getattr(source, name)
+        if isinstance(value, np.ndarray):
+            getattr(target, name)[...] = value
+        else:
+            setattr(target, name, value)
 
 
 def viewer_option(flags: Mapping[int, bool] | None = None) -> mujoco.MjvOption:
@@ -87,3 +99,11 @@ def viewer_option(flags: Mapping[int, bool] | None = None) -> mujoco.MjvOption:
 def new_scene_flags(model: mujoco.MjModel) -> bytes:
     """Return the rendering flags of a new scene."""
     return bytes(mujoco.MjvScene(model, maxgeom=1).flags.tobytes())
+
+
+def _members(kind: type) -> list[str]:
+    names = (name for name in dir(kind) if not name.startswith("_"))
+    return [name for name in names if not callable(getattr(kind, name))]
+
+
+_MEMBERS = {kind: _members(kind) for kind in (mujoco.MjvCamera, mujoco.MjvOption)}
