@@ -27,7 +27,7 @@ from .environments.policies import (
 from .errors import GLError, InvalidArgument
 from .gl import use_gl
 from .monitors import Monitor
-from .rates import to_rate
+from .recorder.options import LIVE, OFF, RecorderOptions
 from .schedules import disable_videos, schedule_from_text
 
 if TYPE_CHECKING:
@@ -59,6 +59,12 @@ class Session:
         height: of the videos, in pixels; None is the environment's own.
         width: likewise.
         fps: the rate written into the videos; None is real time.
+        max_fps: the most frames per second of simulated time; None is every step.
+        render: when pictures are drawn, `"deferred"`, `"live"` or `"off"`, see
+            `mjrec.Monitor`; None is deferred where it can be.
+        workers: how many processes draw deferred pictures; None is one for each CPU;
+            0 leaves the videos pending.
+        quality: `"full"` or `"draft"`.
         env_kwargs: more arguments for the environment.
     """
 
@@ -75,6 +81,10 @@ class Session:
     height: int | None = None
     width: int | None = None
     fps: float | None = None
+    max_fps: float | None = None
+    render: str | None = None
+    workers: int | None = None
+    quality: str = "full"
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -86,7 +96,8 @@ class SessionEpisode:
         episode_id: its number.
         length: number of steps.
         reward: sum of the rewards.
-        video: its video, where the schedule chose it.
+        video: its video, where the schedule chose it: where it is, or will be when
+            it has been rendered.
     """
 
     episode_id: int
@@ -101,7 +112,8 @@ def record_session(
     """Record a session, and yield each episode as it ends.
 
     The recordings are closed when the iterator ends, is closed, or raises; so close
-    it, best with `contextlib.closing`.
+    it, best with `contextlib.closing`. Only when it ends by itself are the videos
+    waited for that are still to be rendered; else they are left pending.
 
     Args:
         session: what is to be recorded.
@@ -114,7 +126,8 @@ def record_session(
     _check(session)
     schedule = schedule_from_text(session.schedule)
     with contextlib.ExitStack() as stack:
-        named = _environment(session, pictures=schedule is not disable_videos)
+        drawn = schedule is not disable_videos and session.render != OFF
+        named = _environment(session, pictures=drawn)
         closing = stack.enter_context(contextlib.ExitStack())
         closing.callback(named.environment.close)
         policy = load_policy(session.policy, named.environment)
@@ -125,12 +138,16 @@ def record_session(
             force=session.force,
             resume=session.resume,
             fps=session.fps,
+            max_fps=session.max_fps,
+            render=session.render,
+            workers=session.workers,
+            quality=session.quality,
             env_id=named.env_id,
             **named.view,
         )
         # From here on the monitor closes the environment.
         closing.pop_all()
-        stack.callback(monitor.close)
+        stack.enter_context(monitor)
         for _ in range(session.episodes):
             seeds = episode_seeds(session.seed, monitor.episode_id)
             _run_episode(named, monitor, policy, seeds, on_step)
@@ -143,14 +160,19 @@ def _check(session: Session) -> None:
         raise InvalidArgument(
             f"episodes must be a positive whole number, got {session.episodes}."
         )
-    if session.fps is not None:
-        to_rate(session.fps)
+    RecorderOptions(
+        fps=session.fps,
+        max_fps=session.max_fps,
+        render=session.render,
+        workers=session.workers,
+        quality=session.quality,
+    )
     parse_environment_name(session.environment)
     episode_seeds(session.seed, 0)
 
 
 def _environment(session: Session, *, pictures: bool) -> NamedEnvironment:
-    no_gl = _choose_gl() if pictures else None
+    no_gl = _choose_gl() if pictures and _may_draw_here(session) else None
     named = environment_from_name(
         session.environment,
         EnvironmentOptions(
@@ -164,9 +186,26 @@ def _environment(session: Session, *, pictures: bool) -> NamedEnvironment:
         ),
     )
     if no_gl is not None and "mujoco" in sys.modules:
-        named.environment.close()
-        raise no_gl
+        with contextlib.closing(named.environment):
+            raise _without_gl(session, named, no_gl)
     return named
+
+
+def _may_draw_here(session: Session) -> bool:
+    """Tell whether this process may have to draw something."""
+    if session.render is None:
+        return session.workers != 0
+    return session.render == LIVE
+
+
+def _without_gl(session: Session, named: NamedEnvironment, error: GLError) -> GLError:
+    if session.render == LIVE or not named.has_deferrable_pictures():
+        return error
+    return GLError(
+        f"{error}\nRecording itself needs no OpenGL: with --workers 0 (workers=0) the "
+        f"states are recorded, and `mjrec render {session.directory}` draws the videos "
+        "from them on a machine where OpenGL works."
+    )
 
 
 def _choose_gl() -> GLError | None:

@@ -9,7 +9,7 @@ import re
 import secrets
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import rich.console
 import tyro
@@ -42,6 +42,10 @@ def record(
     camera: str | None = None,
     size: str | None = None,
     fps: float | None = None,
+    max_fps: float = 60,
+    render: Literal["deferred", "live", "off"] | None = None,
+    workers: int | None = None,
+    quality: Literal["full", "draft"] = "full",
     env_kwargs: str = "{}",
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
@@ -67,6 +71,16 @@ def record(
             is not given.
         size: of the videos, WIDTHxHEIGHT in pixels.
         fps: frames per second written into the videos; real time, if not given.
+        max_fps: the most frames for a second of simulated time; of a faster simulation
+            every second, third ... step is shown, and always the last.
+        render: deferred: record states, and draw the videos from them in processes of
+            their own. live: draw while the simulation runs. off: no videos, only
+            statistics and trajectories. If it is not given, deferred where the
+            pictures are known to be the same, else live.
+        workers: how many processes draw deferred videos; one for each CPU, if it is not
+            given. 0 draws nothing now, needs no OpenGL, and leaves the videos pending:
+            mjrec render DIR makes them.
+        quality: full, or draft: several times faster, with coarser edges and shadows.
         env_kwargs: more arguments for the environment, as a JSON object.
         as_json: print one JSON object at the end, and nothing else.
     """
@@ -87,6 +101,10 @@ def record(
         height=height,
         width=width,
         fps=fps,
+        max_fps=max_fps,
+        render=render,
+        workers=workers,
+        quality=quality,
         env_kwargs=_kwargs(env_kwargs),
     )
     console = rich.console.Console(quiet=as_json)
@@ -128,14 +146,14 @@ def _print_summary(
 ) -> None:
     if interrupted:
         console.print("Interrupted. What was recorded so far is complete:")
-    videos = [episode.video.name for episode in recorded if episode.video]
+    videos = [episode.video for episode in recorded if episode.video]
     shown = session.directory.absolute()
     lines = [
         f"{_count(len(recorded), 'episode')} of {session.environment}, "
         f"seed {session.seed}, in",
         f"  {shown}",
         _count(len(videos), "video") + (":" if videos else ""),
-        *(f"  {name}" for name in videos),
+        *(f"  {video.name}{_pending(video)}" for video in videos),
     ]
     # Names must survive copying, so no line is folded.
     console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
@@ -155,11 +173,17 @@ def _print_json(
                 "length": episode.length,
                 "reward": episode.reward,
                 "video": episode.video.name if episode.video else None,
+                "pending": bool(episode.video and not episode.video.exists()),
             }
             for episode in recorded
         ],
     }
     sys.stdout.write(json_text.dumps(summary) + "\n")
+
+
+def _pending(video: Path) -> str:
+    # Nothing incomplete has a video's final name.
+    return "" if video.exists() else f"  (pending: mjrec render {video.parent})"
 
 
 def _size(text: str | None) -> tuple[int | None, int | None]:

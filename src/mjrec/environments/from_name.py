@@ -17,6 +17,7 @@ from .names import (
     parse_environment_name,
 )
 from .options import EnvironmentOptions
+from .scenes import Scenes
 
 __all__ = ["NamedEnvironment", "environment_from_name"]
 
@@ -32,6 +33,8 @@ class NamedEnvironment:
             an episode's seeds and returns the first observation.
         step: takes the same and an action, and returns the next observation and
             whether it is the episode's last.
+        has_deferrable_pictures: tells whether what it shows can be drawn from its
+            states.
         view: `camera`, `height` and `width` as far as the monitor is to be given
             them; empty where the environment itself shows what was asked for.
     """
@@ -40,6 +43,7 @@ class NamedEnvironment:
     env_id: str
     begin_episode: Callable[[Any, EpisodeSeeds], Any]
     step: Callable[[Any, Any], tuple[Any, bool]]
+    has_deferrable_pictures: Callable[[], bool]
     view: dict[str, Any] = field(default_factory=dict)
 
 
@@ -78,6 +82,7 @@ def environment_from_name(
 
 def _gymnasium(env_id: str, options: EnvironmentOptions) -> NamedEnvironment:
     from . import gymnasium_environments as module
+    from .gymnasium_scenes import gymnasium_scenes
 
     environment = module.make_gymnasium(env_id, options)
     return NamedEnvironment(
@@ -85,11 +90,13 @@ def _gymnasium(env_id: str, options: EnvironmentOptions) -> NamedEnvironment:
         env_id=_id_of(environment),
         begin_episode=module.begin_episode,
         step=module.step,
+        has_deferrable_pictures=lambda: _are_deferrable(gymnasium_scenes(environment)),
     )
 
 
 def _mjcf(name: MjcfName, options: EnvironmentOptions) -> NamedEnvironment:
     from . import gymnasium_environments as module
+    from .gymnasium_scenes import gymnasium_scenes
     from .mjcf_environments import make_mjcf
 
     environment = make_mjcf(name.path, options)
@@ -98,12 +105,14 @@ def _mjcf(name: MjcfName, options: EnvironmentOptions) -> NamedEnvironment:
         env_id=_id_of(environment),
         begin_episode=module.begin_episode,
         step=module.step,
+        has_deferrable_pictures=lambda: _are_deferrable(gymnasium_scenes(environment)),
     )
 
 
 def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnvironment:
     try:
         from . import dm_control_environments as module
+        from .dm_control_scenes import dm_control_scenes
     except Exception as error:
         raise dm_control_failure(str(name), error) from error
     environment = module.make_dm_control(name.domain, name.task, options)
@@ -112,8 +121,13 @@ def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnviro
         env_id=str(name),
         begin_episode=module.begin_episode,
         step=module.step,
+        has_deferrable_pictures=lambda: _are_deferrable(dm_control_scenes(environment)),
         view=_dm_control_view(environment, options),
     )
+
+
+def _are_deferrable(scenes: Scenes) -> bool:
+    return scenes.states is not None and scenes.obstacle is None
 
 
 def _id_of(environment: Any) -> str:
