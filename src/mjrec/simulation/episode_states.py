@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The states of a MuJoCo simulation inside an environment, ready to be recorded."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ClosedError, PicturesDiffer
+from ..formats.trajectory import RowLayout
+from .cameras import raw_data, raw_model
+from .integration_state import STATE_SPEC, state_components
+from .model_fields import is_settable
+from .model_memory import ModelMemory
+from .model_store import AuthoredModel, ModelStore
+from .picture_states import (
+    CheckedPictures,
+    KeptCameras,
+    PictureStates,
+    has_infinite_plane,
+)
+from .scene_view import SceneView
+from .state_source import EpisodeStart
+
+__all__ = ["EpisodeStates"]
+
+T = TypeVar("T")
+
+
+class EpisodeStates:
+    """Implements `StateSource` for a MuJoCo simulation. Needs no OpenGL.
+
+    The simulation is only read. What does not change between captures is kept, so that
+    a capture takes microseconds; what has changed is found by comparing memory.
+
+    Args:
+        simulation: returns the model and the data of this moment, MuJoCo's own or
+            dm_control's. The model may be another one after a reset.
+        view: returns how the scene is shown; asked when an episode begins. The camera
+            and the option in it are watched: they may be the environment's own.
+        at_picture: calls what it is given in the moment at which the environment would
+            draw, and then puts everything back; None where any moment is as good.
+        resetting: returns what to put around a reset.
+        authored: returns what the model was made from, where that is known.
+        obstacle: returns why the picture of this moment cannot be made from the state,
+            or None.
+    """
+
+    def __init__(
+        self,
+        simulation: Callable[[], tuple[Any, Any]],
+        *,
+        view: Callable[[], SceneView],
+        at_picture: Callable[[Callable[[], None]], None] | None = None,
+        resetting: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
+        authored: Callable[[], AuthoredModel | None] | None = None,
+        obstacle: Callable[[], str | None] | None = None,
+    ) -> None:
+        self._simulation = simulation
+        self._view = view
+        self._at_picture = at_picture
+        self._resetting = resetting
+        self._authored = authored
+        self._obstacle = obstacle
+        self._store: ModelStore | None = None
+        self._stored: _StoredModel | None = None
+        self._pictures: PictureStates | None = None
+        self._refusal: str | None = None
+        self._look_at_everything = False
+        # As `simulation` gave them last; they may be dm_control's wrappers.
+        self._seen: tuple[Any, Any] = (None, None)
+
+    def open(self, directory: Path) -> None:
+        """Store models in `directory` from here on."""
+        self._store = ModelStore(directory)
+        self._stored = self._pictures = None
+
+    def resetting(self) -> AbstractContextManager[None]:
+        """Return what to put around the reset of the environment."""
+        return self._resetting()
+
+    def begin_episode(self) -> EpisodeStart:
+        """Return what is there now, just after a reset.
+
+        A model that was not seen before is stored; of one that was, the fields that
+        are other than then are returned.
+        """
+        self._seen = self._simulation()
+        model, data = raw_model(self._seen[0]), raw_data(self._seen[1])
+        stored, fields = self._stored_model(model)
+        stored.follow(data)
+        self._look_at_everything = False
+        pictures = self._episode_pictures(stored)
+        self._refusal = self._reason_against(pictures, fields)
+        refused = self._refusal is not None
+        return EpisodeStart(
+            state=stored.components,
+            snapshot=RowLayout() if refused else pictures.layout,
+            model=stored.facts,
+            scene=None if refused else pictures.facts(),
+            model_fields=fields,
+            refusal=self._refusal,
+        )
+
+    def capture_state(self, out: NDArray[np.uint8]) -> None:
+        """Write the state of this moment into `out`, `(8 * its numbers,)`.
+
+        Raises:
+            PicturesDiffer: the environment has gone over to another model.
+        """
+        self._look_who_is_there()
+        if self._stored is None:
+            raise _not_begun()
+        self._stored.write_state(out)
+
+    def capture_snapshot(
+        self, out: NDArray[np.uint8]
+    ) -> Mapping[str, NDArray[Any]] | None:
+        """Write what a picture of this moment is made from into `out`.
+
+        Where the beginning of the episode gave a refusal nothing is written, and what
+        has changed in the model is still returned.
+
+        Returns:
+            Model and view fields that are other than at the capture before; None,
+            which is usual, where all are the same.
+
+        Raises:
+            PicturesDiffer: the picture of this moment cannot be made from a snapshot,
+                which was possible when the episode began.
+        """
+        self._look_who_is_there()
+        stored, pictures = self._stored, self._pictures
+        if stored is None or pictures is None:
+            raise _not_begun()
+        if self._refusal is not None:
+            return self._changed_fields(stored)
+        if self._obstacle is not None and (reason := self._obstacle()) is not None:
+            raise _differs(reason)
+        if self._at_picture is None:
+            return self._captured(stored, pictures, out)
+        return _called_in(
+            self._at_picture, lambda: self._captured(stored, pictures, out)
+        )
+
+    def model_changed(self) -> None:
+        """Note that anything in the model may be another; the next capture looks."""
+        self._look_at_everything = True
+
+    def finish(self) -> None:
+        """Wait until every model is stored.
+
+        Raises:
+            FileNotWritten: one could not be.
+        """
+        if self._store is not None:
+            self._store.finish()
+
+    def close(self) -> None:
+        """Let go of model and data; idempotent. What waits is still stored."""
+        if self._store is not None:
+            self._store.leave()
+        self._stored = self._pictures = None
+        self._seen = (None, None)
+
+    def _stored_model(
+        self, model: mujoco.MjModel
+    ) -> tuple[_StoredModel, dict[str, NDArray[Any]]]:
+        """Return the model as stored, and what of it is other than that now."""
+        if self._stored is not None and self._stored.memory.is_of(model):
+            fields = self._stored.memory.changed_from_stored()
+            if all(is_settable(name) for name in fields):
+                return self._stored, fields
+        if self._store is None:
+            raise ClosedError("Call open() with a directory before the first episode.")
+        authored = self._authored() if self._authored is not None else None
+        facts = self._store.add(model, authored)
+        self._stored, self._pictures = _StoredModel(model, facts), None
+        return self._stored, {}
+
+    def _episode_pictures(self, stored: _StoredModel) -> PictureStates:
+        view = self._view()
+        pictures = self._pictures
+        if pictures is None or not pictures.goes_on_with(stored.data, view):
+            pictures = self._pictures = stored.pictures(view)
+        return pictures
+
+    def _reason_against(
+        self, pictures: PictureStates, fields: Mapping[str, Any]
+    ) -> str | None:
+        reason = self._obstacle() if self._obstacle is not None else None
+        if reason is not None:
+            return reason
+        if self._at_picture is None or pictures.is_sound(fields):
+            return pictures.refusal(fields)
+        return _called_in(self._at_picture, lambda: pictures.refusal(fields))
+
+    def _captured(
+        self, stored: _StoredModel, pictures: PictureStates, out: NDArray[np.uint8]
+    ) -> dict[str, NDArray[Any]] | None:
+        of_view = pictures.take(out)
+        of_model = self._changed_fields(stored)
+        if of_view is None and of_model is None:
+            return None
+        changed = {**(of_model or {}), **(of_view or {})}
+        reason = pictures.objection(out, changed)
+        if reason is not None:
+            raise _differs(reason)
+        return changed
+
+    def _changed_fields(self, stored: _StoredModel) -> dict[str, NDArray[Any]] | None:
+        if self._look_at_everything:
+            self._look_at_everything = False
+            changed = stored.memory.anything_changed()
+        else:
+            changed = stored.memory.changed()
+        if changed is not None:
+            _check_settable(changed)
+        return changed
+
+    def _look_who_is_there(self) -> None:
+        model, data = self._simulation()
+        if model is not self._seen[0] or data is not self._seen[1]:
+            self._go_over_to(model, data)
+
+    def _go_over_to(self, model: Any, data: Any) -> None:
+        """Take note of other objects in mid-episode."""
+        stored, pictures = self._stored, self._pictures
+        if stored is None or pictures is None:
+            raise _not_begun()
+        if not stored.memory.is_of(raw_model(model)):
+            raise _differs("the environment has gone over to another model")
+        stored.follow(raw_data(data))
+        self._pictures = stored.pictures(pictures.view)
+        self._seen = (model, data)
+
+
+class _StoredModel:
+    """A model that is stored, and what is known of it.
+
+    Args:
+        model: the model.
+        facts: where it is stored.
+
+    Attributes:
+        data: the data whose states are recorded.
+    """
+
+    data: mujoco.MjData
+
+    def __init__(self, model: mujoco.MjModel, facts: dict[str, Any]) -> None:
+        self.memory = ModelMemory(model)
+        self.facts = facts
+        self.components = state_components(model)
+        self._model = model
+        self._checked = CheckedPictures()
+        self._kept: KeptCameras | None = None
+        self._state = np.empty(mujoco.mj_stateSize(model, STATE_SPEC))
+        self._state_bytes = self._state.view(np.uint8)
+
+    def follow(self, data: mujoco.MjData) -> None:
+        """Record the states of `data` from here on."""
+        self.data = data
+
+    def write_state(self, out: NDArray[np.uint8]) -> None:
+        """Write the state into `out`, which need not be aligned."""
+        mujoco.mj_getState(self._model, self.data, self._state, STATE_SPEC)
+        out[:] = self._state_bytes
+
+    def pictures(self, view: SceneView) -> PictureStates:
+        """Return what takes snapshots of the data."""
+        return PictureStates(
+            self._model,
+            self.data,
+            view,
+            kept=self._kept_cameras(view),
+            checked=self._checked,
+        )
+
+    def _kept_cameras(self, view: SceneView) -> KeptCameras | None:
+        if view.fresh:
+            return None
+        if self._kept is None and has_infinite_plane(self._model):
+            self._kept = KeptCameras(self._model)
+        return self._kept
+
+
+def _called_in(around: Callable[[Callable[[], None]], None], do: Callable[[], T]) -> T:
+    """Return what `do` returns when `around` calls it."""
+    results: list[T] = []
+    around(lambda: results.append(do()))
+    return results[-1]
+
+
+def _check_settable(changed: Iterable[str]) -> None:
+    names = [name for name in changed if not is_settable(name)]
+    if names:
+        raise _differs(
+            f"{', '.join(names)} of the model has changed in mid-episode, which "
+            "changes what the model consists of"
+        )
+
+
+def _differs(reason: str) -> PicturesDiffer:
+    return PicturesDiffer(
+        f"The picture of this moment cannot be made from the recorded state: {reason}. "
+        'Record the environment\'s own pictures with render="live".'
+    )
+
+
+def _not_begun() -> ClosedError:
+    return ClosedError("No episode is recorded: call begin_episode() first.")

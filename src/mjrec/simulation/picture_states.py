@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Snapshots of one simulation in one episode, and whether they can be trusted."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..formats.trajectory import RowLayout
+from .scene_check import scene_difference
+from .scene_view import SceneView, ViewMemory
+from .snapshot import SnapshotSource, needs_constraints, snapshot_layout
+
+__all__ = ["CheckedPictures", "KeptCameras", "PictureStates", "has_infinite_plane"]
+
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+
+
+class CheckedPictures:
+    """Remembers what the self-check has been made of, so that it is made once.
+
+    It is made of the first picture, and again of the first one that has a visual
+    option, or a changed field of the model, that none before it had.
+    """
+
+    def __init__(self) -> None:
+        self._options: set[bytes] = set()
+        self._fields: set[str] = set()
+
+    def covers(self, option: mujoco.MjvOption, fields: Iterable[str]) -> bool:
+        """Tell whether pictures with this option and these fields changed are sound."""
+        return _key(option) in self._options and self._fields.issuperset(fields)
+
+    def add(self, option: mujoco.MjvOption, fields: Iterable[str]) -> None:
+        """Note that a picture with this option and these fields changed is sound."""
+        self._options.add(_key(option))
+        self._fields.update(fields)
+
+
+class KeptCameras:
+    """The cameras that each picture leaves in a scene that stays.
+
+    An infinite plane is drawn around the camera of the picture before. The positions
+    are those that MuJoCo computes, without any drawing.
+
+    Args:
+        model: the model of the scene.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._model = model
+        self._scene = mujoco.MjvScene(model, maxgeom=1)
+        self._drawn = False
+
+    @property
+    def positions(self) -> list[list[float]] | None:
+        """Of both cameras; None where no picture has been made in this scene."""
+        if not self._drawn:
+            return None
+        return [camera.pos.tolist() for camera in self._scene.camera]
+
+    def drawn(self, data: mujoco.MjData, camera: mujoco.MjvCamera) -> None:
+        """Note that a picture of `data` has been made."""
+        # A camera that follows something would be moved.
+        mujoco.mjv_updateCamera(self._model, data, copy.copy(camera), self._scene)
+        self._drawn = True
+
+
+class PictureStates:
+    """Takes snapshots of one simulation.
+
+    Args:
+        model: the model; kept alive, as is the data.
+        data: its data.
+        view: how the scene is shown.
+        kept: told of every picture, where one has an influence on the next.
+        checked: what is known to be sound.
+
+    Attributes:
+        layout: of the snapshots.
+        view: as given.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        view: SceneView,
+        *,
+        kept: KeptCameras | None,
+        checked: CheckedPictures,
+    ) -> None:
+        self.layout = snapshot_layout(model, view.option)
+        self.view = view
+        self._model = model
+        self._data = data
+        self._kept = kept
+        self._checked = checked
+        self._source = SnapshotSource(model, data, self.layout)
+        self._watched = ViewMemory(view)
+
+    def goes_on_with(self, data: mujoco.MjData, view: SceneView) -> bool:
+        """Go on with another episode, if it can be recorded in the same way.
+
+        Args:
+            data: of this episode; another one, or a view of other objects, needs other
+                `PictureStates`.
+            view: of this episode.
+        """
+        if (
+            data._address != self._data._address
+            or view.camera is not self.view.camera
+            or view.option is not self.view.option
+            or view.fresh is not self.view.fresh
+        ):
+            return False
+        self.view = view
+        # What has changed since the last episode is no news in this one.
+        self._watched.changed()
+        return snapshot_layout(self._model, view.option) == self.layout
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts of the scene, and what the picture before left in it."""
+        previous = None if self._kept is None else self._kept.positions
+        return {**self.view.facts(), "previous_cameras": previous}
+
+    def is_sound(self, changed_fields: Iterable[str]) -> bool:
+        """Tell whether pictures with these fields changed were checked before."""
+        return self._checked.covers(self.view.option, changed_fields)
+
+    def refusal(self, changed_fields: Iterable[str]) -> str | None:
+        """Say why pictures of this moment cannot be made from snapshots.
+
+        Args:
+            changed_fields: of the model, other than in the stored one.
+        """
+        reason = needs_constraints(self._model, self.view.option)
+        if reason is not None or self._checked.covers(self.view.option, changed_fields):
+            return reason
+        row = np.empty(self.layout.size, np.uint8)
+        self._source.take(row)
+        return self._difference(row, changed_fields)
+
+    def take(self, out: NDArray[np.uint8]) -> dict[str, NDArray[Any]] | None:
+        """Write a snapshot into `out`, and return what of the view has changed."""
+        self._source.take(out)
+        if self._kept is not None:
+            self._kept.drawn(self._data, self.view.camera)
+        return self._watched.changed()
+
+    def objection(self, row: NDArray[np.uint8], changed: Iterable[str]) -> str | None:
+        """Say why a snapshot does not suffice any longer, after something has changed.
+
+        Args:
+            row: the snapshot of this moment.
+            changed: the fields of model and view that have.
+        """
+        option = self.view.option
+        fields = [name for name in changed if not name.startswith("camera.")]
+        if self._checked.covers(option, fields):
+            return None
+        reason = needs_constraints(self._model, option)
+        if reason is not None:
+            return reason
+        missing = _names(snapshot_layout(self._model, option)) - _names(self.layout)
+        if missing:
+            return (
+                f"it now needs {', '.join(sorted(missing))} as well, which the "
+                "recording of this episode was not begun with"
+            )
+        return self._difference(row, fields)
+
+    def _difference(
+        self, row: NDArray[np.uint8], changed_fields: Iterable[str]
+    ) -> str | None:
+        difference = scene_difference(
+            self._model, self._data, self.layout, row, self.view
+        )
+        if difference is None:
+            self._checked.add(self.view.option, changed_fields)
+            return None
+        return f"drawn from its snapshot the scene is another one: {difference}"
+
+
+def has_infinite_plane(model: mujoco.MjModel) -> bool:
+    """Tell whether the model has a plane without an edge."""
+    planes = model.geom_size[model.geom_type == _PLANE]
+    return bool((planes[:, :2] <= 0).any())
+
+
+def _key(option: mujoco.MjvOption) -> bytes:
+    numbers = (option.label, option.frame, option.bvh_depth, option.flex_layer)
+    groups = (
+        *(option.geomgroup, option.sitegroup, option.jointgroup, option.tendongroup),
+        *(option.actuatorgroup, option.flexgroup, option.skingroup, option.flags),
+    )
+    return b"".join((repr(numbers).encode(), *(group.tobytes() for group in groups)))
+
+
+def _names(layout: RowLayout) -> set[str]:
+    return {field.name for field in layout.fields}

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Proof that a snapshot holds what the visualiser reads, on the spot.
+
+MuJoCo may read a field that we do not know of, and a plugin reads whatever it likes.
+Putting a scene together needs no OpenGL and microseconds: one is made from the live
+data and one from what a snapshot brings back, and they have to be the same.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..formats.trajectory import RowLayout
+from .drawing_plugins import drawing_plugin
+from .scene_view import SceneView
+from .snapshot import restore_snapshot
+from .struct_memory import kind_of
+
+__all__ = ["scene_difference", "updated_scene"]
+
+_EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
+
+# Not set by `mjv_updateScene` in every geom, or only later, when it is drawn.
+_NOT_SET = ("camdist", "modelrbound", "transparent", "label")
+
+
+def scene_difference(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    layout: RowLayout,
+    row: NDArray[np.uint8],
+    view: SceneView,
+) -> str | None:
+    """Say in what the picture of a snapshot would differ from the one of the live data.
+
+    Neither model nor data is written to.
+
+    Args:
+        model: the model of this moment.
+        data: its data.
+        layout: of the snapshot.
+        row: the snapshot of this moment, `(layout.size,) uint8`.
+        view: how the scene is shown.
+
+    Returns:
+        What differs, in words; None where the scenes are the same.
+    """
+    plugin = drawing_plugin(model)
+    if plugin is not None:
+        return f"the plugin {plugin} draws by itself, from what it alone knows"
+    # Where tendons have colours of their own these are set in the model.
+    restored_model = copy.copy(model) if _sets_model(layout) else model
+    restored = mujoco.MjData(restored_model)
+    restore_snapshot(layout.unpack(row), restored_model, restored)
+    live = updated_scene(model, data, view)
+    again = updated_scene(restored_model, restored, view)
+    return next(_differences(live, again, view), None)
+
+
+def updated_scene(
+    model: mujoco.MjModel, data: mujoco.MjData, view: SceneView
+) -> mujoco.MjvScene:
+    """Return a new scene of `data`; the view is left as it is."""
+    scene = mujoco.MjvScene(model, maxgeom=view.max_geom)
+    # A camera that follows something is moved by what it follows.
+    camera = copy.copy(view.camera)
+    mujoco.mjv_updateScene(model, data, view.option, None, camera, _EVERYTHING, scene)
+    return scene
+
+
+def _sets_model(layout: RowLayout) -> bool:
+    return any(field.name == "tendon_rgba" for field in layout.fields)
+
+
+def _differences(
+    live: mujoco.MjvScene, again: mujoco.MjvScene, view: SceneView
+) -> Iterator[str]:
+    if live.ngeom != again.ngeom:
+        yield f"{again.ngeom} geoms instead of {live.ngeom}"
+    shown = min(live.ngeom, again.ngeom)
+    labelled = view.option.label != int(mujoco.mjtLabel.mjLABEL_NONE)
+    without = tuple(n for n in _NOT_SET if not (labelled and n == "label"))
+    yield from _different("geom", live.geoms[:shown], again.geoms[:shown], without)
+    if live.nlight != again.nlight:
+        yield f"{again.nlight} lights instead of {live.nlight}"
+    lights = slice(min(live.nlight, again.nlight))
+    yield from _different("light", live.lights[lights], again.lights[lights])
+    yield from _different("camera", live.camera, again.camera)
+    for name in _scene_arrays():
+        if _value(live, name) != _value(again, name):
+            yield f"the scene's {name}"
+
+
+def _different(
+    what: str,
+    live: Iterable[Any],
+    again: Iterable[Any],
+    without: tuple[str, ...] = (),
+) -> Iterator[str]:
+    for index, (one, other) in enumerate(zip(live, again, strict=True)):
+        names = [n for n in _members(kind_of(one)) if n not in without]
+        differing = [n for n in names if _value(one, n) != _value(other, n)]
+        if differing:
+            yield f"{', '.join(differing)} of {what} {index} of the scene"
+
+
+def _value(struct: Any, name: str) -> Any:
+    value = getattr(struct, name)
+    # By bytes: a NaN is the same as a NaN, and -0.0 is not 0.0.
+    return value.tobytes() if isinstance(value, np.ndarray) else value
+
+
+@functools.cache
+def _members(kind: Any) -> tuple[str, ...]:
+    names = (name for name in dir(kind) if not name.startswith("_"))
+    return tuple(n for n in names if not callable(getattr(kind, n)))
+
+
+@functools.cache
+def _scene_arrays() -> tuple[str, ...]:
+    """Return the names of what holds the shapes of skins and flexes."""
+    names = (name for name in dir(mujoco.MjvScene) if not name.startswith("_"))
+    return tuple(name for name in names if name.startswith(("skin", "flex")))

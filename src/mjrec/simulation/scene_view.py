@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How an environment shows its scene: the camera, the options, the size."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InvalidArgument
+from .struct_memory import (
+    Members,
+    Memory,
+    Place,
+    array_address,
+    find_places,
+    kind_of,
+    member_names,
+    read_member,
+)
+
+__all__ = ["SceneView", "ViewMemory", "scene_view_from_facts"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneView:
+    """What a picture depends on besides model and data.
+
+    Attributes:
+        camera: the environment's own live camera, or one of ours.
+        option: likewise the visual options, which are not always MuJoCo's default.
+        max_geom: how many geoms the scene may have; the rest is not drawn.
+        fresh: whether each picture gets a new scene, as in dm_control. In a scene that
+            stays, an infinite plane is drawn around the camera of the picture before.
+        height: of the pictures, in pixels.
+        width: likewise.
+        label: what metadata calls the camera: a name, a number, or where it is.
+    """
+
+    camera: mujoco.MjvCamera
+    option: mujoco.MjvOption
+    max_geom: int
+    fresh: bool
+    height: int
+    width: int
+    label: Any
+
+    def facts(self) -> dict[str, Any]:
+        """Return what JSON can hold of it, all of it."""
+        return {
+            "camera": _struct_facts(self.camera),
+            "option": _struct_facts(self.option),
+            "max_geom": int(self.max_geom),
+            "fresh": bool(self.fresh),
+            "height": int(self.height),
+            "width": int(self.width),
+            "label": self.label,
+            "previous_cameras": None,
+        }
+
+    def detached(self) -> SceneView:
+        """Return the same view with a camera and an option of its own."""
+        return SceneView(
+            camera=copy.copy(self.camera),
+            option=copy.copy(self.option),
+            max_geom=self.max_geom,
+            fresh=self.fresh,
+            height=self.height,
+            width=self.width,
+            label=self.label,
+        )
+
+
+def scene_view_from_facts(facts: Mapping[str, Any]) -> SceneView:
+    """Return the view that `SceneView.facts` has described.
+
+    Raises:
+        InvalidArgument: something is missing, or is not what it should be; the facts
+            may come from a file.
+    """
+    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+    _set_struct(camera, facts.get("camera"), "camera")
+    _set_struct(option, facts.get("option"), "option")
+    return SceneView(
+        camera=camera,
+        option=option,
+        max_geom=_whole(facts, "max_geom"),
+        fresh=facts.get("fresh") is True,
+        height=_whole(facts, "height"),
+        width=_whole(facts, "width"),
+        label=facts.get("label"),
+    )
+
+
+class ViewMemory:
+    """Notices when somebody moves the camera or sets an option of a view.
+
+    Args:
+        view: whose objects are watched, and kept alive.
+    """
+
+    def __init__(self, view: SceneView) -> None:
+        self._view = view
+        self._camera = _memory_of(view.camera)
+        self._option = _memory_of(view.option)
+        self._camera_seen = self._camera.copy()
+        self._option_seen = self._option.copy()
+        self._camera_raw = self._camera.raw
+        self._option_raw = self._option.raw
+
+    def changed(self) -> dict[str, NDArray[Any]] | None:
+        """Return what is other than when last asked, as `camera.lookat` and so on.
+
+        Returns:
+            Copies by their names; None, at once, where all is the same.
+        """
+        if (
+            self._camera_seen == self._camera_raw
+            and self._option_seen == self._option_raw
+        ):
+            return None
+        fields = {
+            f"camera.{name}": read_member(self._view.camera, name)
+            for name in self._camera.differing(self._camera_seen)
+        }
+        for name in self._option.differing(self._option_seen):
+            fields[f"option.{name}"] = read_member(self._view.option, name)
+        self._camera_seen = self._camera.copy()
+        self._option_seen = self._option.copy()
+        return fields or None
+
+
+@functools.cache
+def _names(kind: Any) -> tuple[str, ...]:
+    return tuple(member_names(kind()))
+
+
+def _struct_facts(struct: Any) -> dict[str, Any]:
+    names = _names(kind_of(struct))
+    return {name: read_member(struct, name).tolist() for name in names}
+
+
+def _set_struct(struct: Any, values: object, what: str) -> None:
+    names = _names(kind_of(struct))
+    if not isinstance(values, Mapping) or values.keys() != set(names):
+        raise InvalidArgument(
+            f"A {what} needs exactly these values: {', '.join(names)}; "
+            f"got {values!r:.200}."
+        )
+    for name in names:
+        _set_member(struct, name, values[name], what)
+
+
+def _set_member(struct: object, name: str, value: Any, what: str) -> None:
+    present = getattr(struct, name)
+    given = np.asarray(value)
+    if given.dtype.kind not in "iuf" or given.shape != np.shape(present):
+        raise InvalidArgument(
+            f"{name} of a {what} has to be numbers of the shape {np.shape(present)} in "
+            f"MuJoCo {mujoco.__version__}, got {value!r:.200}."
+        )
+    if isinstance(present, np.ndarray):
+        present[...] = given
+    else:
+        setattr(struct, name, type(present)(given.item()))
+
+
+def _whole(facts: Mapping[str, Any], name: str) -> int:
+    value = facts.get(name)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise InvalidArgument(
+            f"{name} of a scene has to be a whole number of at least 1, got {value!r}."
+        )
+    return value
+
+
+# How far a camera and an option reach before their first and behind their last array.
+# Nothing beyond is looked at: it belongs to somebody else, and may change any time.
+_REACH = {mujoco.MjvCamera: (16, 32), mujoco.MjvOption: (8, 8)}
+
+
+def _memory_of(struct: Any) -> Memory | Members:
+    names = list(_names(kind_of(struct)))
+    found = _places(kind_of(struct))
+    if found is None:
+        return Members(struct, names)
+    offset, places = found
+    return Memory(_span_of_arrays(struct)[0] + offset, list(places))
+
+
+@functools.cache
+def _places(kind: Any) -> tuple[int, tuple[Place, ...]] | None:
+    """Return where a struct begins, from its first array on, and its members."""
+    struct = kind()
+    first, last = _span_of_arrays(struct)
+    before, behind = _REACH[kind]
+    start, stop = first - before, last + -last % 4 + behind
+    places = find_places(struct, list(_names(kind)), start=start, stop=stop)
+    return None if places is None else (-before, tuple(places))
+
+
+def _span_of_arrays(struct: Any) -> tuple[int, int]:
+    values = [getattr(struct, name) for name in _names(kind_of(struct))]
+    arrays = [value for value in values if isinstance(value, np.ndarray)]
+    starts = [array_address(array) for array in arrays]
+    stops = [array_address(array) + array.nbytes for array in arrays]
+    return min(starts), max(stops)

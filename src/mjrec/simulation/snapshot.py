@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a picture of a moment is made from, as one row of bytes.
+
+MuJoCo's visualiser reads some twenty of the hundred and more arrays of `MjData`. They
+are copied as they are in the moment of the picture, because they do not follow from
+the physics state alone: after a step they belong to the state before its last substep,
+and environments move things just before they draw. Restored into fresh data they give
+the same scene, byte for byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InvalidArgument
+from ..formats.trajectory import Array, RowLayout
+from .struct_memory import array_address
+from .tendon_colours import TendonColours, has_limited_tendons, has_plastic_tendons
+
+__all__ = [
+    "SnapshotSource",
+    "needs_constraints",
+    "restore_snapshot",
+    "snapshot_layout",
+]
+
+# Not an array of `MjData`: the colours that tendons have in the picture. They are
+# restored into the model's array of this name.
+_TENDON_RGBA = "tendon_rgba"
+
+# Arrays of `MjData` in the order in which it has them, so that neighbours are copied at
+# once: type, the model's size that settles their length, and the numbers in a row.
+_ARRAYS: dict[str, tuple[str, str, tuple[int, ...]]] = {
+    "act": ("<f8", "na", ()),
+    "plastic": ("<f8", "nplastic", ()),
+    "ctrl": ("<f8", "nu", ()),
+    "xfrc_applied": ("<f8", "nbody", (6,)),
+    "eq_active": ("|u1", "neq", ()),
+    "sensordata": ("<f8", "nsensordata", ()),
+    "xpos": ("<f8", "nbody", (3,)),
+    "xquat": ("<f8", "nbody", (4,)),
+    "xmat": ("<f8", "nbody", (9,)),
+    "xipos": ("<f8", "nbody", (3,)),
+    "ximat": ("<f8", "nbody", (9,)),
+    "xanchor": ("<f8", "njnt", (3,)),
+    "xaxis": ("<f8", "njnt", (3,)),
+    "geom_xpos": ("<f8", "ngeom", (3,)),
+    "geom_xmat": ("<f8", "ngeom", (9,)),
+    "site_xpos": ("<f8", "nsite", (3,)),
+    "site_xmat": ("<f8", "nsite", (9,)),
+    "cam_xpos": ("<f8", "ncam", (3,)),
+    "cam_xmat": ("<f8", "ncam", (9,)),
+    "light_xpos": ("<f8", "nlight", (3,)),
+    "light_xdir": ("<f8", "nlight", (3,)),
+    "subtree_com": ("<f8", "nbody", (3,)),
+    "flexvert_xpos": ("<f8", "nflexvert", (3,)),
+    "bvh_aabb_dyn": ("<f8", "nbvhdynamic", (6,)),
+    "ten_wrapadr": ("<i4", "ntendon", ()),
+    "ten_wrapnum": ("<i4", "ntendon", ()),
+    "ten_length": ("<f8", "ntendon", ()),
+    "wrap_obj": ("<i4", "nwrap", (2,)),
+    "wrap_xpos": ("<f8", "nwrap", (6,)),
+    "bvh_active": ("|u1", "nbvh", ()),
+}
+
+# What any camera may need with MuJoCo's default option, wherever there is any of it.
+_ALWAYS = (
+    *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat"),
+    *("light_xpos", "light_xdir", "subtree_com", "flexvert_xpos"),
+    *("ten_wrapadr", "ten_wrapnum", "ten_length", "wrap_obj", "wrap_xpos"),
+)
+_FOR_SKINS = ("xpos", "xquat")
+_BODIES = ("xpos", "xmat", "xipos", "ximat")
+
+# What a flag that is off by default needs besides.
+_FOR_FLAGS: dict[str, tuple[str, ...]] = {
+    "mjVIS_JOINT": ("xanchor", "xaxis", "xmat"),
+    "mjVIS_ACTUATOR": ("ctrl", "act", "xanchor", "xaxis", "xmat"),
+    "mjVIS_ACTIVATION": ("act",),
+    "mjVIS_CONSTRAINT": ("eq_active", "xpos", "xmat"),
+    "mjVIS_INERTIA": ("xipos", "ximat"),
+    "mjVIS_SCLINERTIA": ("xipos", "ximat"),
+    "mjVIS_PERTFORCE": ("xfrc_applied", "xipos"),
+    "mjVIS_SELECT": _BODIES,
+    "mjVIS_AUTOCONNECT": ("xanchor", "xipos"),
+    "mjVIS_BODYBVH": ("xipos", "ximat", "bvh_active"),
+    # Until mujoco 3.3 on their own.
+    "mjVIS_FLEXBVH": ("bvh_aabb_dyn", "bvh_active", "xpos", "xmat"),
+    "mjVIS_MESHBVH": ("bvh_aabb_dyn", "bvh_active", "xpos", "xmat"),
+}
+_FRAMES_OF_BODIES = ("mjFRAME_BODY", "mjFRAME_WORLD")
+
+# Read from the constraints of a step, which cannot be put into fresh data.
+_CONSTRAINT_FLAGS = ("mjVIS_CONTACTPOINT", "mjVIS_CONTACTFORCE", "mjVIS_CONTACTSPLIT")
+
+# Sensors whose reading is drawn: as rays.
+_DRAWN_SENSORS = ("mjSENS_RANGEFINDER", "mjSENS_GEOMFROMTO")
+
+
+def snapshot_layout(
+    model: mujoco.MjModel, option: mujoco.MjvOption | None = None
+) -> RowLayout:
+    """Return what of a simulation's data a snapshot holds.
+
+    Everything that the default option and any camera needs, and what `option` needs
+    besides, as far as the model has any of it.
+
+    Args:
+        model: the model.
+        option: how it is shown; None is MuJoCo's default.
+    """
+    names = set(_ALWAYS)
+    if model.nskin:
+        names.update(_FOR_SKINS)
+    if has_plastic_tendons(model):
+        names.add("plastic")
+    if _has_sensor(model, _DRAWN_SENSORS):
+        names.add("sensordata")
+    if option is not None:
+        names.update(_for_option(option))
+    arrays = [(name, _array(model, name)) for name in _ARRAYS if name in names]
+    if has_limited_tendons(model):
+        arrays.append((_TENDON_RGBA, Array("<f4", (model.ntendon, 4))))
+    return RowLayout.packed((name, array) for name, array in arrays if array.size)
+
+
+def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | None:
+    """Say what `option` shows that no snapshot holds; None if there is nothing.
+
+    Contacts, constraint islands and joints at their limits are drawn from the
+    constraints of a step.
+    """
+    shown = [name for name in _CONSTRAINT_FLAGS if _flag(option, name)]
+    if _flag(option, "mjVIS_ISLAND") and _has_islands(model):
+        shown.append("mjVIS_ISLAND")
+    if _flag(option, "mjVIS_JOINT") and model.jnt_limited.any():
+        shown.append("mjVIS_JOINT")
+    if option.frame == int(mujoco.mjtFrame.mjFRAME_CONTACT):
+        shown.append("mjFRAME_CONTACT")
+    if option.label == int(mujoco.mjtLabel.mjLABEL_ISLAND):
+        shown.append("mjLABEL_ISLAND")
+    if not shown:
+        return None
+    return (
+        f"{' and '.join(shown)} of the visual options show constraints (contacts, "
+        "joints at their limits), which are gone once the step is over"
+    )
+
+
+def restore_snapshot(
+    values: Mapping[str, NDArray[Any]], model: mujoco.MjModel, data: mujoco.MjData
+) -> None:
+    """Put what a snapshot holds back, ready for `mjv_updateScene`.
+
+    Args:
+        values: the arrays by their names, as `RowLayout.unpack` gives them.
+        model: the colours of its tendons are set where `values` has them.
+        data: its data.
+
+    Raises:
+        InvalidArgument: an array is not there, or has another shape.
+    """
+    for name, value in values.items():
+        target = model if name == _TENDON_RGBA else data
+        known = name == _TENDON_RGBA or name in _ARRAYS
+        present = getattr(target, name, None) if known else None
+        if present is None or present.shape != value.shape:
+            shape = None if present is None else present.shape
+            raise InvalidArgument(
+                f"The snapshot's {name} has the shape {value.shape}, and here it is "
+                f"{shape}: it belongs to another model or version of MuJoCo."
+            )
+        present[...] = value
+
+
+class SnapshotSource:
+    """Takes snapshots of one `MjData`.
+
+    Args:
+        model: the model; kept alive, as is the data.
+        data: its data.
+        layout: what `snapshot_layout` gave for the model.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, layout: RowLayout
+    ) -> None:
+        self.data = data
+        self._colours: TendonColours | None = None
+        arrays = []
+        for field in layout.fields:
+            if field.name == _TENDON_RGBA:
+                self._colours = TendonColours(model, data)
+                arrays.append(self._colours.rgba)
+            else:
+                arrays.append(getattr(data, field.name))
+        self._views = _joined([array.reshape(-1).view(np.uint8) for array in arrays])
+
+    def take(self, out: NDArray[np.uint8]) -> None:
+        """Write a snapshot of this moment into `out`, `(layout.size,) uint8`."""
+        if self._colours is not None:
+            self._colours.update()
+        if self._views:
+            # The quickest way there is to copy a few short arrays.
+            np.concatenate(self._views, out=out)
+
+
+def _joined(views: list[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+    """Return views of the same bytes, those that are neighbours in memory as one."""
+    joined: list[NDArray[np.uint8]] = []
+    for view in views:
+        last = joined[-1] if joined else None
+        if last is not None and array_address(last) + last.nbytes == array_address(
+            view
+        ):
+            joined[-1] = np.lib.stride_tricks.as_strided(
+                last, (last.size + view.size,), writeable=False
+            )
+        else:
+            joined.append(view)
+    return joined
+
+
+def _array(model: mujoco.MjModel, name: str) -> Array:
+    dtype, size, row = _ARRAYS[name]
+    # `nplastic` and others are not in every version.
+    return Array(dtype, (int(getattr(model, size, 0)), *row))
+
+
+def _for_option(option: mujoco.MjvOption) -> set[str]:
+    names = {
+        name
+        for flag, needed in _FOR_FLAGS.items()
+        if _flag(option, flag)
+        for name in needed
+    }
+    frames = [int(getattr(mujoco.mjtFrame, name)) for name in _FRAMES_OF_BODIES]
+    if option.frame in frames or option.label != int(mujoco.mjtLabel.mjLABEL_NONE):
+        names.update(_BODIES)
+    return names
+
+
+def _flag(option: mujoco.MjvOption, name: str) -> bool:
+    index = getattr(mujoco.mjtVisFlag, name, None)
+    return index is not None and bool(option.flags[int(index)])
+
+
+def _has_islands(model: mujoco.MjModel) -> bool:
+    """Tell whether islands of constraints are looked for in this model."""
+    # In mujoco 3.3 they had to be enabled, and the flag that shows them was on.
+    enabling = getattr(mujoco.mjtEnableBit, "mjENBL_ISLAND", None)
+    if enabling is not None:
+        return bool(model.opt.enableflags & int(enabling))
+    return not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+
+
+def _has_sensor(model: mujoco.MjModel, names: tuple[str, ...]) -> bool:
+    kinds = [getattr(mujoco.mjtSensor, name, None) for name in names]
+    numbers = [int(kind) for kind in kinds if kind is not None]
+    return bool(np.isin(model.sensor_type, numbers).any())
