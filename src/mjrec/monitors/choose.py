@@ -10,7 +10,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidArgument
-from ..recorder.recorder import RecorderOptions
+from ..recorder.options import RecorderOptions
 
 if TYPE_CHECKING:
     from .dm_env_monitor import DmEnvMonitor
@@ -34,6 +34,12 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     camera: Any = None,
     width: int | None = None,
     height: int | None = None,
+    max_fps: float | Fraction | None = None,
+    quality: str = "full",
+    render: str | None = None,
+    workers: int | None = None,
+    trajectory_callable: Callable[[int], Any] | bool | None = None,
+    observations: bool = False,
     allow_early_reset: bool | None = None,
     env_id: str | None = None,
 ) -> GymnasiumMonitor | DmEnvMonitor:
@@ -44,10 +50,17 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
         with mjrec.Monitor(env, "recordings/run1") as env:
             observation, info = env.reset(seed=0)
 
+    Where the pictures of a MuJoCo environment follow from its state, the state is
+    recorded, and processes of their own draw the pictures beside the simulation:
+    stepping is hardly slowed down, and any recorded episode can be rendered again
+    (`mjrec.render`). They are byte for byte those of `env.render()` at that moment.
+    Other environments are drawn while they step, through their own `render()`.
+
     Args:
-        env: a Gymnasium environment, made with `render_mode="rgb_array"` (or
-            `"rgb_array_list"`, `"ansi"`), or a dm_env environment such as
-            `dm_control.suite.load(...)`.
+        env: a Gymnasium environment or a dm_env environment such as
+            `dm_control.suite.load(...)`. Where pictures are drawn live it must be
+            made with `render_mode="rgb_array"` (or `"rgb_array_list"`, `"ansi"`);
+            deferred rendering needs no `render_mode`, and no OpenGL in this process.
         directory: where the recordings go. It is made where it is missing.
         video_callable: which episodes get a video: a function from the episode's
             number, from 0, to a bool; None for `capped_cubic_video_schedule`; False
@@ -69,6 +82,23 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             None is what the environment itself shows.
         width: of the videos, in pixels; None is the environment's own.
         height: likewise.
+        max_fps: the most frames per second of simulated time: steps 0, n, 2n ... with
+            the smallest whole n that fits, and the last. None is every step.
+        quality: "full", the model's own settings, or "draft", without multisampling
+            and with a small shadow map: several times faster, for a quick look.
+            Deferred rendering only; what is drawn live is as the environment draws it.
+        render: "deferred" (states now, pictures later), "live" (pictures in `step`),
+            "off" (statistics and trajectories only), or None: deferred where the
+            pictures are known to follow from the states, else live. The log and the
+            metadata say which, and why.
+        workers: how many processes draw deferred pictures; None is one for each CPU
+            that may be used, shared by all monitors of a directory; 0 draws nothing
+            now and leaves the videos pending: `mjrec render DIR` makes them.
+        trajectory_callable: which episodes keep their trajectory: a function from the
+            episode's number to a bool, True for all, False for none (that of a video
+            is then removed once the video is there). None is all episodes of type
+            evaluation, and of the others those with a video.
+        observations: whether trajectories hold observations too.
         allow_early_reset: whether a reset in mid-episode is allowed; the episode is
             then no part of the statistics, and its video is marked incomplete. None
             is what the framework has: no for Gymnasium, yes for dm_env.
@@ -82,6 +112,8 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     Raises:
         InvalidArgument: `env` is neither, or an argument cannot be.
         NoPictures: videos were asked for of an environment that gives no pictures.
+        PicturesDiffer: `render="deferred"`, and what the environment shows cannot be
+            made from its state; the message names what stands in the way.
         ExistingRecordings: the directory holds recordings, and neither `force` nor
             `resume` was given.
         DirectoryInUse: `force`, and another monitor is recording there.
@@ -102,6 +134,12 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             uid=uid,
             mode=mode,
             fps=fps,
+            max_fps=max_fps,
+            quality=quality,
+            render=render,
+            workers=workers,
+            trajectory_callable=trajectory_callable,
+            observations=observations,
             allow_early_reset=(
                 monitor.allows_early_reset
                 if allow_early_reset is None

@@ -9,12 +9,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
+from ..environments.scenes import Scenes
+from ..errors import RenderError
 from ..recorder.declared_rate import declared_rate
+from ..recorder.deferred_video import DeferredVideo
 from ..recorder.exit_guard import ExitGuard
-from ..recorder.recorder import EpisodePictures, Recorder, RecorderOptions
+from ..recorder.options import DEFERRED, RecorderOptions
+from ..recorder.recorder import EpisodePictures, Recorder, Rendering, Subject
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.video_recorder import VideoRecorder
+from ..rendering.render_service import RenderService
 from ..simulation.inside import simulation_time
+from .rendering_choice import rendering_choice
+from .waiting import waiting_display
 
 __all__ = ["MonitorControls"]
 
@@ -31,6 +38,7 @@ class MonitorControls:
 
     _recorder: Recorder
     _guard: ExitGuard
+    _told_failures = False
 
     @property
     def directory(self) -> Path:
@@ -53,7 +61,7 @@ class MonitorControls:
         return self._recorder.stats_recorder
 
     @property
-    def video_recorder(self) -> VideoRecorder | None:
+    def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
         """Records the running episode (or not); None before the first reset."""
         return self._recorder.video_recorder
 
@@ -80,14 +88,36 @@ class MonitorControls:
         """Return the steps of each complete episode."""
         return list(self._recorder.stats_recorder.episode_lengths)
 
-    def close(self) -> None:
+    def model_changed(self) -> None:
+        """Say that a texture, a height field or a mesh was changed in mid-episode.
+
+        Everything else that changes in a model is noticed, and so are these at every
+        reset. The next recorded frame shows the change.
+        """
+        self._recorder.model_changed()
+
+    def close(self, *, wait: bool = True) -> None:
         """Finish the recordings, then close the environment. Idempotent.
+
+        Args:
+            wait: whether to wait, with a progress bar on a terminal, until all videos
+                are rendered; else what is not rendered yet is left pending, and
+                `mjrec render DIR` makes it. Ctrl-C while it waits is the same.
 
         Raises:
             EncoderError: the running video could not be finished; all else is.
+            RenderError: videos could not be rendered; all else is done, and their
+                trajectories are kept.
             FileNotWritten: the disk is full; the next call tries again.
         """
-        self._guard.close()
+        try:
+            if wait:
+                with waiting_display() as on_progress:
+                    self._recorder.finish(on_progress)
+        finally:
+            self._guard.close()
+        if wait:
+            self._raise_failures()
 
     def __enter__(self) -> Self:
         return self
@@ -95,13 +125,20 @@ class MonitorControls:
     def __exit__(self, *exc_info: Any) -> Literal[False]:
         _, first, _ = exc_info
         try:
-            self.close()
+            # Whoever leaves by an exception does not wait for videos.
+            self.close(wait=first is None)
         except Exception as second:
             if first is None:
                 raise
             # What went wrong first is what the user needs to see.
             first.add_note(f"Closing the monitor failed too: {second}")
         return False
+
+    def _raise_failures(self) -> None:
+        failures = self._recorder.failures()
+        if failures and not self._told_failures:
+            self._told_failures = True
+            raise RenderError(self.directory, failures)
 
     def _start(
         self,
@@ -110,41 +147,63 @@ class MonitorControls:
         *,
         env_id: str,
         pictures: EpisodePictures,
+        scenes: Scenes,
         options: RecorderOptions,
         close_environment: Callable[[Any], None],
     ) -> None:
         """Open the directory; from here on the environment is this monitor's."""
+        choice = rendering_choice(options.render, scenes, env_id)
         self._recorder = Recorder(
             directory,
-            env_id=env_id,
-            pictures=pictures,
+            subject=Subject(
+                env_id=env_id,
+                pictures=pictures,
+                clock=functools.partial(simulation_time, env),
+                declared=functools.partial(declared_rate, env),
+                rendering=choice,
+                states=scenes.states,
+                environment=scenes.environment,
+                random_state=scenes.random_state,
+            ),
             options=options,
-            clock=functools.partial(simulation_time, env),
-            declared=functools.partial(declared_rate, env),
+            rendering=_rendering(options.workers) if choice.mode == DEFERRED else None,
         )
         self._guard = ExitGuard(
             self,
             functools.partial(
                 _close,
                 self._recorder,
-                pictures,
+                (pictures, scenes.states),
                 functools.partial(close_environment, env),
             ),
         )
 
-    def _begin(self, *, seed: Any = None, options: Any = None) -> None:
+    def _begin(
+        self, *, seed: Any = None, options: Any = None, observation: Any = None
+    ) -> None:
         """Record that the environment has been reset."""
-        self._recorder.reset(seed=seed, options=options)
-        if self._recorder.video_recorder and self._recorder.video_recorder.enabled:
+        self._recorder.reset(seed=seed, options=options, observation=observation)
+        video = self._recorder.video_recorder
+        if isinstance(video, VideoRecorder) and video.enabled:
             # Drawing has loaded OpenGL by now, which tears itself down at exit.
             self._guard.run_first_at_exit()
 
 
+def _rendering(workers: int | None) -> Callable[[Path], Rendering] | None:
+    if workers == 0:
+        return None
+    return functools.partial(RenderService, workers=workers)
+
+
 def _close(
-    recorder: Recorder, pictures: EpisodePictures, close_environment: Callable[[], None]
+    recorder: Recorder,
+    acquired: tuple[Any, ...],
+    close_environment: Callable[[], None],
 ) -> None:
     try:
         recorder.close()
     finally:
-        pictures.close()
+        for each in acquired:
+            if each is not None:
+                each.close()
         close_environment()

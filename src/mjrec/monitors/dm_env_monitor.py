@@ -12,8 +12,9 @@ import dm_env
 
 from ..environments.dm_env_episodes import is_terminated, is_truncated
 from ..environments.no_pictures import NoPictureSource
+from ..environments.scenes import Scenes
 from ..errors import InvalidArgument
-from ..recorder.recorder import RecorderOptions
+from ..recorder.options import RecorderOptions
 from .controls import MonitorControls
 
 __all__ = ["DmEnvMonitor"]
@@ -57,11 +58,13 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
     ) -> None:
         self._env = env
         self.seed: Any = None
+        view = {"camera": camera, "height": height, "width": width}
         self._start(
             env,
             directory,
             env_id=env_id or _env_id(env),
-            pictures=_pictures(env, camera=camera, height=height, width=width),
+            pictures=_pictures(env, **view),
+            scenes=_scenes(env, **view),
             options=options,
             close_environment=operator.methodcaller("close"),
         )
@@ -75,8 +78,9 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
         if self._recorder.closed:
             return self._env.reset()
         self._recorder.before_reset()
-        timestep = self._env.reset()
-        self._begin(seed=self.seed)
+        with self._recorder.resetting():
+            timestep = self._env.reset()
+        self._begin(seed=self.seed, observation=timestep.observation)
         return timestep
 
     def step(self, action: Any) -> dm_env.TimeStep:
@@ -85,11 +89,12 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
             return self._env.step(action)
         if self._recorder.done is not False:
             return self.reset()
+        self._recorder.before_step(action)
         timestep = self._env.step(action)
         if timestep.first():
             # The environment was reset behind the monitor's back.
             self._recorder.before_reset()
-            self._begin(seed=self.seed)
+            self._begin(seed=self.seed, observation=timestep.observation)
         else:
             self._record(timestep)
         return timestep
@@ -122,6 +127,7 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
             0.0 if timestep.reward is None else timestep.reward,
             terminated=is_terminated(timestep),
             truncated=is_truncated(timestep),
+            observation=timestep.observation,
         )
 
 
@@ -138,6 +144,18 @@ def _pictures(
             f"environment, and {type(env).__name__} has no physics."
         )
     return NoPictureSource(_NO_PHYSICS)
+
+
+def _scenes(
+    env: dm_env.Environment, *, camera: Any, height: int | None, width: int | None
+) -> Scenes:
+    if getattr(env, "physics", None) is None:
+        return Scenes(
+            states=None, obstacle=None, environment=None, random_state=lambda: None
+        )
+    from ..environments.dm_control_scenes import dm_control_scenes
+
+    return dm_control_scenes(env, camera=camera, height=height, width=width)
 
 
 def _env_id(env: dm_env.Environment) -> str:

@@ -12,7 +12,8 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
-from ..recorder.recorder import RecorderOptions
+from ..environments.gymnasium_scenes import gymnasium_scenes
+from ..recorder.options import RecorderOptions
 from .controls import MonitorControls
 
 __all__ = ["GymnasiumMonitor"]
@@ -52,11 +53,13 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         self._next_step_autoreset = any(
             isinstance(wrapper, gymnasium.wrappers.Autoreset) for wrapper in _chain(env)
         )
+        view = {"camera": camera, "height": height, "width": width}
         self._start(
             env,
             directory,
             env_id=env_id or _env_id(env),
-            pictures=gymnasium_pictures(env, camera=camera, height=height, width=width),
+            pictures=gymnasium_pictures(env, **view),
+            scenes=gymnasium_scenes(env, **view),
             options=options,
             close_environment=close_environment,
         )
@@ -78,8 +81,9 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._recorder.closed:
             return self.env.reset(seed=seed, options=options)
         self._recorder.before_reset()
-        result = self.env.reset(seed=seed, options=options)
-        self._begin(seed=seed, options=options)
+        with self._recorder.resetting():
+            result = self.env.reset(seed=seed, options=options)
+        self._begin(seed=seed, options=options, observation=result[0])
         return result
 
     def step(
@@ -94,27 +98,29 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
             return self.env.step(action)
         if self._recorder.done and self._next_step_autoreset:
             return self._reset_by_step(action)
-        self._recorder.before_step()
+        self._recorder.before_step(action)
         result = self.env.step(action)
-        _, reward, terminated, truncated, _ = result
+        observation, reward, terminated, truncated, _ = result
         resets_itself = self._same_step_autoreset and bool(terminated or truncated)
         self._recorder.step(
             reward,
             terminated=terminated,
             truncated=truncated,
             picture=not resets_itself,
+            observation=observation,
         )
         if resets_itself:
             self._recorder.before_reset()
-            self._begin()
+            self._begin(observation=observation)
         return result
 
     def _reset_by_step(
         self, action: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         self._recorder.before_reset()
-        result = self.env.step(action)
-        self._begin()
+        with self._recorder.resetting():
+            result = self.env.step(action)
+        self._begin(observation=result[0])
         return result
 
 

@@ -3,40 +3,52 @@
 
 from __future__ import annotations
 
-import importlib.metadata
+import contextlib
 import logging
 import os
-import platform
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol
 
-from ..errors import Error, InvalidArgument, NoPictures
+from ..errors import Error, FileNotWritten, NoPictures, PicturesDiffer
 from ..formats.journal import JournalEntry, JournalWriter
 from ..formats.manifest import Manifest, write_manifest
 from ..formats.monitor_directory import (
     journal_name,
     manifest_name,
     stats_prefix,
+    trajectory_prefix,
     video_prefix,
 )
-from ..rates import to_rate
+from ..formats.trajectory_log import RowBlocks
 from ..schedules import disable_videos, schedule_name, to_schedule
+from ..simulation.state_source import EpisodeStart, StateSource
+from .deferred_video import DeferredVideo
+from .episode_videos import EpisodeVideos
 from .opening import OpenDirectory, open_directory
-from .stats_recorder import StatsRecorder
+from .options import (
+    DEFERRED,
+    LIVE,
+    OFF,
+    RecorderOptions,
+    RenderingChoice,
+    type_of_mode,
+)
+from .stats_recorder import StatsRecorder, reward_to_float
+from .trajectory_recorder import Pace, TrajectoryRecorder
+from .versions import versions
 from .video_recorder import PictureSource, VideoRecorder, can_give_pictures
 
-__all__ = ["EpisodePictures", "Recorder", "RecorderOptions"]
+__all__ = ["EpisodePictures", "Recorder", "Rendering", "Subject"]
 
 logger = logging.getLogger(__name__)
 
 _FORMAT_VERSION = 1
 _GYM_VERSION = "mjrec-1"
-_MODES = {None: "t", "training": "t", "evaluation": "e"}
-_PACKAGES = ("mjrec", "mujoco", "gymnasium", "dm-control", "numpy", "imageio-ffmpeg")
 
 
 class EpisodePictures(PictureSource, Protocol):
@@ -52,68 +64,84 @@ class EpisodePictures(PictureSource, Protocol):
         """Free what was acquired; idempotent."""
 
 
+class Rendering(Protocol):
+    """Whoever turns ended trajectories into videos, beside the simulation."""
+
+    def submit(self, trajectory: Path) -> None:
+        """Take over an ended trajectory. Never waits."""
+
+    def wait(self, on_progress: Callable[[Any], None]) -> None:
+        """Return when all that was taken over is done."""
+
+    def stop(self) -> None:
+        """Stop at once; what is not done stays pending. Idempotent."""
+
+    @property
+    def failures(self) -> Mapping[str, str]:
+        """Why videos could not be rendered, by the base names of the videos."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class RecorderOptions:
-    """What a monitor was asked for; `mjrec.Monitor` says what each means."""
+class Subject:
+    """What is recorded, as far as a recorder knows it.
 
-    video_callable: Callable[[int], Any] | bool | None = None
-    force: bool = False
-    resume: bool = False
-    write_upon_reset: bool = False
-    uid: str | None = None
-    mode: str | None = None
-    fps: float | Fraction | None = None
-    allow_early_reset: bool = False
+    Attributes:
+        env_id: the environment's name.
+        pictures: where live pictures come from.
+        clock: returns the simulated time in seconds, or None.
+        declared: returns the rate to take where there is no simulated time.
+        rendering: when pictures are drawn.
+        states: of its simulation; None where there is none that can be seen.
+        environment: what it can be made from again, for the trajectories.
+        random_state: returns the state of its random generator, for JSON, or None.
+    """
 
-
-@dataclass
-class _Videos:
-    """What became of the videos so far, for the manifest."""
-
-    scheduled: list[int] = field(default_factory=list)
-    finished: list[tuple[str, str]] = field(default_factory=list)
-    broken: list[str] = field(default_factory=list)
+    env_id: str
+    pictures: EpisodePictures
+    clock: Callable[[], float | None]
+    declared: Callable[[], Fraction]
+    rendering: RenderingChoice
+    states: StateSource | None = None
+    environment: Mapping[str, Any] | None = None
+    random_state: Callable[[], Any] = lambda: None
 
 
 class Recorder:
-    """Drives statistics, journal, video and manifest of one monitor.
+    """Drives statistics, journal, trajectory, video and manifest of one monitor.
 
-    It is told what happens to an environment and never calls it, except for pictures:
-    `before_reset`, the environment's reset, `reset`; `before_step`, the environment's
-    step, `step`; `close`. It belongs to the process that made it.
+    It is told what happens to an environment and never calls it, except for pictures
+    and states: `before_reset`, the environment's reset inside `resetting`, `reset`;
+    `before_step`, the environment's step, `step`; `close`. It belongs to the process
+    that made it.
 
     Args:
         directory: the monitor directory.
-        env_id: the environment's name.
-        pictures: where the pictures come from.
+        subject: what is recorded.
         options: what was asked for.
-        clock: returns the simulated time in seconds, or None.
-        declared: returns the rate to take where there is no simulated time.
+        rendering: makes what renders, for the directory; None where nothing is to be
+            rendered now.
     """
 
     def __init__(
         self,
         directory: str | os.PathLike[str],
         *,
-        env_id: str,
-        pictures: EpisodePictures,
+        subject: Subject,
         options: RecorderOptions,
-        clock: Callable[[], float | None] | None = None,
-        declared: Callable[[], Fraction] | None = None,
+        rendering: Callable[[Path], Rendering] | None = None,
     ) -> None:
         self._schedule = to_schedule(options.video_callable)
-        episode_type = _type_of_mode(options.mode)
-        if options.fps is not None:
-            to_rate(options.fps)
-        if self._schedule is not disable_videos:
-            _check_pictures(pictures, env_id)
-        self._env_info = {"gym_version": _GYM_VERSION, "env_id": env_id}
-        self._pictures = pictures
+        self._choice = subject.rendering
+        if self._choice.mode == OFF:
+            self._schedule = disable_videos
+        if self._schedule is not disable_videos and self._choice.mode == LIVE:
+            _check_pictures(subject)
+        self._subject = subject
+        self._states = subject.states
         self._options = options
-        self._clock = clock
-        self._declared = declared
+        self._env_info = {"gym_version": _GYM_VERSION, "env_id": subject.env_id}
         self._pid = os.getpid()
-        self._videos = _Videos()
+        self._videos = EpisodeVideos()
         self._decision = (-1, False)
         self._place: OpenDirectory = open_directory(
             directory,
@@ -122,17 +150,27 @@ class Recorder:
             uid=options.uid,
             env_info=self._env_info,
         )
+        if self._states is not None:
+            self._states.open(self.directory)
+        self._rendering = rendering(self.directory) if rendering else None
         self._next_episode_id = self._place.first_episode_id
         self._episode_start: dict[str, Any] = {}
         self._journal = JournalWriter(self.directory / journal_name(self._place.infix))
         self.stats_recorder = StatsRecorder(
             str(self.directory),
             stats_prefix(self._place.infix),
-            env_id=env_id,
+            env_id=subject.env_id,
             allow_early_reset=options.allow_early_reset,
         )
-        self.stats_recorder.type = episode_type
-        self.video_recorder: VideoRecorder | None = None
+        self.stats_recorder.type = type_of_mode(options.mode)
+        self._pace = Pace(
+            clock=subject.clock, declared=subject.declared, max_fps=options.max_fps
+        )
+        self._trajectory: TrajectoryRecorder | None = None
+        self._blocks: RowBlocks | None = None
+        self._unfinished: list[Path] = []
+        self._said: set[str] = set()
+        self.video_recorder: VideoRecorder | DeferredVideo | None = None
         self.closed = False
 
     @property
@@ -155,6 +193,11 @@ class Recorder:
         """Whether the episode is over; None before the first reset."""
         return self.stats_recorder.done
 
+    @property
+    def wants_observations(self) -> bool:
+        """Whether observations are recorded."""
+        return self._options.observations
+
     def set_mode(self, mode: str | None) -> None:
         """Set the type of the episodes from the next reset on.
 
@@ -164,10 +207,21 @@ class Recorder:
         Raises:
             InvalidArgument: it is something else.
         """
-        self.stats_recorder.type = _type_of_mode(mode)
+        self.stats_recorder.type = type_of_mode(mode)
+
+    def model_changed(self) -> None:
+        """Note that textures, height fields or meshes were changed in mid-episode."""
+        if self._states is not None:
+            self._states.model_changed()
+
+    def resetting(self) -> AbstractContextManager[None]:
+        """Return what to put around the reset of the environment."""
+        if self._states is None or self._choice.mode == LIVE:
+            return contextlib.nullcontext()
+        return self._states.resetting()
 
     def before_reset(self) -> None:
-        """Check that a reset may be made now.
+        """Check that a reset may be made now, and take what it will overwrite.
 
         Raises:
             ResetNotAllowed: in mid-episode, unless early resets are allowed.
@@ -175,9 +229,14 @@ class Recorder:
         """
         self._check_process()
         self.stats_recorder.before_reset()
+        if not self._is_unbegun():
+            self._take_last_picture()
         self._reset_time = time.time()
+        self._random_state = self._subject.random_state() if self._will_keep() else None
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> None:
+    def reset(
+        self, *, seed: Any = None, options: Any = None, observation: Any = None
+    ) -> None:
         """Begin an episode; the environment has just been reset.
 
         A reset before any step of the running episode keeps its number and replaces
@@ -186,13 +245,16 @@ class Recorder:
         Args:
             seed: the seed given to the environment's reset.
             options: the options given to it.
+            observation: what it returned.
+
+        Raises:
+            PicturesDiffer: rendering was to be deferred, and cannot be.
         """
-        if self.stats_recorder.done is False and self.stats_recorder.steps == 0:
+        if self._is_unbegun():
             self._next_episode_id -= 1
-            if self.video_recorder is not None:
-                self.video_recorder.discard()
+            self._discard_episode()
         else:
-            self._end_video(complete=False, reason="reset")
+            self._end_episode(complete=False, reason="reset")
         self.stats_recorder.after_reset()
         self._episode_start = {
             "start_time": self._reset_time,
@@ -201,12 +263,12 @@ class Recorder:
         }
         episode_id = self._next_episode_id
         self._next_episode_id += 1
-        self._begin_video(episode_id)
+        self._begin_episode(episode_id, observation)
         if self._options.write_upon_reset:
             self._flush()
 
-    def before_step(self) -> None:
-        """Check that a step may be taken now.
+    def before_step(self, action: Any = None) -> None:
+        """Check that a step may be taken now, and note its action.
 
         Raises:
             ResetNeeded: before the first reset, or after the end of an episode.
@@ -214,6 +276,8 @@ class Recorder:
         """
         self._check_process()
         self.stats_recorder.before_step()
+        if self._trajectory is not None:
+            self._trajectory.before_step(action)
 
     def step(
         self,
@@ -222,6 +286,7 @@ class Recorder:
         terminated: bool,
         truncated: bool,
         picture: bool = True,
+        observation: Any = None,
     ) -> None:
         """Record a step that the environment has just taken.
 
@@ -231,22 +296,65 @@ class Recorder:
             truncated: a limit from outside the task ended it.
             picture: False where the environment has reset itself already, and its
                 picture belongs to the next episode.
+            observation: what the step returned.
         """
+        reward = reward_to_float(reward)
         done = self.stats_recorder.after_step(None, reward, terminated or truncated)
-        ending = {"terminated": bool(terminated), "truncated": bool(truncated)}
         if done:
             # First of all, so that no failing video can lose the episode.
-            self._journal_episode(**ending)
+            self._journal_episode(
+                terminated=bool(terminated), truncated=bool(truncated)
+            )
         try:
-            self._take_picture(missing=not picture)
+            if self._trajectory is not None:
+                self._record_states(
+                    reward,
+                    terminated=bool(terminated),
+                    truncated=bool(truncated),
+                    observation=observation,
+                    is_last=done,
+                    has_picture=picture,
+                )
+            if isinstance(self.video_recorder, VideoRecorder):
+                self._take_picture(self.video_recorder, missing=not picture)
+                if done and picture:
+                    self.video_recorder.capture_last()
         finally:
             if done:
-                self._end_video(complete=True, **ending)
+                self._end_episode(
+                    complete=True,
+                    terminated=bool(terminated),
+                    truncated=bool(truncated),
+                )
+
+    def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
+        """End the running episode, and wait until all videos are rendered.
+
+        Trajectories get their final form here where nothing renders. To be called
+        before `close`, which waits for nothing.
+
+        Args:
+            on_progress: called while it waits.
+
+        Raises:
+            EncoderError: the running video could not be finished.
+            Error: whoever renders has failed.
+        """
+        if self.closed:
+            return
+        self._take_last_picture()
+        self._end_episode(complete=False, reason="close")
+        if self._states is not None:
+            self._states.finish()
+        if self._rendering is not None:
+            self._rendering.wait(on_progress)
+        self._finish_trajectories()
 
     def close(self) -> None:
-        """Finish the video, write statistics and manifest, and let go. Idempotent.
+        """End the episode, write statistics and manifest, and let go. Idempotent.
 
-        An episode that is not over is no part of the statistics; its video is kept,
+        Nothing is rendered any more: what is not rendered yet stays pending. An
+        episode that is not over is no part of the statistics; its video is kept,
         marked incomplete. Where it is interrupted (Ctrl-C), the next call goes on.
 
         Raises:
@@ -255,13 +363,20 @@ class Recorder:
         """
         if self.closed:
             return
+        if self._rendering is not None:
+            self._rendering.stop()
         try:
-            self._end_video(complete=False, reason="close")
+            self._take_last_picture()
+            self._end_episode(complete=False, reason="close")
         except Exception:
             self._let_go()
             raise
         self._let_go()
         logger.info("Finished writing results. They are in %s.", self.directory)
+
+    def failures(self) -> Mapping[str, str]:
+        """Return why videos could not be rendered, by their names."""
+        return self._rendering.failures if self._rendering is not None else {}
 
     def _let_go(self) -> None:
         # Where it fails, all stays open, and the next close tries again.
@@ -270,6 +385,15 @@ class Recorder:
         self.stats_recorder.closed = True
         self._journal.close()
         self._place.lock.release()
+        pending = len(self._videos.pending())
+        if pending:
+            # Said aloud: nobody else will render them.
+            logger.warning(
+                "%d %s pending: mjrec render %s",
+                pending,
+                "video" if pending == 1 else "videos",
+                self.directory,
+            )
 
     def _check_process(self) -> None:
         if os.getpid() != self._pid:
@@ -279,30 +403,133 @@ class Recorder:
                 "files: make the monitor inside the process that uses it."
             )
 
-    def _take_picture(self, *, missing: bool) -> None:
-        recorder = self.video_recorder
-        if recorder is None or not recorder.functional:
-            return
-        if missing:
-            recorder.metadata["final_frame"] = "missing"
-        else:
-            recorder.capture_frame()
+    def _is_unbegun(self) -> bool:
+        """Whether the running episode has had its reset only."""
+        return self.stats_recorder.done is False and self.stats_recorder.steps == 0
 
-    def _begin_video(self, episode_id: int) -> None:
-        self.video_recorder = VideoRecorder(
-            self._pictures,
-            base_path=self.directory / video_prefix(self._place.infix, episode_id),
+    def _begin_episode(self, episode_id: int, observation: Any) -> None:
+        wanted = self._decide(episode_id)
+        keeps = self._keeps_trajectory(episode_id, has_video=wanted)
+        deferred = wanted and self._choice.mode == DEFERRED
+        start = None
+        if self._states is not None and (keeps or deferred):
+            start = self._states.begin_episode()
+            deferred = deferred and self._can_be_deferred(start)
+        self._trajectory = None
+        self.video_recorder = None
+        if keeps or deferred:
+            self._trajectory = self._new_trajectory(
+                episode_id,
+                start,
+                video=("deferred" if deferred else "live") if wanted else None,
+                is_kept=keeps,
+                observation=observation if self._options.observations else None,
+            )
+        if deferred:
+            assert self._trajectory is not None
+            self.video_recorder = DeferredVideo(
+                self._video_path(episode_id), self._trajectory
+            )
+        else:
+            self._begin_live_video(episode_id, enabled=wanted)
+
+    def _begin_live_video(self, episode_id: int, *, enabled: bool) -> None:
+        self.video_recorder = recorder = VideoRecorder(
+            self._subject.pictures,
+            base_path=self._video_path(episode_id),
             metadata={"episode_id": episode_id},
-            enabled=self._decide(episode_id),
+            enabled=enabled,
             fps=self._options.fps,
+            max_fps=self._options.max_fps,
             frame_hashes=True,
-            clock=self._clock,
-            declared=self._declared,
-            facts=self._pictures.facts,
+            clock=self._subject.clock,
+            declared=self._subject.declared,
+            facts=self._subject.pictures.facts,
         )
-        if self.video_recorder.enabled:
-            self._pictures.begin_episode()
-        self.video_recorder.capture_frame()
+        if recorder.enabled:
+            self._subject.pictures.begin_episode()
+        recorder.capture_frame()
+
+    def _new_trajectory(
+        self,
+        episode_id: int,
+        start: EpisodeStart | None,
+        *,
+        video: str | None,
+        is_kept: bool,
+        observation: Any,
+    ) -> TrajectoryRecorder:
+        name = trajectory_prefix(self._place.infix, episode_id)
+        return TrajectoryRecorder(
+            self.directory / f"{name}.log",
+            facts=self._trajectory_facts(
+                episode_id, start, video=video, is_kept=is_kept
+            ),
+            states=None if start is None else self._states,
+            start=start,
+            pace=self._pace,
+            observation=observation,
+            blocks=self._blocks,
+        )
+
+    def _trajectory_facts(
+        self,
+        episode_id: int,
+        start: EpisodeStart | None,
+        *,
+        video: str | None,
+        is_kept: bool,
+    ) -> dict[str, Any]:
+        options = self._options
+        return {
+            "episode_id": episode_id,
+            "infix": str(self._place.infix),
+            "env_id": self._subject.env_id,
+            "type": self.stats_recorder.episode_type,
+            **self._episode_start,
+            "random_state": self._random_state,
+            "environment": self._subject.environment,
+            "versions": dict(versions()),
+            "model": None if start is None else start.model,
+            "scene": None if start is None else start.scene,
+            "refusal": None if start is None else start.refusal,
+            "kept": is_kept,
+            "video": None
+            if video is None
+            else {
+                "name": self._video_path(episode_id).name + ".mp4",
+                "quality": options.quality,
+                "fps": None if options.fps is None else str(options.fps),
+                "max_fps": None if options.max_fps is None else str(options.max_fps),
+                "recording": video,
+            },
+        }
+
+    def _video_path(self, episode_id: int) -> Path:
+        return self.directory / video_prefix(self._place.infix, episode_id)
+
+    def _can_be_deferred(self, start: EpisodeStart) -> bool:
+        if start.refusal is None:
+            return True
+        if self._choice.is_forced:
+            raise PicturesDiffer(
+                f"The videos of {self._subject.env_id} were to be rendered later, from "
+                f'recorded states, and cannot be: {start.refusal}. Use render="live".'
+            )
+        if not can_give_pictures(self._subject.pictures):
+            raise NoPictures(
+                f"The videos of {self._subject.env_id} cannot be rendered from its "
+                f"states: {start.refusal}. They cannot be drawn live either: "
+                f"{_what_is_missing(self._subject.pictures)}."
+            )
+        if start.refusal not in self._said:
+            self._said.add(start.refusal)
+            logger.warning(
+                "The videos of %s are drawn live: %s.",
+                self._subject.env_id,
+                start.refusal,
+            )
+        return False
 
     def _decide(self, episode_id: int) -> bool:
         """Ask the schedule; only once for a number, which resets may share."""
@@ -311,6 +538,69 @@ class Recorder:
             if self._decision[1]:
                 self._videos.scheduled.append(episode_id)
         return self._decision[1]
+
+    def _keeps_trajectory(self, episode_id: int, *, has_video: bool) -> bool:
+        chosen = self._options.trajectory_callable
+        if chosen is None:
+            return has_video or self.stats_recorder.episode_type == "e"
+        return bool(chosen(episode_id)) if callable(chosen) else chosen
+
+    def _will_keep(self) -> bool:
+        """Whether the episode that the coming reset begins may have a trajectory."""
+        return (
+            self._options.trajectory_callable is not None
+            or self.stats_recorder.type == "e"
+            or self._schedule is not disable_videos
+        )
+
+    def _record_states(self, reward: float, **rest: Any) -> None:
+        trajectory = self._trajectory
+        assert trajectory is not None
+        try:
+            trajectory.step(reward, **rest)
+        except PicturesDiffer as error:
+            self._stop_frames(trajectory, error)
+        except FileNotWritten as error:
+            self._trajectory = None
+            self._break_deferred(str(error))
+            raise
+
+    def _stop_frames(
+        self, trajectory: TrajectoryRecorder, error: PicturesDiffer
+    ) -> None:
+        trajectory.stop_frames(str(error))
+        self._break_deferred(str(error))
+        logger.warning(
+            "The frames of episode %d end at step %d: %s",
+            self._next_episode_id - 1,
+            trajectory.steps,
+            error,
+        )
+
+    def _break_deferred(self, reason: str) -> None:
+        if isinstance(self.video_recorder, DeferredVideo):
+            self.video_recorder.broken = True
+            self.video_recorder.metadata["broken_reason"] = reason
+
+    def _take_picture(self, recorder: VideoRecorder, *, missing: bool) -> None:
+        if not recorder.functional:
+            return
+        if missing:
+            recorder.metadata["final_frame"] = "missing"
+        else:
+            recorder.capture_frame()
+
+    def _take_last_picture(self) -> None:
+        """Take the picture of the running episode's last step, if it was left out."""
+        if self.stats_recorder.done is not False:
+            return
+        if self._trajectory is not None:
+            try:
+                self._trajectory.take_frame()
+            except PicturesDiffer as error:
+                self._stop_frames(self._trajectory, error)
+        if isinstance(self.video_recorder, VideoRecorder):
+            self.video_recorder.capture_last()
 
     def _journal_episode(self, *, terminated: bool, truncated: bool) -> None:
         stats = self.stats_recorder
@@ -327,15 +617,70 @@ class Recorder:
             )
         )
 
-    def _end_video(self, *, complete: bool, **facts: Any) -> None:
-        """Finish the running video, if there is one; what is known goes with it."""
-        recorder = self.video_recorder
-        if recorder is None or not recorder.enabled or recorder.closed:
+    def _discard_episode(self) -> None:
+        if self.video_recorder is not None:
+            self.video_recorder.discard()
+        trajectory, self._trajectory = self._trajectory, None
+        if trajectory is not None:
+            trajectory.discard()
+
+    def _end_episode(self, *, complete: bool, **facts: Any) -> None:
+        """Finish the running episode's trajectory and video, if there are any."""
+        try:
+            self._end_trajectory(complete=complete, **facts)
+        finally:
+            if isinstance(self.video_recorder, VideoRecorder):
+                self._end_live_video(self.video_recorder, complete=complete, **facts)
+
+    def _end_trajectory(self, *, complete: bool, **facts: Any) -> None:
+        trajectory = self._trajectory
+        if trajectory is None:
+            return
+        stats = self.stats_recorder
+        trajectory.end(
+            {
+                "complete": complete,
+                **facts,
+                "length": trajectory.steps,
+                "reward": stats.rewards,
+                "end_time": time.time(),
+            }
+        )
+        self._trajectory, self._blocks = None, trajectory.blocks
+        if isinstance(self.video_recorder, DeferredVideo):
+            self.video_recorder.close()
+            self._videos.add_deferred(
+                self._next_episode_id - 1, trajectory.path, self.video_recorder
+            )
+        if self._rendering is not None:
+            self._rendering.submit(trajectory.path)
+        else:
+            self._unfinished.append(trajectory.path)
+
+    def _finish_trajectories(self) -> None:
+        """Give the trajectories that nobody has finished their final form."""
+        if not self._unfinished:
+            return
+        # Not at the top: h5py is loaded only where there is something to write.
+        from ..formats.trajectory_file import finish_trajectory
+
+        while self._unfinished:
+            if self._unfinished[0].exists():
+                finish_trajectory(self._unfinished[0])
+            self._unfinished.pop(0)
+
+    def _end_live_video(
+        self, recorder: VideoRecorder, *, complete: bool, **facts: Any
+    ) -> None:
+        """Finish a video that was drawn live; what is known goes with it."""
+        if not recorder.enabled or recorder.closed:
             return
         stats = self.stats_recorder
         if "complete" not in recorder.metadata:
             # Else an end that was interrupted is taken up again.
             recorder.metadata.update(complete=complete, **facts)
+        if self._choice.reason is not None:
+            recorder.metadata["recording_reason"] = self._choice.reason
         recorder.metadata.update(
             length=stats.steps,
             reward=stats.rewards,
@@ -343,23 +688,14 @@ class Recorder:
             env_id=self._env_info["env_id"],
             seed=self._episode_start.get("seed"),
             options=self._episode_start.get("options"),
-            recording="live",
-            versions=_versions(),
+            recording=LIVE,
+            versions=dict(versions()),
         )
         try:
             recorder.close()
         finally:
             if recorder.closed:
-                self._note(recorder)
-
-    def _note(self, recorder: VideoRecorder) -> None:
-        assert recorder.path is not None
-        assert recorder.metadata_path is not None
-        names = (Path(recorder.path).name, Path(recorder.metadata_path).name)
-        if recorder.broken:
-            self._videos.broken.append(names[1])
-        elif recorder.finished:
-            self._videos.finished.append(names)
+                self._videos.add_live(recorder)
 
     def _flush(self) -> None:
         self.stats_recorder.flush()
@@ -367,7 +703,7 @@ class Recorder:
             self.directory / manifest_name(self._place.infix),
             Manifest(
                 stats=Path(self.stats_recorder.path).name,
-                videos=tuple(self._videos.finished),
+                videos=tuple(self._videos.finished()),
                 env_info=self._env_info,
                 mjrec=self._details(),
             ),
@@ -384,26 +720,19 @@ class Recorder:
             },
             "first_episode_id": self._place.first_episode_id,
             "next_episode_id": self._next_episode_id,
-            "pending": [],
-            "broken": self._videos.broken,
-            "versions": _versions(),
+            "pending": self._videos.pending(),
+            "broken": self._videos.broken(),
+            "versions": dict(versions()),
         }
 
 
-def _type_of_mode(mode: str | None) -> str:
-    if mode not in _MODES:
-        raise InvalidArgument(
-            f'mode must be "training", "evaluation" or None, got {mode!r}.'
-        )
-    return _MODES[mode]
-
-
-def _check_pictures(pictures: PictureSource, env_id: str) -> None:
-    if can_give_pictures(pictures):
+def _check_pictures(subject: Subject) -> None:
+    if can_give_pictures(subject.pictures):
         return
+    why = "" if subject.rendering.reason is None else f" ({subject.rendering.reason})"
     raise NoPictures(
-        f"Videos were asked for, and {env_id} gives no pictures: "
-        f"{_what_is_missing(pictures)}, or record statistics only with "
+        f"Videos were asked for, and {subject.env_id} gives no pictures{why}: "
+        f"{_what_is_missing(subject.pictures)}, or record statistics only with "
         "video_callable=False."
     )
 
@@ -416,14 +745,3 @@ def _what_is_missing(pictures: PictureSource) -> str:
         f"its render_mode is {mode!r}. Make the environment with "
         'render_mode="rgb_array"',
     )
-
-
-def _versions() -> dict[str, str]:
-    """Return the versions of what made the recording."""
-    versions = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions

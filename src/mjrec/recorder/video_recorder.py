@@ -19,7 +19,7 @@ from ..formats.asciicast import AsciicastWriter, text_of_frame
 from ..formats.video_metadata import StepRuns, file_facts, timing_facts
 from ..formats.video_writer import VideoWriter
 from ..frames import Frame, check_frame
-from ..rates import rate_from_timestep, to_rate
+from ..rates import rate_from_timestep, stride_for, to_rate
 from ..simulation.inside import simulation_time
 from .declared_rate import declared_rate
 
@@ -71,6 +71,9 @@ class VideoRecorder:
         enabled: False makes a recorder that does nothing.
         base_path: the path without extension, instead of `path`.
         fps: frames per second of the file, instead of real time.
+        max_fps: the most frames per second that are wanted: of the pictures of
+            `rgb_array` every n-th is taken, with the smallest n that fits, and the
+            last, see `capture_last`. Of the other render modes every one is.
         frame_hashes: also write the `.framehash` of an image video.
         clock: returns the simulated time in seconds, or None where there is none.
         declared: returns the rate to take where there is no simulated time.
@@ -98,6 +101,7 @@ class VideoRecorder:
         base_path: str | os.PathLike[str] | None = None,
         *,
         fps: float | Fraction | None = None,
+        max_fps: float | Fraction | None = None,
         frame_hashes: bool = False,
         clock: Callable[[], float | None] | None = None,
         declared: Callable[[], Fraction] | None = None,
@@ -115,6 +119,9 @@ class VideoRecorder:
         self._declared = declared or (lambda: declared_rate(env))
         self._facts = facts
         self._fps = None if fps is None else to_rate(fps)
+        self._max_fps = None if max_fps is None else to_rate(max_fps)
+        self._stride = 1
+        self._last_taken = -1
         self._frame_hashes = frame_hashes
         self._take = text_of_frame if self.ansi_mode else self._checked_frame
         self._size: tuple[int, int] | None = None
@@ -177,7 +184,23 @@ class VideoRecorder:
             return
         # Counted also where `render` raises: frames belong to steps.
         step, self._captures = self._captures, self._captures + 1
+        self._settle_stride(step)
+        if step % self._stride == 0:
+            self._capture(step)
+
+    def capture_last(self) -> None:
+        """Record the picture of the last step, if `max_fps` has left it out.
+
+        To be called at the end of an episode, before the environment goes on. Raises
+        what `capture_frame` raises.
+        """
+        step = self._captures - 1
+        if self.functional and not self._closed and step > self._last_taken >= 0:
+            self._capture(step)
+
+    def _capture(self, step: int) -> None:
         rendered = self.env.render()
+        self._last_taken = step
         frames = rendered if isinstance(rendered, list) else [rendered]
         try:
             for frame in frames:
@@ -266,6 +289,22 @@ class VideoRecorder:
             # The environment may draw the next picture into the same array.
             self._waiting.append(frame.copy())
 
+    def _settle_stride(self, step: int) -> None:
+        """Choose every how many-th picture is taken, once a step has been timed."""
+        if self._max_fps is None or self._measured or self._first is None:
+            return
+        if getattr(self.env, "render_mode", None) != "rgb_array":
+            return
+        timestep = _time_of_a_step(self._first, (step, self._clock()))
+        rate = 1 / timestep if timestep is not None else self._declared()
+        self._stride = stride_for(rate, self._max_fps)
+        if self._stride > 1:
+            self._measured = True
+            self._timestep = timestep
+            self._steps = StepRuns([self._first[0]], stride=self._stride)
+            if self._writer is None:
+                self._open_writer(rate / self._stride)
+
     def _settle_rate(self, step: int, frames: int) -> None:
         """Measure the time of a step, from the first two pictures that there are."""
         if self._writer is None and self._fps is not None:
@@ -284,6 +323,9 @@ class VideoRecorder:
         if self._timestep is not None and frames:
             return rate_from_timestep(float(self._timestep / frames))
         return self._declared()
+
+    def _thinned(self, rate: Fraction) -> Fraction:
+        return rate / stride_for(rate, self._max_fps)
 
     def _open_writer(self, rate: Fraction) -> None:
         assert self.path is not None
@@ -320,7 +362,7 @@ class VideoRecorder:
 
     def _finish_writer(self) -> None:
         if self._waiting:
-            self._open_writer(self._fps or self._declared())
+            self._open_writer(self._fps or self._thinned(self._declared()))
         if self._writer is not None:
             self._writer.close()
             self.finished = True
@@ -341,6 +383,7 @@ class VideoRecorder:
             self._steps,
             fps=self._rate,
             timestep=self._timestep,
+            stride=self._stride,
             frames_per_step=self._frames_per_capture,
         )
         if isinstance(self._writer, AsciicastWriter):

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The progress bar of a monitor that waits for its videos."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+
+import rich.console
+import rich.progress
+
+from ..rendering.render_service import Progress
+
+__all__ = ["waiting_display"]
+
+
+@contextlib.contextmanager
+def waiting_display() -> Iterator[Callable[[Progress], None]]:
+    """Yield a function that shows how far the rendering is, on a terminal only.
+
+    The bar goes to standard error and vanishes at the end: what a program prints is
+    its own business.
+    """
+    if not sys.stderr.isatty():
+        yield _nothing
+        return
+    with rich.progress.Progress(
+        rich.progress.TextColumn("rendering {task.fields[videos]}"),
+        rich.progress.BarColumn(),
+        rich.progress.TextColumn("{task.completed}/{task.total} frames"),
+        rich.progress.TimeRemainingColumn(),
+        console=rich.console.Console(stderr=True),
+        transient=True,
+    ) as bar:
+        task = bar.add_task("", total=None, videos="")
+
+        def show(progress: Progress) -> None:
+            bar.update(
+                task,
+                completed=progress.frames_done,
+                total=progress.frames,
+                videos=f"{progress.videos_done}/{progress.videos} videos",
+            )
+
+        yield show
+
+
+def _nothing(progress: Progress) -> None:
+    del progress

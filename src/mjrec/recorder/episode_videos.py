@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What has become of the videos of a run, for its manifest."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from .deferred_video import DeferredVideo
+from .video_recorder import VideoRecorder
+
+__all__ = ["EpisodeVideos"]
+
+
+class EpisodeVideos:
+    """The videos of the episodes that are over.
+
+    Attributes:
+        scheduled: the numbers of the episodes that the schedule chose.
+    """
+
+    def __init__(self) -> None:
+        self.scheduled: list[int] = []
+        self._finished: list[tuple[str, str]] = []
+        self._broken: list[str] = []
+        # Number, base name of the trajectory without extension, and the video.
+        self._deferred: list[tuple[int, str, Path]] = []
+
+    def add_live(self, recorder: VideoRecorder) -> None:
+        """Note a video that was drawn while its episode ran."""
+        assert recorder.path is not None
+        assert recorder.metadata_path is not None
+        names = (Path(recorder.path).name, Path(recorder.metadata_path).name)
+        if recorder.broken:
+            self._broken.append(names[1])
+        elif recorder.finished:
+            self._finished.append(names)
+
+    def add_deferred(
+        self, episode_id: int, trajectory: Path, video: DeferredVideo
+    ) -> None:
+        """Note a video that is to be rendered from a trajectory."""
+        self._deferred.append((episode_id, trajectory.stem, Path(video.path)))
+
+    def finished(self) -> list[tuple[str, str]]:
+        """Return the names of the videos that are there now, and their metadata's.
+
+        Whoever rendered a deferred one, it counts as soon as its metadata is there,
+        which is written last.
+        """
+        self._look_for_rendered()
+        return sorted(self._finished)
+
+    def broken(self) -> list[str]:
+        """Return the names of the metadata of videos that were given up."""
+        self._look_for_rendered()
+        return list(self._broken)
+
+    def pending(self) -> list[dict[str, Any]]:
+        """Return what is still to be rendered."""
+        self._look_for_rendered()
+        return [
+            {"episode_id": episode_id, "trajectory": trajectory, "video": video.name}
+            for episode_id, trajectory, video in self._deferred
+        ]
+
+    def _look_for_rendered(self) -> None:
+        waiting = []
+        for entry in self._deferred:
+            video = entry[2]
+            metadata = video.with_suffix(".meta.json")
+            if not metadata.exists():
+                waiting.append(entry)
+            elif _says_broken(metadata):
+                self._broken.append(metadata.name)
+            else:
+                self._finished.append((video.name, metadata.name))
+        self._deferred = waiting
+
+
+def _says_broken(metadata: Path) -> bool:
+    try:
+        return bool(json.loads(metadata.read_bytes()).get("broken"))
+    except (OSError, ValueError, AttributeError):
+        return False

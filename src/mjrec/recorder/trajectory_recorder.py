@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writing down the states of one episode while it runs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
+from ..formats.trajectory_log import RowBlocks, TrajectoryLogWriter
+from ..rates import rate_from_timestep, stride_for
+from ..simulation.state_source import EpisodeStart, StateSource
+from .step_arrays import StepArray, step_array
+
+__all__ = ["Pace", "TrajectoryRecorder"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pace:
+    """How simulated time becomes frames.
+
+    Attributes:
+        clock: returns the simulated time in seconds, or None where there is none.
+        declared: returns the steps per second to take where it cannot be measured.
+        max_fps: the most frames per second that are wanted; None for every step.
+    """
+
+    clock: Callable[[], float | None]
+    declared: Callable[[], Fraction]
+    max_fps: float | Fraction | None = None
+
+
+class TrajectoryRecorder:
+    """Writes the trajectory of one episode: a state a step, a snapshot a frame.
+
+    The log is made by the first `step`, because only then it is known what an action
+    is, or by `end`: a reset that another reset replaces leaves nothing.
+
+    Frames are steps 0, n, 2n ... where n is the smallest stride that keeps `max_fps`,
+    and always the last one.
+
+    Args:
+        path: of the log.
+        facts: what is known of the episode, for the header.
+        states: of the simulation; None where there is none that can be seen.
+        start: what `states.begin_episode` returned.
+        pace: how simulated time becomes frames.
+        observation: of the reset; None where observations are not recorded.
+        blocks: of the trajectory before, to be used again.
+
+    Attributes:
+        path: of the log, which is there after the first step.
+        steps: how many steps were recorded.
+        frame_count: how many snapshots were taken.
+        blocks: memory that the next trajectory may use, once this one has ended.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        facts: Mapping[str, Any],
+        states: StateSource | None,
+        start: EpisodeStart | None,
+        pace: Pace,
+        observation: Any = None,
+        blocks: RowBlocks | None = None,
+    ) -> None:
+        self.path = path
+        self.blocks = blocks
+        self.steps = 0
+        self.frame_count = 0
+        self._facts = facts
+        self._states = states
+        self._start = start or _NOTHING
+        self._pace = pace
+        self._state_bytes = 8 * sum(c.length for c in self._start.state)
+        self._takes_frames = bool(self._start.snapshot.fields)
+        self._stride = 1
+        self._last_frame = -1
+        self._log: TrajectoryLogWriter | None = None
+        self._ended = False
+        self._irregular: set[str] = set()
+        self._action: StepArray | None = None
+        self._observation = None if observation is None else step_array(observation)
+        # What belongs to step 0 waits here until there is a log.
+        self._first_state = np.empty(self._state_bytes, np.uint8)
+        self._first_snapshot = np.empty(self._start.snapshot.size, np.uint8)
+        self._first_observation = _bytes_of(self._observation, observation)
+        self._first_change: Mapping[str, NDArray[Any]] | None = None
+        self._first_time = pace.clock()
+        self._take_first()
+
+    def before_step(self, action: Any) -> None:
+        """Note the action of the coming step, which the environment may overwrite."""
+        if self._log is None:
+            self._action = step_array(action)
+            self._begin_log()
+        if self._action is not None and not self._action.set(action):
+            self._note_irregular("actions")
+
+    def note(self, **facts: Any) -> None:
+        """Add to the facts of the episode."""
+        if self._log is None:
+            self._facts = {**self._facts, **facts}
+        else:
+            self._log.add_facts(facts)
+
+    def stop_frames(self, reason: str) -> None:
+        """Take no more snapshots, and say why."""
+        self._takes_frames = False
+        self.note(broken_reason=reason)
+
+    def step(
+        self,
+        reward: float,
+        *,
+        terminated: bool,
+        truncated: bool,
+        observation: Any = None,
+        is_last: bool,
+        has_picture: bool = True,
+    ) -> None:
+        """Record what the environment is like after a step.
+
+        Args:
+            reward: of the step.
+            terminated: the task ended the episode.
+            truncated: a limit from outside the task ended it.
+            observation: after the step; only where observations are recorded.
+            is_last: the episode is over.
+            has_picture: False where the environment has reset itself already: its
+                state is the next episode's.
+
+        Raises:
+            FileNotWritten: the disk is full.
+            PicturesDiffer: no picture of this moment can be made from its state.
+        """
+        log = self._log
+        assert log is not None, "before_step was not called"
+        self.steps += 1
+        if self.steps == 1:
+            self._settle_pace(log)
+        if self._observation is not None and not self._observation.set(observation):
+            self._note_irregular("observations")
+        row = log.step_row(self.steps, reward, terminated, truncated)
+        try:
+            self._fill(row, has_state=has_picture)
+        except BaseException:
+            # Ctrl-C, say: what is half in it is some earlier row.
+            log.withdraw_row()
+            raise
+        if has_picture and (is_last or self.steps % self._stride == 0):
+            self.take_frame()
+
+    def _fill(self, row: NDArray[np.uint8], *, has_state: bool) -> None:
+        size = self._state_bytes
+        if has_state and self._states is not None:
+            self._states.capture_state(row[:size])
+        else:
+            row[:size].view(np.float64)[...] = np.nan
+        if self._action is not None:
+            end = size + self._action.size
+            row[size:end] = self._action.bytes
+            size = end
+        if self._observation is not None:
+            row[size:] = self._observation.bytes
+
+    def take_frame(self) -> None:
+        """Take the snapshot of this moment, unless there is one of it already.
+
+        Raises:
+            PicturesDiffer: no picture of this moment can be made from its state.
+        """
+        if not self._takes_frames or self._last_frame == self.steps:
+            return
+        log = self._log
+        if log is None or self._states is None:
+            return
+        row = log.frame_row(self.steps)
+        try:
+            changed = self._states.capture_snapshot(row)
+        except BaseException:
+            log.withdraw_row()
+            raise
+        self._last_frame = self.steps
+        self.frame_count += 1
+        if changed:
+            log.add_model_change(ModelChange(step=self.steps, fields=changed))
+
+    def end(self, facts: Mapping[str, Any]) -> None:
+        """Write what is known of the episode's end, and close the log. Idempotent.
+
+        Raises:
+            FileNotWritten: the disk is full; the next call tries again.
+        """
+        if self._ended:
+            return
+        if self._log is None:
+            self._begin_log()
+        assert self._log is not None
+        if self.steps == 0:
+            self._settle_pace(self._log)
+        self._log.add_facts(facts)
+        self._log.close()
+        self._ended = True
+
+    def discard(self) -> None:
+        """Leave nothing."""
+        self._ended = True
+        if self._log is not None:
+            self._log.discard()
+
+    def _take_first(self) -> None:
+        if self._states is None:
+            return
+        self._states.capture_state(self._first_state)
+        if self._takes_frames:
+            self._first_change = self._states.capture_snapshot(self._first_snapshot)
+
+    def _begin_log(self) -> None:
+        start = self._start
+        self._log = log = TrajectoryLogWriter(
+            self.path,
+            TrajectoryHeader(
+                facts=self._facts,
+                state=start.state,
+                snapshot=start.snapshot,
+                action=_array_of(self._action),
+                observation=_array_of(self._observation),
+            ),
+            blocks=self.blocks,
+        )
+        self.blocks = log.blocks
+        for fields in (start.model_fields, self._first_change):
+            if fields:
+                log.add_model_change(ModelChange(step=0, fields=fields))
+        row = log.step_row(0, 0.0, False, False)
+        row[:] = 0
+        row[: self._state_bytes] = self._first_state
+        if self._observation is not None:
+            row[-self._observation.size :] = self._first_observation
+        if self._takes_frames:
+            log.frame_row(0)[:] = self._first_snapshot
+            self._last_frame = 0
+            self.frame_count = 1
+
+    def _note_irregular(self, what: str) -> None:
+        if what not in self._irregular:
+            self._irregular.add(what)
+            self.note(**{f"irregular_{what}_from": self.steps})
+            logger.warning(
+                "%s: from step %d on the %s are not like those before and are recorded "
+                "as zeros.",
+                self.path.name,
+                self.steps,
+                what,
+            )
+
+    def _settle_pace(self, log: TrajectoryLogWriter) -> None:
+        """Measure the time of a step over the first one, and choose the stride."""
+        elapsed = _difference(self._first_time, self._pace.clock())
+        rate = rate_from_timestep(elapsed) if elapsed else self._pace.declared()
+        self._stride = stride_for(rate, self._pace.max_fps)
+        log.add_facts(
+            {
+                "rate": str(rate),
+                "timestep": str(1 / rate) if elapsed else None,
+                "stride": self._stride,
+            }
+        )
+
+
+_NOTHING = EpisodeStart(state=(), snapshot=RowLayout(), model={}, scene=None)
+
+
+def _array_of(array: StepArray | None) -> Array | None:
+    return None if array is None else array.kind
+
+
+def _bytes_of(array: StepArray | None, value: Any) -> NDArray[np.uint8]:
+    if array is None:
+        return np.empty(0, np.uint8)
+    array.set(value)
+    return array.bytes.copy()
+
+
+def _difference(start: float | None, end: float | None) -> float | None:
+    if start is None or end is None or end <= start:
+        return None
+    return end - start

@@ -1,0 +1,541 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Monitors that record states and leave the pictures to other processes."""
+
+from __future__ import annotations
+
+import gc
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from processes import children
+from recordings import frames_in, manifest_of, metadata_of, videos_in
+
+import mjrec
+
+SIZE: dict[str, Any] = {"height": 48, "width": 64}
+
+
+def make(env_id: str = "InvertedPendulum-v5", **arguments: Any) -> Any:
+    """Return a small environment, without a render mode unless one is given."""
+    return gymnasium.make(env_id, **SIZE, **arguments)
+
+
+def steps(env: Any, count: int, *, seed: int = 0) -> None:
+    """Reset and take so many steps, or fewer if the episode ends."""
+    env.reset(seed=seed)
+    env.action_space.seed(seed)
+    for _ in range(count):
+        if any(env.step(env.action_space.sample())[2:4]):
+            break
+
+
+def extensions(directory: Path) -> list[str]:
+    """Return what the names in a directory end in."""
+    return sorted("".join(p.suffixes[-2:]) for p in directory.iterdir())
+
+
+def shown_by_env(env_id: str, count: int, **arguments: Any) -> list[Any]:
+    """Return what `env.render()` shows of an episode's first steps."""
+    env = make(env_id, render_mode="rgb_array", **arguments)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    frames = [env.render()]
+    for _ in range(count):
+        env.step(env.action_space.sample())
+        frames.append(env.render())
+    env.close()
+    return frames
+
+
+@pytest.fixture
+def pendulum() -> Iterator[Any]:
+    """An environment without a render mode."""
+    env = make()
+    yield env
+    env.close()
+
+
+# --- what is written -----------------------------------------------------------------
+
+
+def test_close_leaves_a_rendered_directory(pendulum: Any, tmp_path: Path) -> None:
+    """Video, hashes, metadata, trajectory, model: no log, nothing hidden, no promise."""
+    with mjrec.Monitor(pendulum, tmp_path, lambda e: True, workers=1) as env:
+        steps(env, 3)
+        steps(env, 2, seed=1)
+    assert videos_in(tmp_path) == [0, 1]
+    assert not list(tmp_path.glob(".*"))
+    assert not list(tmp_path.glob("*.log"))
+    assert len(list(tmp_path.glob("*.h5"))) == 2
+    assert len(list(tmp_path.glob("openaigym.model.*.mjb.gz"))) == 1
+    manifest = manifest_of(tmp_path)
+    assert manifest["mjrec"]["pending"] == []
+    assert len(manifest["videos"]) == 2
+    assert len(frames_in(tmp_path, 0)) == 4
+    assert len(frames_in(tmp_path, 1)) == 3
+
+
+def test_metadata_says_that_it_was_deferred(pendulum: Any, tmp_path: Path) -> None:
+    """And all that live recording says."""
+    live = tmp_path / "live"
+    drawn = make(render_mode="rgb_array")
+    with mjrec.Monitor(drawn, live, render="live") as env:
+        steps(env, 2)
+    with mjrec.Monitor(pendulum, tmp_path / "deferred", workers=1) as env:
+        steps(env, 2)
+    earlier, later = metadata_of(live, 0), metadata_of(tmp_path / "deferred", 0)
+    assert earlier.keys() - {"recording_reason"} <= later.keys()
+    assert (earlier["recording"], later["recording"]) == ("live", "deferred")
+    assert (earlier["pictures"], later["pictures"]) == ("env.render", "scene")
+    same = "fps timestep stride frame_count frame_steps height width seed complete"
+    for key in [*same.split(), "decoded_sha256", "file_sha256", "gl_renderer"]:
+        assert earlier[key] == later[key], key
+
+
+def test_trajectory_tells_what_happened(pendulum: Any, tmp_path: Path) -> None:
+    """Also the seed, the environment, and the random state at the reset."""
+    with mjrec.Monitor(pendulum, tmp_path, workers=0) as env:
+        env.reset(seed=4)
+        actions = [np.array([0.1 * k]) for k in range(3)]
+        rewards = [env.step(action)[1] for action in actions]
+    [path] = tmp_path.glob("*.h5")
+    trajectory = mjrec.load_trajectory(path)
+    np.testing.assert_array_equal(trajectory.actions, actions)
+    assert trajectory.rewards.tolist() == rewards
+    assert trajectory.seed == 4
+    assert trajectory.environment["framework"] == "gymnasium"
+    assert trajectory.environment["id"] == "InvertedPendulum-v5"
+    assert trajectory.states.shape[0] == 4
+    assert trajectory.time[1] == pytest.approx(0.04)
+
+
+# --- pending -------------------------------------------------------------------------
+
+
+def test_no_workers_leave_the_videos_pending(
+    pendulum: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The manifest lists them, one line says how to make them, and that makes them."""
+    with mjrec.Monitor(pendulum, tmp_path, lambda e: e < 2, workers=0) as env:
+        for seed in range(3):
+            steps(env, 2, seed=seed)
+            env.stats_recorder.done = True
+    assert videos_in(tmp_path) == []
+    pending = manifest_of(tmp_path)["mjrec"]["pending"]
+    assert [entry["episode_id"] for entry in pending] == [0, 1]
+    assert f"2 videos pending: mjrec render {tmp_path}" in caplog.text
+    command = [sys.executable, "-m", "mjrec", "render", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True)
+    assert videos_in(tmp_path) == [0, 1]
+    assert manifest_of(tmp_path)["mjrec"]["pending"] == []
+    assert len(manifest_of(tmp_path)["videos"]) == 2
+
+
+def leave_by_exception(env: Any) -> None:
+    with pytest.raises(ZeroDivisionError), env:
+        steps(env, 2)
+        _ = 1 // 0
+
+
+def leave_without_waiting(env: Any) -> None:
+    steps(env, 2)
+    env.close(wait=False)
+
+
+LEAVING: dict[str, Callable[[Any], None]] = {
+    "exception": leave_by_exception,
+    "close(wait=False)": leave_without_waiting,
+}
+
+
+@pytest.mark.parametrize("leave", LEAVING.values(), ids=LEAVING)
+def test_leaving_otherwise_renders_nothing(
+    leave: Callable[[Any], None],
+    pendulum: Any,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Manifest and journal are there, what was not rendered is pending, no child is."""
+    before = children()
+    leave(mjrec.Monitor(pendulum, tmp_path, workers=1))
+    assert children() == before
+    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
+    assert entry["episode_id"] == 0
+    assert "1 video pending" in caplog.text
+    assert videos_in(tmp_path) == []
+    assert len(list(tmp_path.glob("openaigym.trajectory.*"))) == 1
+
+
+def test_garbage_collection_renders_nothing(tmp_path: Path) -> None:
+    """The manifest is written all the same."""
+    before = children()
+    env = mjrec.Monitor(make(), tmp_path, workers=1)
+    steps(env, 2)
+    del env
+    gc.collect()
+    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
+    assert children() == before
+
+
+SCRIPT = """
+import sys, gymnasium, mjrec
+env = gymnasium.make("InvertedPendulum-v5", height=48, width=64)
+env = mjrec.Monitor(env, sys.argv[1], workers=1)
+env.reset(seed=0)
+env.step(env.action_space.sample())
+"""
+
+
+def run_script(
+    code: str, *arguments: object, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run code as `python -`, which has no file to come from."""
+    return subprocess.run(
+        [sys.executable, "-", *map(str, arguments)],
+        input=code,
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+        timeout=120,
+        check=False,
+    )
+
+
+def test_end_of_the_interpreter_renders_nothing(tmp_path: Path) -> None:
+    """One line says what is pending."""
+    done = run_script(SCRIPT, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("1 video pending: mjrec render") == 1
+    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
+
+
+def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path: Path) -> None:
+    """The manifest is written, the line is said, and the process ends at once."""
+    code = SCRIPT.replace('"InvertedPendulum-v5", height=48, width=64', '"Humanoid-v5"')
+    code += (
+        "for _ in range(9): env.step(env.action_space.sample())\n"
+        "import os, signal, threading\n"
+        "threading.Timer(1, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
+        "env.close()\n"
+    )
+    done = run_script(code, tmp_path)
+    assert done.returncode == -signal.SIGINT, done.stderr
+    assert "1 video pending: mjrec render" in done.stderr
+    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
+
+
+def test_killed_monitor_leaves_what_can_be_rendered(tmp_path: Path) -> None:
+    """A whole episode is there after SIGKILL, and its video can be made."""
+    code = SCRIPT + "env.close = None\nenv._recorder._end_episode(complete=True)\n"
+    code += "import os, signal; os.kill(os.getpid(), signal.SIGKILL)\n"
+    done = run_script(code.replace("workers=1", "workers=0"), tmp_path)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    command = [sys.executable, "-m", "mjrec", "render", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True)
+    assert len(frames_in(tmp_path, 0)) == 2
+
+
+# --- which way -----------------------------------------------------------------------
+
+
+class Overlay(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Draws something on top."""
+
+    def render(self) -> Any:
+        frame = np.array(self.env.render())
+        frame[:4] = 255
+        return frame
+
+
+def test_overlay_is_recorded_live_and_says_why(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its pictures do not follow from the state."""
+    caplog.set_level(logging.INFO)
+    env = mjrec.Monitor(Overlay(make(render_mode="rgb_array")), tmp_path)
+    with env:
+        steps(env, 1)
+    metadata = metadata_of(tmp_path, 0)
+    assert metadata["recording"] == "live"
+    assert "Overlay" in metadata["recording_reason"]
+    assert "Overlay" in caplog.text
+    assert frames_in(tmp_path, 0)[0][0].min() > 240
+
+
+def test_deferred_by_force_is_an_error_that_names_the_class(tmp_path: Path) -> None:
+    """Nothing is written."""
+    env = Overlay(make(render_mode="rgb_array"))
+    with pytest.raises(mjrec.PicturesDiffer, match="Overlay"):
+        mjrec.Monitor(env, tmp_path / "d", render="deferred")
+    assert not (tmp_path / "d").exists()
+    env.close()
+
+
+def test_deferred_by_force_needs_a_simulation(corridor: Any, tmp_path: Path) -> None:
+    """There is nothing to defer to without a state."""
+    with pytest.raises(mjrec.PicturesDiffer, match="no MuJoCo model"):
+        mjrec.Monitor(corridor, tmp_path, render="deferred")
+
+
+def test_off_writes_trajectories_and_no_videos(pendulum: Any, tmp_path: Path) -> None:
+    """Of every episode, in evaluation mode."""
+    with mjrec.Monitor(pendulum, tmp_path, render="off", mode="evaluation") as env:
+        steps(env, 2)
+        env.stats_recorder.done = True
+        steps(env, 2)
+    assert len(list(tmp_path.glob("*.h5"))) == 2
+    assert not list(tmp_path.glob("*video*"))
+
+
+@pytest.mark.parametrize("value", ["later", 3, ""])
+def test_no_such_way_to_render(value: Any, pendulum: Any, tmp_path: Path) -> None:
+    """The message lists them."""
+    with pytest.raises(mjrec.InvalidArgument, match="deferred"):
+        mjrec.Monitor(pendulum, tmp_path, render=value)
+
+
+@pytest.mark.parametrize("value", [-1, 1.5, True, "2"])
+def test_workers_are_a_number(value: Any, pendulum: Any, tmp_path: Path) -> None:
+    """Of processes."""
+    with pytest.raises(mjrec.InvalidArgument, match="workers"):
+        mjrec.Monitor(pendulum, tmp_path, workers=value)
+
+
+# --- which trajectories --------------------------------------------------------------
+
+
+def trajectories(directory: Path) -> list[str]:
+    return sorted(path.name.split(".")[-2] for path in directory.glob("*.h5"))
+
+
+@pytest.mark.parametrize(
+    ("options", "kept"),
+    [
+        ({}, [0, 1]),
+        ({"mode": "evaluation"}, [0, 1, 2]),
+        ({"trajectory_callable": True}, [0, 1, 2]),
+        ({"trajectory_callable": lambda episode: episode == 2}, [2]),
+        ({"trajectory_callable": False}, []),
+    ],
+)
+def test_which_trajectories_are_kept(
+    options: dict[str, Any], kept: list[int], pendulum: Any, tmp_path: Path
+) -> None:
+    """The videos' own are removed once the videos are there, if they are not wanted."""
+    with mjrec.Monitor(pendulum, tmp_path, workers=1, **options) as env:
+        for seed in range(3):
+            steps(env, 1, seed=seed)
+            env.stats_recorder.done = True
+    assert trajectories(tmp_path) == [f"episode{number:06d}" for number in kept]
+    assert videos_in(tmp_path) == [0, 1]
+
+
+def test_observations_are_recorded_where_asked_for(
+    pendulum: Any, tmp_path: Path
+) -> None:
+    """One more than there are steps."""
+    with mjrec.Monitor(pendulum, tmp_path, workers=0, observations=True) as env:
+        first, _ = env.reset(seed=0)
+        second = env.step(env.action_space.sample())[0]
+    [path] = tmp_path.glob("*.h5")
+    recorded = mjrec.load_trajectory(path).observations
+    np.testing.assert_array_equal(recorded, [first, second])
+
+
+# --- frames --------------------------------------------------------------------------
+
+
+def test_max_fps_takes_every_nth_step_and_the_last(
+    pendulum: Any, tmp_path: Path
+) -> None:
+    """25 steps a second at 10 frames a second: every third."""
+    with mjrec.Monitor(pendulum, tmp_path, workers=1, max_fps=10) as env:
+        steps(env, 4)
+    metadata = metadata_of(tmp_path, 0)
+    assert (metadata["stride"], metadata["fps"]) == (3, "25/3")
+    assert metadata["frame_steps"] == [[0, 3], [4, 4]]
+    assert metadata["playback_speed"] == 1
+    assert len(frames_in(tmp_path, 0)) == 3
+
+
+def test_live_recording_takes_the_same_frames(tmp_path: Path) -> None:
+    """With max_fps too."""
+    files = {}
+    for render in ("live", "deferred"):
+        env = make(render_mode="rgb_array")
+        with mjrec.Monitor(
+            env, tmp_path / render, workers=1, max_fps=10, render=render
+        ) as env:
+            steps(env, 4)
+        files[render] = metadata_of(tmp_path / render, 0)
+    for key in ("frame_steps", "fps", "stride", "file_sha256", "playback_speed"):
+        assert files["live"][key] == files["deferred"][key], key
+
+
+def test_changed_texture_shows_after_model_changed(tmp_path: Path) -> None:
+    """From the next frame on, as with a renderer that uploads it."""
+    env = make("Ant-v5")
+    with mjrec.Monitor(env, tmp_path, workers=1) as monitored:
+        monitored.reset(seed=0)
+        monitored.step(np.zeros(8))
+        env.unwrapped.model.tex_data[:] = 255 - env.unwrapped.model.tex_data
+        monitored.model_changed()
+        monitored.step(np.zeros(8))
+    _, before, after = frames_in(tmp_path, 0)
+    assert np.abs(before.astype(int) - after).mean() > 20
+
+
+def test_changed_colour_is_noticed_by_itself(tmp_path: Path) -> None:
+    """Small arrays of the model are compared at each frame."""
+    env = make()
+    with mjrec.Monitor(env, tmp_path, workers=1) as monitored:
+        monitored.reset(seed=0)
+        env.unwrapped.model.geom_rgba[:] = (0, 1, 0, 1)
+        monitored.step(np.zeros(1))
+    before, after = frames_in(tmp_path, 0)
+    assert np.abs(before.astype(int) - after).max() > 60
+
+
+def test_unfinished_episode_keeps_trajectory_and_video(
+    pendulum: Any, tmp_path: Path
+) -> None:
+    """Marked incomplete; it is no part of the statistics."""
+    with mjrec.Monitor(pendulum, tmp_path, workers=1) as env:
+        steps(env, 2)
+    metadata = metadata_of(tmp_path, 0)
+    assert (metadata["complete"], metadata["reason"]) == (False, "close")
+    [path] = tmp_path.glob("*.h5")
+    assert mjrec.load_trajectory(path).complete is False
+
+
+def test_reset_before_any_step_replaces_the_trajectory(
+    pendulum: Any, tmp_path: Path
+) -> None:
+    """It keeps its number."""
+    with mjrec.Monitor(pendulum, tmp_path, workers=0) as env:
+        env.reset(seed=1)
+        env.reset(seed=2)
+        env.step(np.zeros(1))
+    [path] = tmp_path.glob("*.h5")
+    trajectory = mjrec.load_trajectory(path)
+    assert (trajectory.seed, trajectory.episode_id) == (2, 0)
+
+
+def test_video_recorder_tells_of_the_promise(pendulum: Any, tmp_path: Path) -> None:
+    """gym's attribute is there, with the path that the video will have."""
+    with mjrec.Monitor(pendulum, tmp_path, workers=1) as env:
+        steps(env, 2)
+        video = env.video_recorder
+        assert video is not None
+        assert (video.enabled, video.functional, video.empty) == (True, True, False)
+        assert video.frame_count == 3
+        assert not video.finished
+    assert video.finished
+    assert Path(str(video.path)).exists()
+
+
+# --- the simulation is left alone ----------------------------------------------------
+
+
+def test_no_opengl_in_the_simulation(tmp_path: Path) -> None:
+    """A process in which MuJoCo has none records all the same."""
+    done = run_script(SCRIPT + "env.close()\n", tmp_path, MUJOCO_GL="disable")
+    assert done.returncode == 0, done.stderr
+    assert len(frames_in(tmp_path, 0)) == 2
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Humanoid-v5"])
+def test_recording_does_not_disturb(env_id: str, tmp_path: Path) -> None:
+    """Observations, rewards, states and random numbers are bit for bit the same."""
+
+    def run(env: Any) -> list[Any]:
+        seen = []
+        for seed in (3, None):
+            seen.append(env.reset(seed=seed)[0])
+            env.action_space.seed(1)
+            for _ in range(5):
+                observation, reward, *_ = env.step(env.action_space.sample())
+                seen += [observation, reward, env.unwrapped.data.qacc_warmstart.copy()]
+            env.stats_recorder.done = True
+        return [np.asarray(value).tobytes() for value in seen]
+
+    monitored = run(mjrec.Monitor(make(env_id), tmp_path, workers=0))
+    bare = make(env_id)
+    bare.stats_recorder = type("", (), {})()
+    assert run(bare) == monitored
+
+
+def test_same_pixels_as_the_environment_shows(tmp_path: Path) -> None:
+    """Every frame's hash is that of `env.render()` at that moment."""
+    frames = shown_by_env("HalfCheetah-v5", 3)
+    with mjrec.Monitor(make("HalfCheetah-v5"), tmp_path, workers=1) as env:
+        steps(env, 3)
+    [path] = tmp_path.glob("*.h5")
+    drawn = list(mjrec.render(path))
+    assert len(drawn) == 4
+    for shown, later in zip(frames, drawn, strict=True):
+        np.testing.assert_array_equal(shown, later)
+
+
+# --- where monitors live -------------------------------------------------------------
+
+
+def test_works_in_a_daemonic_process(tmp_path: Path) -> None:
+    """Such as those of gymnasium's AsyncVectorEnv, which may have no children."""
+    code = (
+        "import sys, functools, gymnasium, numpy as np, mjrec\n"
+        "def make(n):\n"
+        "    env = gymnasium.make('InvertedPendulum-v5', height=48, width=64)\n"
+        "    return mjrec.Monitor(env, sys.argv[1], resume=True, uid=str(n), workers=1)\n"
+        "if __name__ == '__main__':\n"
+        "    makers = [functools.partial(make, n) for n in range(2)]\n"
+        "    envs = gymnasium.vector.AsyncVectorEnv(makers, context='spawn')\n"
+        "    envs.reset(seed=0)\n"
+        "    for _ in range(3): envs.step(np.zeros((2, 1), np.float32))\n"
+        "    envs.close()\n"
+    )
+    script = tmp_path / "script.py"
+    script.write_text(code)
+    out = tmp_path / "out"
+    command = [sys.executable, str(script), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert len(list(out.glob("*.mp4"))) == 2, done.stderr
+
+
+def test_works_in_a_script_without_a_main_guard(tmp_path: Path) -> None:
+    """Workers never import the user's main module."""
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT + "print('once')\nenv.close()\n")
+    out = tmp_path / "out"
+    command = [sys.executable, str(script), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "once\n"), done.stderr
+    assert len(list(out.glob("*.mp4"))) == 1
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_forked_child_is_told_and_does_not_hang(pendulum: Any, tmp_path: Path) -> None:
+    """The monitor belongs to the process that made it."""
+    with mjrec.Monitor(pendulum, tmp_path, workers=1) as env:
+        steps(env, 1)
+        pid = os.fork()
+        if pid == 0:
+            try:
+                env.step(np.zeros(1))
+            except mjrec.Error as error:
+                (tmp_path / "told.json").write_text(json.dumps(str(error)))
+            os._exit(0)
+        assert os.waitpid(pid, 0)[1] == 0
+    assert "forked" in json.loads((tmp_path / "told.json").read_text())
+    assert videos_in(tmp_path) == [0]

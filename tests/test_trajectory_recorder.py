@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjrec.errors import PicturesDiffer
+from mjrec.formats.trajectory import (
+    Array,
+    RowLayout,
+    StateComponent,
+    TrajectoryContent,
+)
+from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
+from mjrec.simulation.state_source import EpisodeStart
+
+
+class Counter:
+    """A simulation whose state is the number of the step, 0.02 seconds each."""
+
+    timestep = 0.02
+
+    def __init__(self) -> None:
+        self.step = 0
+        self.changes: dict[int, Mapping[str, Any]] = {}
+        self.hidden_from = 10**6
+
+    start = EpisodeStart(
+        state=(StateComponent("time", 0, 1), StateComponent("qpos", 1, 2)),
+        snapshot=RowLayout.packed([("geom_xpos", Array("<f8", (1, 3)))]),
+        model={"sha256": "ab"},
+        scene={"height": 48},
+        model_fields={"geom_rgba": np.ones((1, 4), np.float32)},
+    )
+
+    def open(self, directory: Path) -> None: ...
+    def resetting(self) -> Any:
+        return contextlib.nullcontext()
+
+    def begin_episode(self) -> EpisodeStart:
+        return self.start
+
+    def capture_state(self, out: Any) -> None:
+        out.view(np.float64)[:] = [self.time(), self.step, -self.step]
+
+    def capture_snapshot(self, out: Any) -> Mapping[str, Any] | None:
+        if self.step >= self.hidden_from:
+            raise PicturesDiffer("a marker is in the way")
+        out.view(np.float64)[:] = self.step
+        return self.changes.get(self.step)
+
+    def time(self) -> float:
+        return self.step * self.timestep
+
+    def model_changed(self) -> None: ...
+    def finish(self) -> None: ...
+    def close(self) -> None: ...
+
+
+def recorder(
+    path: Path, states: Counter | None, *, max_fps: Any = None, observation: Any = None
+) -> TrajectoryRecorder:
+    """Return the recorder of an episode of `states`."""
+    return TrajectoryRecorder(
+        path,
+        facts={"episode_id": 3},
+        states=states,
+        start=None if states is None else states.start,
+        pace=Pace(
+            clock=(lambda: None) if states is None else states.time,
+            declared=lambda: Fraction(30),
+            max_fps=max_fps,
+        ),
+        observation=observation,
+    )
+
+
+def play(
+    recorder: TrajectoryRecorder,
+    states: Counter,
+    steps: int,
+    *,
+    done: bool = True,
+    observe: Callable[[int], Any] = lambda _: None,
+) -> None:
+    """Take so many steps, the last of which ends the episode if it is `done`."""
+    for step in range(1, steps + 1):
+        recorder.before_step(np.full(2, step, np.float32))
+        states.step = step
+        recorder.step(
+            step / 2,
+            terminated=done and step == steps,
+            truncated=False,
+            observation=observe(step),
+            is_last=done and step == steps,
+        )
+
+
+def content(path: Path) -> TrajectoryContent:
+    """Return what is in a log."""
+    with open_trajectory(path) as reader:
+        return reader.content()
+
+
+def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:
+    """States, actions, rewards, flags and snapshots, those of the reset included."""
+    states, path = Counter(), tmp_path / "t.log"
+    trajectory = recorder(path, states)
+    play(trajectory, states, 3)
+    trajectory.end({"complete": True})
+    read = content(path)
+    assert read.states.tolist() == [[k * 0.02, k, -k] for k in range(4)]
+    assert read.actions is not None
+    assert read.actions.tolist() == [[1, 1], [2, 2], [3, 3]]
+    assert read.rewards.tolist() == [0.5, 1, 1.5]
+    assert read.terminated.tolist() == [False, False, True]
+    assert not read.truncated.any()
+    assert read.frame_steps.tolist() == [0, 1, 2, 3]
+    assert read.header.snapshot.unpack(read.snapshots)["geom_xpos"][:, 0, 0].tolist() == [
+        0, 1, 2, 3
+    ]  # fmt: skip
+    facts = read.header.facts
+    assert (facts["rate"], facts["timestep"], facts["stride"]) == ("50", "1/50", 1)
+    assert facts["complete"] is True
+    assert trajectory.frame_count == 4
+
+
+@pytest.mark.parametrize(
+    ("max_fps", "steps", "frames"),
+    [
+        (25, 7, [0, 2, 4, 6, 7]),
+        (24, 6, [0, 3, 6]),
+        (50, 2, [0, 1, 2]),
+        (1, 4, [0, 4]),
+    ],
+)
+def test_every_nth_step_and_the_last(
+    tmp_path: Path, max_fps: int, steps: int, frames: list[int]
+) -> None:
+    """With the smallest n that keeps to max_fps."""
+    states, path = Counter(), tmp_path / "t.log"
+    trajectory = recorder(path, states, max_fps=max_fps)
+    play(trajectory, states, steps)
+    trajectory.end({})
+    read = content(path)
+    assert read.frame_steps.tolist() == frames
+    assert read.states[:, 1].tolist() == list(range(steps + 1))
+
+
+def test_last_frame_of_an_episode_that_is_not_over(tmp_path: Path) -> None:
+    """It is taken when somebody asks, and only once."""
+    states, path = Counter(), tmp_path / "t.log"
+    trajectory = recorder(path, states, max_fps=10)
+    play(trajectory, states, 3, done=False)
+    trajectory.take_frame()
+    trajectory.take_frame()
+    trajectory.end({"complete": False, "reason": "close"})
+    read = content(path)
+    assert read.frame_steps.tolist() == [0, 3]
+    assert read.header.facts["reason"] == "close"
+
+
+def test_reset_alone_leaves_nothing_until_the_end(tmp_path: Path) -> None:
+    """A reset that is replaced has no log; one that is the end has a frame."""
+    states, path = Counter(), tmp_path / "t.log"
+    recorder(path, states).discard()
+    assert list(tmp_path.iterdir()) == []
+    trajectory = recorder(path, states)
+    trajectory.end({"complete": False})
+    trajectory.end({"complete": True})
+    read = content(path)
+    assert (len(read.states), len(read.rewards), read.frame_steps.tolist()) == (
+        1,
+        0,
+        [0],
+    )
+    assert read.header.facts["rate"] == "30"
+    assert read.header.facts["complete"] is False
+
+
+def test_model_changes_go_with_their_steps(tmp_path: Path) -> None:
+    """Those since the model was stored at step 0, later ones at theirs."""
+    states, path = Counter(), tmp_path / "t.log"
+    states.changes[2] = {"site_rgba": np.zeros((1, 4), np.float32)}
+    trajectory = recorder(path, states)
+    play(trajectory, states, 3)
+    trajectory.end({})
+    changes = [(c.step, list(c.fields)) for c in content(path).model_changes]
+    assert changes == [(0, ["geom_rgba"]), (2, ["site_rgba"])]
+
+
+def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> None:
+    """For environments whose state nobody can see."""
+    path = tmp_path / "t.log"
+    trajectory = recorder(path, None)
+    trajectory.before_step(1)
+    trajectory.step(1.0, terminated=True, truncated=False, is_last=True)
+    trajectory.end({})
+    read = content(path)
+    assert read.states.shape == (2, 0)
+    assert read.actions is not None
+    assert (read.actions.tolist(), read.rewards.tolist()) == ([1], [1.0])
+    assert read.frame_steps.size == 0
+    assert read.header.facts["timestep"] is None
+
+
+def test_observations_where_they_are_asked_for(tmp_path: Path) -> None:
+    """That of the reset is the first."""
+    states, path = Counter(), tmp_path / "t.log"
+    trajectory = recorder(path, states, observation=np.zeros(2))
+    play(trajectory, states, 2, observe=lambda step: np.full(2, step))
+    trajectory.end({})
+    read = content(path)
+    assert read.observations is not None
+    assert read.observations.tolist() == [[0, 0], [1, 1], [2, 2]]
+
+
+def test_odd_action_is_noted_and_nothing_stops(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An environment may take what the first action was not like."""
+    states, path = Counter(), tmp_path / "t.log"
+    trajectory = recorder(path, states)
+    play(trajectory, states, 1, done=False)
+    for _ in range(2):
+        trajectory.before_step(np.zeros(5))
+        trajectory.step(0.0, terminated=False, truncated=False, is_last=False)
+    trajectory.end({})
+    read = content(path)
+    assert read.actions is not None
+    assert read.actions.tolist() == [[1, 1], [0, 0], [0, 0]]
+    assert read.header.facts["irregular_actions_from"] == 1
+    assert caplog.text.count("not like those before") == 1
+
+
+def test_state_after_an_environments_own_reset_is_not_a_number(tmp_path: Path) -> None:
+    """It belongs to the next episode; there is no frame of it either."""
+    states, path = Counter(), tmp_path / "t.log"
+    trajectory = recorder(path, states)
+    trajectory.before_step(np.zeros(2))
+    trajectory.step(
+        0.0, terminated=True, truncated=False, is_last=True, has_picture=False
+    )
+    trajectory.end({})
+    read = content(path)
+    assert np.isnan(read.states[1]).all()
+    assert read.frame_steps.tolist() == [0]
+
+
+def test_frames_stop_where_they_would_differ(tmp_path: Path) -> None:
+    """States go on; the facts say why there are no more frames."""
+    states, path = Counter(), tmp_path / "t.log"
+    states.hidden_from = 2
+    trajectory = recorder(path, states)
+    with pytest.raises(PicturesDiffer):
+        play(trajectory, states, 2, done=False)
+    trajectory.stop_frames("a marker is in the way")
+    trajectory.before_step(np.zeros(2))
+    trajectory.step(0.0, terminated=True, truncated=False, is_last=True)
+    trajectory.end({})
+    read = content(path)
+    assert (len(read.rewards), read.frame_steps.tolist()) == (3, [0, 1])
+    assert read.header.facts["broken_reason"] == "a marker is in the way"
