@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements: each module is a program, `python -m benchmarks.<name>`."""
+"""Measurements of what recording costs: `python -m benchmarks`."""

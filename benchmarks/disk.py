@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How many bytes recorded episodes are, and how long their final form takes."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import mjrec
+from mjrec.formats.trajectory_file import finish_trajectory
+
+from .children import call
+from .results import Result
+from .rounds import Say, take_turns
+from .setups import MONITOR, UNENDING, Setup, random_actions
+
+__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure", "record_and_finish"]
+
+TITLE = "Disk: bytes of an episode, every step captured"
+
+_DM_CONTROL = "dm_control/"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How much is measured.
+
+    Attributes:
+        environments: their names; those of dm_control as `dm_control/dog-run`.
+        rounds: of all environments; only the time depends on them.
+        steps: the length of the episodes.
+    """
+
+    environments: tuple[str, ...] = (
+        "HalfCheetah-v5",
+        "Humanoid-v5",
+        "dm_control/dog-run",
+    )
+    rounds: int = 3
+    steps: int = 1000
+
+
+FULL = Settings()
+QUICK = Settings(rounds=1)
+
+
+def measure(settings: Settings, say: Say) -> list[Result]:
+    """Return the lines of each environment."""
+    samples = take_turns(
+        {
+            name: functools.partial(
+                call, record_and_finish, name=name, steps=settings.steps
+            )
+            for name in settings.environments
+            if _is_there(name)
+        },
+        rounds=settings.rounds,
+        say=say,
+    )
+    results = [
+        result
+        for name, values in samples.items()
+        for result in _results(name, values, settings.steps)
+    ]
+    missing = [name for name in settings.environments if name not in samples]
+    return [*results, *map(_missing, missing)]
+
+
+def record_and_finish(name: str, steps: int) -> dict[str, float]:
+    """Record an episode of random actions and give its trajectory the final form.
+
+    Returns:
+        Bytes of the log, of the finished file and of the model's files, and the
+        seconds that finishing took.
+    """
+    with tempfile.TemporaryDirectory() as directory:
+        if name.startswith(_DM_CONTROL):
+            _record_dm_control(name.removeprefix(_DM_CONTROL), steps, directory)
+        else:
+            _record_gymnasium(name, steps, directory)
+        [log] = Path(directory).glob("openaigym.trajectory.*.log")
+        log_bytes = log.stat().st_size
+        start = time.perf_counter()
+        finished = finish_trajectory(log)
+        seconds = time.perf_counter() - start
+        models = Path(directory).glob("openaigym.model.*")
+        return {
+            "log": log_bytes,
+            "finished": finished.stat().st_size,
+            "seconds": seconds,
+            **{
+                f"model, {_ending(path.name)}": path.stat().st_size
+                for path in sorted(models)
+            },
+        }
+
+
+def _ending(name: str) -> str:
+    """Return what comes behind the hash in a model's name."""
+    return "." + name.split(".", 3)[3]
+
+
+def _record_gymnasium(env_id: str, steps: int, directory: str) -> None:
+    make = {**UNENDING.get(env_id, {}), "max_episode_steps": steps}
+    setup = Setup(
+        env_id=env_id,
+        recorder=MONITOR,
+        make=make,
+        options={"workers": 0},
+        waits=False,
+    )
+    env = setup.open(directory)
+    env.reset(seed=0)
+    for action in random_actions(env, steps):
+        env.step(action)
+    setup.close(env)
+
+
+def _record_dm_control(name: str, steps: int, directory: str) -> None:
+    # Here, because it may not be installed.
+    from dm_control import suite
+
+    domain, _, task = name.partition("-")
+    env = suite.load(domain, task, task_kwargs={"random": 0})
+    low, high = env.action_spec().minimum, env.action_spec().maximum
+    random = np.random.default_rng(0)
+    monitor = mjrec.Monitor(env, directory, workers=0, env_id=_DM_CONTROL + name)
+    monitor.reset()
+    for _ in range(steps):
+        monitor.step(random.uniform(low, high))
+    monitor.close(wait=False)
+
+
+def _is_there(name: str) -> bool:
+    return not name.startswith(_DM_CONTROL) or bool(
+        importlib.util.find_spec("dm_control")
+    )
+
+
+def _results(
+    name: str, samples: list[dict[str, float]], steps: int
+) -> Iterator[Result]:
+    per_thousand = 1000 / steps
+    labels = {
+        "log": "log, per 1000 steps",
+        "finished": "finished .h5, per 1000 steps",
+        "seconds": "time to finish, per 1000 steps",
+    }
+    for key in samples[0]:
+        scale = per_thousand if key in labels else 1.0
+        is_time = key == "seconds"
+        yield Result(
+            subject=name,
+            variant=labels.get(key, key),
+            unit="s" if is_time else "MB",
+            samples=tuple(
+                sample[key] * scale / (1 if is_time else 1e6) for sample in samples
+            ),
+        )
+
+
+def _missing(name: str) -> Result:
+    return Result(
+        subject=name,
+        variant="",
+        unit="MB",
+        samples=(),
+        note="dm_control is not installed",
+    )

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long it takes until an episode is a finished mp4, from its reset on."""
+
+from __future__ import annotations
+
+import functools
+import statistics
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .children import call
+from .results import Promise, Reference, Result, at_most
+from .rounds import Say, take_turns
+from .setups import (
+    MONITOR,
+    RECORD_VIDEO,
+    UNENDING,
+    Setup,
+    has_moviepy,
+    random_actions,
+)
+
+__all__ = [
+    "CASES",
+    "FULL",
+    "QUICK",
+    "TITLE",
+    "Case",
+    "Settings",
+    "make_video",
+    "measure",
+]
+
+TITLE = "Time to video: seconds from reset to the finished mp4 of one episode"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """An episode, drawn by RecordVideo and by mjrec.
+
+    Attributes:
+        env_id: of the environment.
+        variants: names, options of `mjrec.Monitor`, and what is promised, as a part of
+            RecordVideo's time.
+    """
+
+    env_id: str
+    variants: Mapping[str, tuple[Mapping[str, Any], Promise]]
+
+
+CASES = (
+    Case(
+        env_id="HalfCheetah-v5",
+        variants={
+            "every frame, full quality": ({}, at_most(0.75)),
+            "every frame, draft": ({"quality": "draft"}, at_most(0.3)),
+        },
+    ),
+    Case(
+        env_id="Hopper-v5",
+        variants={"max_fps=30, full quality": ({"max_fps": 30}, at_most(0.3))},
+    ),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How much is measured.
+
+    Attributes:
+        rounds: of all variants of a case.
+        steps: the length of the episode.
+        size: height and width of the pictures.
+        workers: mjrec's processes that draw.
+        cases: what is measured.
+    """
+
+    rounds: int = 3
+    steps: int = 1000
+    size: tuple[int, int] = (480, 480)
+    workers: int = 2
+    cases: tuple[Case, ...] = CASES
+
+
+FULL = Settings()
+QUICK = Settings(rounds=1, steps=200)
+
+
+def measure(settings: Settings, say: Say) -> list[Result]:
+    """Return a line for each case and variant."""
+    return [
+        result
+        for case in settings.cases
+        for result in _measure_case(case, settings, say)
+    ]
+
+
+def make_video(setup: dict[str, Any], steps: int) -> dict[str, float]:
+    """Record one episode; return the seconds it took, and those of stepping.
+
+    Raises:
+        RuntimeError: there is no video.
+    """
+    environment = Setup(**setup)
+    with tempfile.TemporaryDirectory() as directory:
+        env = environment.open(directory)
+        actions = random_actions(env, steps)
+        start = time.perf_counter()
+        env.reset(seed=0)
+        for action in actions:
+            env.step(action)
+        stepped = time.perf_counter()
+        environment.close(env)
+        end = time.perf_counter()
+        sizes = [path.stat().st_size for path in Path(directory).glob("*.mp4")]
+    if len(sizes) != 1:
+        raise RuntimeError(f"There are {len(sizes)} videos.")
+    return {"seconds": end - start, "stepping": stepped - start, "bytes": sizes[0]}
+
+
+def _measure_case(case: Case, settings: Settings, say: Say) -> list[Result]:
+    samples = take_turns(
+        {
+            (case.env_id, name): functools.partial(
+                call, make_video, setup=setup.as_json(), steps=settings.steps
+            )
+            for name, setup in _setups(case, settings).items()
+        },
+        rounds=settings.rounds,
+        say=say,
+    )
+    peer = samples.get((case.env_id, RECORD_VIDEO))
+    reference = None if peer is None else Reference(RECORD_VIDEO, _seconds(peer))
+    results = [] if peer is None else [_result(case, RECORD_VIDEO, peer)]
+    for name, (_, promise) in case.variants.items():
+        own = samples[case.env_id, name]
+        results.append(
+            _result(case, name, own, reference, promise if reference else None)
+        )
+    return results
+
+
+def _setups(case: Case, settings: Settings) -> dict[str, Setup]:
+    height, width = settings.size
+    make = {
+        **UNENDING.get(case.env_id, {}),
+        "height": height,
+        "width": width,
+        "max_episode_steps": settings.steps,
+    }
+    setups = {
+        name: Setup(
+            env_id=case.env_id,
+            recorder=MONITOR,
+            make=make,
+            options={**options, "workers": settings.workers},
+        )
+        for name, (options, _) in case.variants.items()
+    }
+    if has_moviepy():
+        peer = Setup(env_id=case.env_id, recorder=RECORD_VIDEO, make=make)
+        setups = {RECORD_VIDEO: peer, **setups}
+    return setups
+
+
+def _result(
+    case: Case,
+    name: str,
+    samples: list[dict[str, float]],
+    reference: Reference | None = None,
+    promise: Promise | None = None,
+) -> Result:
+    stepping = statistics.median(sample["stepping"] for sample in samples)
+    return Result(
+        subject=case.env_id,
+        variant=name,
+        unit="s",
+        samples=_seconds(samples),
+        reference=reference,
+        promise=promise,
+        note=f"{stepping:.2f} s of it in reset and step",
+    )
+
+
+def _seconds(samples: list[dict[str, float]]) -> tuple[float, ...]:
+    return tuple(sample["seconds"] for sample in samples)
