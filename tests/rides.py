@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recorded episode that is small and has what makes pictures hard to draw again.
+
+A camera rides over an infinite plane, which is drawn around the camera of the picture
+before; on the way the terrain, a texture and a colour change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+
+from mjrec.formats.trajectory import ModelChange, TrajectoryHeader
+from mjrec.formats.trajectory_log import TrajectoryLogWriter
+from mjrec.simulation.cameras import Camera, resolve_camera
+from mjrec.simulation.model_fields import read_fields
+from mjrec.simulation.model_store import ModelStore
+from mjrec.simulation.renderer import SceneRenderer
+from mjrec.simulation.scene_view import SceneView
+from mjrec.simulation.snapshot import SnapshotSource, snapshot_layout
+
+HEIGHT, WIDTH = 48, 64
+FRAMES = 9
+
+PLAIN = """
+<mujoco>
+  <visual><quality shadowsize="256"/><map zfar="50"/></visual>
+  <asset>
+    <texture name="checks" type="2d" builtin="checker" rgb1="1 0 0" rgb2="0 0 1"
+      width="32" height="32"/>
+    <material name="cloth" texture="checks" texrepeat="1.7 1.7"/>
+    <hfield name="hills" nrow="8" ncol="8" size=".4 .4 .3 .1"/>
+  </asset>
+  <worldbody>
+    <light directional="true" dir="0 .3 -1"/>
+    <camera name="side" pos="4 -5 3" xyaxes="1 0 0 0 .6 .8"/>
+    <geom type="plane" size="0 0 1" material="cloth"/>
+    <body pos="0 0 .5"><joint type="slide" axis="1 .3 0"/>
+      <geom name="ball" size=".2" rgba="1 1 0 1"/>
+      <geom type="hfield" hfield="hills" pos=".6 .3 .05"/>
+      <camera name="rider" pos="0 -2 1" xyaxes="1 0 0 0 .4 .9"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+class Ride(NamedTuple):
+    """A recorded episode, and the pictures that were seen of it."""
+
+    path: Path
+    frames: list[Any]
+
+
+def start(xml: str = PLAIN) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Return the model at its start."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    return model, mujoco.MjData(model)
+
+
+def move(model: mujoco.MjModel, data: mujoco.MjData, number: int) -> None:
+    """Go on to a picture's place, unevenly."""
+    data.qpos[0] = 3.1 * number + 2 * (number % 3)
+    mujoco.mj_forward(model, data)
+
+
+def change(model: mujoco.MjModel, number: int) -> list[str]:
+    """Change the model before a picture; return the names of what has changed."""
+    if number == 3:
+        model.hfield_data[20:40] = 1
+        return ["hfield_data"]
+    if number == 5:
+        model.tex_data[: model.tex_data.size // 2] = 200
+        return ["tex_data"]
+    if number > 5:
+        model.geom("ball").rgba = (0, 1, number / 10, 1)
+        return ["geom_rgba"]
+    return []
+
+
+def record(
+    directory: Path,
+    *,
+    camera: Camera = "rider",
+    fresh: bool = False,
+    facts: Mapping[str, Any] | None = None,
+) -> Ride:
+    """Record a ride as a log, with the pictures that a viewer had shown."""
+    model, data = start()
+    option = mujoco.MjvOption()
+    option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
+    shown = resolve_camera(model, camera)
+    view = SceneView(
+        camera=shown,
+        option=option,
+        max_geom=1000,
+        fresh=fresh,
+        height=HEIGHT,
+        width=WIDTH,
+        label="rider",
+    )
+    layout = snapshot_layout(model, option)
+    store = ModelStore(directory)
+    known = {
+        "episode_id": 0,
+        "infix": "0.1",
+        "model": store.add(model),
+        "scene": view.facts(),
+        "video": {"quality": "full"},
+        "rate": "20",
+        "stride": 2,
+        **(facts or {}),
+    }
+    store.finish()
+    source = SnapshotSource(model, data, layout)
+    path = directory / "openaigym.trajectory.0.1.episode000000.log"
+    writer = TrajectoryLogWriter(path, TrajectoryHeader(facts=known, snapshot=layout))
+    seen = []
+    with SceneRenderer(
+        model,
+        height=HEIGHT,
+        width=WIDTH,
+        camera=shown,
+        scene_option=option,
+        max_geom=1000,
+        fresh=fresh,
+    ) as renderer:
+        for number in range(FRAMES):
+            names = change(model, number)
+            move(model, data, number)
+            # Pictures are of every second step.
+            for step in sorted({max(2 * number - 1, 0), 2 * number}):
+                writer.step_row(step, 0.0, False, False)
+            if names:
+                fields = read_fields(model, names)
+                writer.add_model_change(ModelChange(step=2 * number, fields=fields))
+            source.take(writer.frame_row(2 * number))
+            renderer.model_changed()
+            seen.append(renderer.render(data))
+    writer.close()
+    return Ride(path, seen)
