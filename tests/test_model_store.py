@@ -8,7 +8,9 @@ import hashlib
 import io
 import json
 import shutil
+import struct
 import threading
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -119,17 +121,30 @@ def test_the_same_content_makes_the_same_files_once(
 ) -> None:
     """Whoever writes them, and whenever; a file that is there is left alone."""
     authored = authored_from_file(mjcf)
+    assert authored is not None
     model = mujoco.MjModel.from_xml_path(str(mjcf))
     stored(directory, model, authored)
     files = {path.name: path.read_bytes() for path in directory.iterdir()}
     assert sorted(name.rpartition(".")[2] for name in files) == ["gz", "zip"]
     other = tmp_path / "other"
     other.mkdir()
-    stored(other, model, authored)
+    backwards = dict(reversed(authored.files.items()))
+    stored(other, model, AuthoredModel(authored.main, backwards))
     assert {path.name: path.read_bytes() for path in other.iterdir()} == files
     times = [path.stat().st_mtime_ns for path in directory.iterdir()]
     stored(directory, model, authored)
     assert [path.stat().st_mtime_ns for path in directory.iterdir()] == times
+
+
+def test_no_file_says_when_it_was_made(directory: Path, mjcf: Path) -> None:
+    """So that the same model makes the same file tomorrow."""
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    facts = stored(directory, model, authored_from_file(mjcf))
+    # The time in the header of gzip's format.
+    assert (directory / facts["mjb"]).read_bytes()[4:8] == bytes(4)
+    with zipfile.ZipFile(directory / facts["xml"]) as archive:
+        dates = {member.date_time for member in archive.infolist()}
+    assert dates == {(1980, 1, 1, 0, 0, 0)}
 
 
 def test_adding_does_not_write_on_the_callers_thread(
@@ -236,6 +251,15 @@ def test_sources_of_another_model_are_not_stored(
         from_source(directory, facts)
 
 
+def test_a_difference_in_words_counts(directory: Path) -> None:
+    """Names and texts are no fields that could be set."""
+    spoken = "<mujoco><custom><text name='t' data='{}'/></custom></mujoco>"
+    authored = AuthoredModel("a.xml", {"a.xml": spoken.format("two").encode()})
+    model = mujoco.MjModel.from_xml_string(spoken.format("one"))
+    facts = stored(directory, model, authored)
+    assert not (directory / facts["xml"]).exists()
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -316,10 +340,10 @@ def test_a_hostile_zip_reads_and_writes_nothing_elsewhere(
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
-        ("geom_bodyid", np.array([10**6], np.int32), "only compiling"),
-        ("geom_rgba", np.zeros((9, 4), np.float32), "another size"),
-        ("aura", np.zeros(1), "no field aura"),
-        ("opt.__class__", np.zeros(()), "no field"),
+        ("geom_bodyid", np.array([10**6], np.int32), "not set from"),
+        ("geom_rgba", np.zeros((9, 4), np.float32), "another model"),
+        ("aura", np.zeros(1), "no model field .aura"),
+        ("opt.__class__", np.zeros(()), "no model field"),
         ("geom_rgba", np.array([[None] * 4]), "allow_pickle"),
     ],
 )
@@ -335,9 +359,26 @@ def test_hostile_fields_are_refused(
 
 
 def test_a_bomb_of_a_zip_is_not_unpacked(directory: Path) -> None:
-    """Also where it lies about its size."""
+    """Its content would be many times what the model needs."""
     with pytest.raises(UnreadableFile, match="no model needs that"):
         foreign(directory, {"source/main.xml": SPHERE, "source/x": bytes(80 << 20)})
+
+
+def test_a_zip_that_lies_about_its_size_is_not_unpacked(directory: Path) -> None:
+    """No more of a file is read than it says that it has."""
+    facts = stored(directory, sphere())
+    facts["xml"] = facts["mjb"].replace(".mjb.gz", ".zip")
+    path = directory / facts["xml"]
+    size = 40 << 20
+    write_zip(path, {"source/x": bytes(size)})
+    lie = path.read_bytes().replace(struct.pack("<I", size), struct.pack("<I", 1000))
+    path.write_bytes(lie)
+    tracemalloc.start()
+    with pytest.raises(UnreadableFile, match=path.name):
+        from_source(directory, facts)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < size / 10
 
 
 def test_a_bomb_of_a_compiled_model_is_not_unpacked(directory: Path) -> None:
@@ -370,6 +411,16 @@ def test_a_damaged_file_is_one_clear_error(
     load = load_model if kind == "mjb" else from_source
     with pytest.raises(UnreadableFile, match=path.name):
         load(directory, {**facts, "xml": facts["xml"] if kind == "xml" else None})
+
+
+def test_another_compiled_model_is_not_taken_for_it(directory: Path) -> None:
+    """It is whole, of the same size, and not the recorded one."""
+    model = sphere()
+    facts = stored(directory, model)
+    model.geom_size[0] = 7
+    (directory / facts["mjb"]).write_bytes(gzip.compress(content_of(model)))
+    with pytest.raises(UnreadableFile, match="not what was recorded"):
+        load_model(directory, facts)
 
 
 def test_a_damaged_compiled_model_is_compiled_again(

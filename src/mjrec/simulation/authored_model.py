@@ -34,7 +34,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UnreadableFile
-from .model_differences import differing_fields, set_fields
+from .model_differences import differing_fields
+from .model_fields import apply_fields
 
 __all__ = [
     "AuthoredModel",
@@ -135,7 +136,7 @@ def read_authored(path: Path, *, limit: int) -> mujoco.MjModel:
             raise ValueError("it holds no model of a format that this mjrec knows")
         sources = _below(_SOURCE, members)
         model = compile_authored(AuthoredModel(contents["main"], sources))
-        set_fields(model, dict(_fields(members)))
+        apply_fields(model, dict(_fields(members)))
     except (*_DAMAGE, KeyError, TypeError, ValueError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise UnreadableFile(path, reason.rstrip(".")) from error

@@ -268,7 +268,7 @@ def _recorded_size(path: Path, facts: Mapping[str, Any]) -> int:
 
 def _source_limit(compiled_size: int) -> int:
     """Return how many bytes a model that compiles to so many may be made from."""
-    return (64 << 20) + 8 * compiled_size
+    return min((64 << 20) + 8 * compiled_size, _LARGEST)
 
 
 def _read_gzip(path: Path, size: int) -> bytes:
