@@ -15,11 +15,13 @@ from ..errors import Error
 from .doctor import doctor
 from .list_episodes import list_episodes
 from .record import record
+from .render import render
 
 __all__ = ["main"]
 
 _COMMANDS: dict[str, Callable[..., int]] = {
     "record": record,
+    "render": render,
     "list": list_episodes,
     "doctor": doctor,
 }

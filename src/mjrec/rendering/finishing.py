@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -18,35 +18,48 @@ from typing import Self
 from ..errors import Error, GLError
 from ..formats.trajectory_file import finish_trajectory
 from .crew import Crew
+from .outcomes import Outcome
 from .pending import EpisodeKey, PendingEpisode, claim, look_at
 from .progress import Progress
-from .rendered_manifests import update_manifest
+from .rendered_manifests import reconcile, update_manifest
 from .videos import render_video
 
-__all__ = ["EpisodeFinisher", "Outcome"]
+__all__ = ["EpisodeFinisher", "finish_pending"]
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """What became of an episode.
+def finish_pending(
+    directory: Path,
+    keys: Iterable[EpisodeKey],
+    *,
+    workers: int | None,
+    on_progress: Callable[[Progress], object] = lambda _: None,
+) -> Iterator[Outcome]:
+    """Finish what is pending of some episodes, and yield what became of each.
 
-    Attributes:
-        key: which one.
-        name: of what was to be made of it, the video or the trajectory.
-        video: what was rendered; None where nothing was.
-        frame_count: how many frames that has.
-        failure: why it could not be done; None where it was, or needed nothing.
-        is_elsewhere: another process is at it.
+    Nothing is yielded of an episode that nothing was to be done about. What another
+    process is at is left to it. Manifests of monitors that are closed are kept true,
+    also where an earlier run could not.
+
+    Args:
+        directory: the monitor directory.
+        keys: which episodes.
+        workers: how many processes draw; None is one for each free CPU.
+        on_progress: called after every frame, and when an episode is over.
+
+    Raises:
+        UnreadableFile: a manifest is damaged.
     """
-
-    key: EpisodeKey
-    name: str
-    video: Path | None = None
-    frame_count: int = 0
-    failure: str | None = None
-    is_elsewhere: bool = False
+    with EpisodeFinisher(
+        directory, workers=workers, on_progress=on_progress
+    ) as finisher:
+        for key in keys:
+            finisher.add(key)
+        while finisher:
+            _, outcome = finisher.finish_next()
+            yield outcome
+    reconcile(directory)
 
 
 class EpisodeFinisher:
@@ -113,7 +126,7 @@ class EpisodeFinisher:
         """Tell whether an episode waits whose model is there already."""
         return any(map(_has_model, self._waiting.values()))
 
-    def finish_next(self) -> Outcome:
+    def finish_next(self) -> tuple[EpisodeKey, Outcome]:
         """Finish the first episode whose model is there, else the first."""
         key = next(
             (key for key, episode in self._waiting.items() if _has_model(episode)),
@@ -129,7 +142,7 @@ class EpisodeFinisher:
                 self.progress, frames_done=before.frames_done + frames
             )
             self._count(videos_done=1)
-        return outcome
+        return key, outcome
 
     def rest(self) -> None:
         """Let others use the CPUs: there is nothing to do."""
@@ -145,43 +158,40 @@ class EpisodeFinisher:
         self._on_progress(self.progress)
 
     def _finish(self, key: EpisodeKey) -> Outcome:
-        name = key.video_name
+        nothing = Outcome(name=key.video_name, directory=self._directory)
         try:
             lock = claim(self._directory, key)
             if lock is None:
-                return Outcome(key=key, name=name, is_elsewhere=True)
+                return replace(nothing, is_elsewhere=True)
             try:
-                return self._finish_claimed(key)
+                # Somebody else may have done it since it was added.
+                episode = look_at(self._directory, key)
+                return nothing if episode is None else self._finish_claimed(episode)
             finally:
                 lock.release()
         except (Error, OSError) as error:
-            return Outcome(key=key, name=name, failure=str(error))
+            return replace(nothing, failure=str(error))
         except Exception as error:
             logger.exception("%s cannot be finished.", key.trajectory_name)
-            failure = f"{type(error).__name__}: {error}"
-            return Outcome(key=key, name=name, failure=failure)
+            return replace(nothing, failure=f"{type(error).__name__}: {error}")
 
-    def _finish_claimed(self, key: EpisodeKey) -> Outcome:
-        # Somebody else may have done it since it was added.
-        episode = look_at(self._directory, key)
-        if episode is None:
-            return Outcome(key=key, name=key.video_name)
+    def _finish_claimed(self, episode: PendingEpisode) -> Outcome:
         path = episode.trajectory
         if episode.is_log and episode.is_kept:
             path = finish_trajectory(path)
-        outcome = Outcome(key=key, name=path.name)
+        outcome = Outcome(name=path.name, directory=self._directory)
         if episode.video is not None:
             frame_count = self._render(path)
             outcome = replace(
                 outcome,
                 name=episode.video.name,
-                video=episode.video if frame_count else None,
+                is_video=frame_count > 0,
                 frame_count=frame_count,
             )
         if not episode.is_kept:
             for suffix in (".log", ".h5"):
                 path.with_suffix(suffix).unlink(missing_ok=True)
-        update_manifest(self._directory, key.infix)
+        update_manifest(self._directory, episode.key.infix)
         return outcome
 
     def _render(self, trajectory: Path) -> int:

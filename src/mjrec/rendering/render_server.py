@@ -105,9 +105,9 @@ class _Service:
         self._report()
 
     def _finish_next(self) -> None:
-        outcome = self._finisher.finish_next()
+        key, outcome = self._finisher.finish_next()
         self._answers.say(
-            done=self._names.pop(outcome.key),
+            done=self._names.pop(key),
             name=outcome.name,
             failure=outcome.failure,
         )

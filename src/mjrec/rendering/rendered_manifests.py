@@ -48,21 +48,24 @@ def is_broken(metadata: Path) -> bool:
         return False
 
 
-def reconcile(directory: Path) -> list[str]:
+def reconcile(directory: Path) -> None:
     """Update the manifests of all monitors that are closed.
 
-    Returns:
-        Why some could not be, by their names.
+    Raises:
+        UnreadableFile: one is damaged; the others are updated.
+        DirectoryNotWritable: there can be no lock in the directory.
+        FileNotWritten: the disk is full; manifests stay as they were.
     """
-    failures = []
+    damaged: UnreadableFile | None = None
     for path in iter_monitor_files(directory):
         infix = Infix.parse(infix_of(path.name) or "")
         if infix is not None and is_manifest(path.name):
             try:
                 update_manifest(directory, infix)
-            except (UnreadableFile, DirectoryNotWritable) as error:
-                failures.append(str(error))
-    return failures
+            except UnreadableFile as error:
+                damaged = damaged or error
+    if damaged is not None:
+        raise damaged
 
 
 def update_manifest(directory: Path, infix: Infix) -> None:

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the options of a view say, on any command's line."""
+
+from __future__ import annotations
+
+import re
+
+from ..errors import InvalidArgument
+from ..frames import check_size
+
+__all__ = ["camera_of", "size_of"]
+
+
+def size_of(text: str | None) -> tuple[int | None, int | None]:
+    """Return `(height, width)` of WIDTHxHEIGHT; twice None for None.
+
+    Raises:
+        InvalidArgument: it is no size.
+    """
+    if text is None:
+        return None, None
+    match = re.fullmatch(r"(\d+)x(\d+)", text.strip(), re.ASCII | re.IGNORECASE)
+    if match is None:
+        raise InvalidArgument(
+            f"--size must be WIDTHxHEIGHT in pixels, such as 640x480, got {text!r}."
+        )
+    return check_size(int(match[2]), int(match[1]))
+
+
+def camera_of(text: str | None) -> str | int | None:
+    """Return a camera's number, if `text` is a whole number, else its name."""
+    if text is not None and re.fullmatch(r"-?\d+", text, re.ASCII):
+        return int(text)
+    return text

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rendering recorded episodes again, another way, beside the originals."""
+
+from __future__ import annotations
+
+import urllib.parse
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+
+from ..errors import Error, InvalidArgument
+from ..formats.trajectory_file import open_trajectory
+from ..rates import to_rate
+from .outcomes import Outcome
+from .pending import EpisodeKey
+from .progress import Progress
+from .videos import render_video
+from .views import View
+from .workers import DrawingWorkers
+
+__all__ = ["Variant", "render_again"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """What is to be other than recorded; None is as recorded.
+
+    Attributes:
+        view: from where, how large and how well it is drawn.
+        max_fps: the most frames per second of simulated time.
+        fps: frames per second of the file.
+
+    Raises:
+        InvalidArgument: one is no rate.
+    """
+
+    view: View = field(default_factory=View)
+    max_fps: float | Fraction | None = None
+    fps: float | Fraction | None = None
+
+    def __post_init__(self) -> None:
+        for rate in (self.max_fps, self.fps):
+            if rate is not None:
+                to_rate(rate)
+
+    def name_for(self, trajectory: Path) -> str:
+        """Return the name of the video that shows an episode this way.
+
+        It is the original's with what is other before its extension, such as
+        `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. Readers of a
+        directory never take it for the original, and those who clear the directory
+        remove it too.
+        """
+        view = self.view
+        size = "x".join(str(side or "") for side in (view.width, view.height))
+        parts = (
+            "" if view.camera is None else _as_name(str(view.camera)),
+            "" if size == "x" else size,
+            view.quality or "",
+            "" if self.max_fps is None else f"max{_rate_name(self.max_fps)}fps",
+            "" if self.fps is None else f"{_rate_name(self.fps)}fps",
+        )
+        key = EpisodeKey.of(trajectory.name)
+        stem = trajectory.stem if key is None else Path(key.video_name).stem
+        return ".".join([stem, *filter(None, parts), "mp4"])
+
+
+def render_again(
+    trajectories: Iterable[Path],
+    variant: Variant,
+    *,
+    workers: int,
+    out: Path | None = None,
+    on_progress: Callable[[Progress], object] = lambda _: None,
+) -> Iterator[Outcome]:
+    """Render recorded episodes another way, and yield what became of each.
+
+    Neither the originals nor the manifests change. A video of an earlier call with the
+    same variant is replaced.
+
+    Args:
+        trajectories: of the episodes.
+        variant: what is to be other.
+        workers: how many processes draw.
+        out: the video, where there is one trajectory only; `Variant.name_for` beside
+            each trajectory, if None.
+        on_progress: called after every frame, and when a video is over.
+
+    Raises:
+        InvalidArgument: nothing would be other, `out` is the name of an original, or
+            stands for several.
+    """
+    paths = list(trajectories)
+    outs = [_out_for(path, variant, out, alone=len(paths) == 1) for path in paths]
+    now = Progress(videos=len(paths), frames=sum(map(_frame_count, paths)))
+
+    def count(**more: int) -> None:
+        nonlocal now
+        now = replace(now, **{name: getattr(now, name) + more[name] for name in more})
+        on_progress(now)
+
+    with DrawingWorkers(workers) as crew:
+        for trajectory, video in zip(paths, outs, strict=True):
+            outcome = Outcome(name=video.name, directory=video.parent)
+            try:
+                file = render_video(
+                    trajectory,
+                    workers=crew,
+                    view=variant.view,
+                    max_fps=variant.max_fps,
+                    fps=variant.fps,
+                    out=video,
+                    on_frame=lambda: count(frames_done=1),
+                )
+            except (Error, OSError) as error:
+                outcome = replace(outcome, failure=str(error))
+            else:
+                frame_count = 0 if file is None else file.frame_count
+                outcome = replace(outcome, is_video=True, frame_count=frame_count)
+            count(videos_done=1)
+            yield outcome
+
+
+def _out_for(
+    trajectory: Path, variant: Variant, out: Path | None, *, alone: bool
+) -> Path:
+    if out is None:
+        if variant == Variant():
+            raise InvalidArgument(
+                f"The video of {trajectory.name} would be as the original. Say what is "
+                "to be other (camera, size, quality, max_fps, fps), or where to write "
+                "it."
+            )
+        return trajectory.with_name(variant.name_for(trajectory))
+    if not alone:
+        raise InvalidArgument(
+            f"{out} is one file, and several episodes were asked for: choose one."
+        )
+    key = EpisodeKey.of(out.name)
+    if key is not None and out.with_suffix(".mp4").name == key.video_name:
+        raise InvalidArgument(
+            f"{out} is the name of a recorded video, which shows what its recording "
+            "saw. Choose another name."
+        )
+    return out
+
+
+def _frame_count(trajectory: Path) -> int:
+    try:
+        with open_trajectory(trajectory) as reader:
+            return reader.frame_count
+    except Error:
+        # It is told when its turn comes.
+        return 0
+
+
+def _rate_name(rate: float | Fraction) -> str:
+    return _as_name(f"{float(rate):g}")
+
+
+def _as_name(text: str) -> str:
+    """Return a text as a part of a file's name."""
+    quoted = urllib.parse.quote(text, safe="")
+    # What `quote` leaves alone and is no letter, digit, `_` or `-`.
+    return quoted.replace(".", "%2E").replace("~", "%7E")

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What became of something that was to be rendered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Outcome"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of a video, or of a trajectory where no video was wanted.
+
+    Attributes:
+        name: of the file.
+        directory: where it is, or was to be.
+        is_video: a video was rendered.
+        frame_count: how many frames it has.
+        failure: why it could not be done; None where it was, or needed nothing.
+        is_elsewhere: another process is at it.
+    """
+
+    name: str
+    directory: Path
+    is_video: bool = False
+    frame_count: int = 0
+    failure: str | None = None
+    is_elsewhere: bool = False
