@@ -97,7 +97,7 @@ class EpisodeStates:
         stored, fields = self._stored_model(model)
         stored.follow(data)
         self._look_at_everything = False
-        pictures = self._episode_pictures(stored)
+        pictures = self._episode_pictures(stored, fields)
         self._refusal = self._reason_against(pictures, fields)
         refused = self._refusal is not None
         return EpisodeStart(
@@ -115,7 +115,9 @@ class EpisodeStates:
         Raises:
             PicturesDiffer: the environment has gone over to another model.
         """
-        self._look_who_is_there()
+        model, data = self._simulation()
+        if model is not self._seen[0] or data is not self._seen[1]:
+            self._go_over_to(model, data)
         if self._stored is None:
             raise _not_begun()
         self._stored.write_state(out)
@@ -136,7 +138,9 @@ class EpisodeStates:
             PicturesDiffer: the picture of this moment cannot be made from a snapshot,
                 which was possible when the episode began.
         """
-        self._look_who_is_there()
+        model, data = self._simulation()
+        if model is not self._seen[0] or data is not self._seen[1]:
+            self._go_over_to(model, data)
         stored, pictures = self._stored, self._pictures
         if stored is None or pictures is None:
             raise _not_begun()
@@ -185,11 +189,13 @@ class EpisodeStates:
         self._stored, self._pictures = _StoredModel(model, facts), None
         return self._stored, {}
 
-    def _episode_pictures(self, stored: _StoredModel) -> PictureStates:
+    def _episode_pictures(
+        self, stored: _StoredModel, fields: Mapping[str, Any]
+    ) -> PictureStates:
         view = self._view()
         pictures = self._pictures
-        if pictures is None or not pictures.goes_on_with(stored.data, view):
-            pictures = self._pictures = stored.pictures(view)
+        if pictures is None or not pictures.goes_on(stored.data, view, fields):
+            pictures = self._pictures = stored.pictures(view, fields)
         return pictures
 
     def _reason_against(
@@ -225,11 +231,6 @@ class EpisodeStates:
             _check_settable(changed)
         return changed
 
-    def _look_who_is_there(self) -> None:
-        model, data = self._simulation()
-        if model is not self._seen[0] or data is not self._seen[1]:
-            self._go_over_to(model, data)
-
     def _go_over_to(self, model: Any, data: Any) -> None:
         """Take note of other objects in mid-episode."""
         stored, pictures = self._stored, self._pictures
@@ -263,7 +264,7 @@ class _StoredModel:
         self._checked = CheckedPictures()
         self._kept: KeptCameras | None = None
         self._state = np.empty(mujoco.mj_stateSize(model, STATE_SPEC))
-        self._state_bytes = self._state.view(np.uint8)
+        self._state_bytes = self._state.view(np.uint8).data
 
     def follow(self, data: mujoco.MjData) -> None:
         """Record the states of `data` from here on."""
@@ -272,14 +273,17 @@ class _StoredModel:
     def write_state(self, out: NDArray[np.uint8]) -> None:
         """Write the state into `out`, which need not be aligned."""
         mujoco.mj_getState(self._model, self.data, self._state, STATE_SPEC)
-        out[:] = self._state_bytes
+        out.data[:] = self._state_bytes
 
-    def pictures(self, view: SceneView) -> PictureStates:
+    def pictures(
+        self, view: SceneView, changed_fields: Iterable[str] = ()
+    ) -> PictureStates:
         """Return what takes snapshots of the data."""
         return PictureStates(
             self._model,
             self.data,
             view,
+            changed_fields,
             kept=self._kept_cameras(view),
             checked=self._checked,
         )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import mujoco
@@ -19,6 +19,14 @@ from .snapshot import SnapshotSource, needs_constraints, snapshot_layout
 __all__ = ["CheckedPictures", "KeptCameras", "PictureStates", "has_infinite_plane"]
 
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+
+# Fields of a model that `snapshot_layout` looks at, which environments leave alone.
+_SETTLING_THE_LAYOUT = (
+    "tendon_limited",
+    "tendon_matid",
+    "tendon_plasticadr",
+    "sensor_",
+)
 
 
 class CheckedPictures:
@@ -78,6 +86,7 @@ class PictureStates:
         model: the model; kept alive, as is the data.
         data: its data.
         view: how the scene is shown.
+        changed_fields: of the model, other than in the stored one.
         kept: told of every picture, where one has an influence on the next.
         checked: what is known to be sound.
 
@@ -91,6 +100,7 @@ class PictureStates:
         model: mujoco.MjModel,
         data: mujoco.MjData,
         view: SceneView,
+        changed_fields: Iterable[str] = (),
         *,
         kept: KeptCameras | None,
         checked: CheckedPictures,
@@ -103,44 +113,51 @@ class PictureStates:
         self._checked = checked
         self._source = SnapshotSource(model, data, self.layout)
         self._watched = ViewMemory(view)
+        self._facts = view.facts()
+        self._is_settled_anew = _settle(changed_fields)
+        # Whether the camera or an option is other than in the facts.
+        self._has_moved = False
 
-    def goes_on_with(self, data: mujoco.MjData, view: SceneView) -> bool:
-        """Go on with another episode, if it can be recorded in the same way.
+    def goes_on(
+        self, data: mujoco.MjData, view: SceneView, changed_fields: Iterable[str]
+    ) -> bool:
+        """Go on with another episode, if nothing but its state is other in it.
 
         Args:
-            data: of this episode; another one, or a view of other objects, needs other
-                `PictureStates`.
+            data: of this episode.
             view: of this episode.
+            changed_fields: of the model, other than in the stored one.
+
+        Returns:
+            Whether it does; otherwise this object is of no use any more.
         """
-        if (
-            data._address != self._data._address
-            or view.camera is not self.view.camera
-            or view.option is not self.view.option
-            or view.fresh is not self.view.fresh
-        ):
-            return False
-        self.view = view
-        # What has changed since the last episode is no news in this one.
-        self._watched.changed()
-        return snapshot_layout(self._model, view.option) == self.layout
+        return (
+            data._address == self._data._address
+            and _is_same(view, self.view)
+            and self._watched.changed() is None
+            and not self._has_moved
+            and not (self._is_settled_anew or _settle(changed_fields))
+        )
 
     def facts(self) -> dict[str, Any]:
         """Return the facts of the scene, and what the picture before left in it."""
         previous = None if self._kept is None else self._kept.positions
-        return {**self.view.facts(), "previous_cameras": previous}
+        return {**self._facts, "previous_cameras": previous}
 
     def is_sound(self, changed_fields: Iterable[str]) -> bool:
         """Tell whether pictures with these fields changed were checked before."""
         return self._checked.covers(self.view.option, changed_fields)
 
-    def refusal(self, changed_fields: Iterable[str]) -> str | None:
+    def refusal(self, changed_fields: Collection[str]) -> str | None:
         """Say why pictures of this moment cannot be made from snapshots.
 
         Args:
             changed_fields: of the model, other than in the stored one.
         """
+        if not changed_fields and self.is_sound(changed_fields):
+            return None
         reason = needs_constraints(self._model, self.view.option)
-        if reason is not None or self._checked.covers(self.view.option, changed_fields):
+        if reason is not None or self.is_sound(changed_fields):
             return reason
         row = np.empty(self.layout.size, np.uint8)
         self._source.take(row)
@@ -151,7 +168,10 @@ class PictureStates:
         self._source.take(out)
         if self._kept is not None:
             self._kept.drawn(self._data, self.view.camera)
-        return self._watched.changed()
+        changed = self._watched.changed()
+        if changed is not None:
+            self._has_moved = True
+        return changed
 
     def objection(self, row: NDArray[np.uint8], changed: Iterable[str]) -> str | None:
         """Say why a snapshot does not suffice any longer, after something has changed.
@@ -185,6 +205,21 @@ class PictureStates:
             self._checked.add(self.view.option, changed_fields)
             return None
         return f"drawn from its snapshot the scene is another one: {difference}"
+
+
+def _settle(changed_fields: Iterable[str]) -> bool:
+    return any(name.startswith(_SETTLING_THE_LAYOUT) for name in changed_fields)
+
+
+def _is_same(view: SceneView, other: SceneView) -> bool:
+    return (
+        view.camera is other.camera
+        and view.option is other.option
+        and view.max_geom == other.max_geom
+        and view.fresh is other.fresh
+        and (view.height, view.width) == (other.height, other.width)
+        and bool(view.label == other.label)
+    )
 
 
 def has_infinite_plane(model: mujoco.MjModel) -> bool:

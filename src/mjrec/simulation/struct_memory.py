@@ -63,8 +63,8 @@ class Memory:
     def __init__(self, address: int, places: list[Place]) -> None:
         size = max(place.stop for place in places)
         # Compared with a `bytearray` this is a `memcmp` without any copying.
-        self.raw: Any = (ctypes.c_ubyte * size).from_address(address)
-        self._bytes = np.frombuffer(self.raw, np.uint8)
+        self.raw = (ctypes.c_ubyte * size).from_address(address)
+        self._bytes = np.frombuffer(memoryview(self.raw), np.uint8)
         self._places = sorted(places, key=lambda place: place.start)
         self._starts = np.array([place.start for place in self._places])
         self._stops = np.array([place.stop for place in self._places])
@@ -75,8 +75,6 @@ class Memory:
 
     def differing(self, saved: bytearray) -> list[str]:
         """Return the names of the places that are other than in an earlier copy."""
-        if saved == self.raw:
-            return []
         positions = np.flatnonzero(self._bytes != np.frombuffer(saved, np.uint8))
         owners = np.searchsorted(self._starts, positions, side="right") - 1
         inside = (owners >= 0) & (positions < self._stops[owners])
