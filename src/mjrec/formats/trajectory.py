@@ -157,7 +157,8 @@ class TrajectoryContent:
 
     Attributes:
         header: what is known besides.
-        states: `(T + 1, state_length) float64`, the first after the reset.
+        states: `(T + 1, state_length) float64`, the first after the reset; none at all
+            in the log of an episode that was killed before that was written.
         actions: `(T, *shape)`, or None.
         rewards: `(T,) float64`.
         terminated: `(T,) bool`.
@@ -166,7 +167,8 @@ class TrajectoryContent:
         frame_steps: `(F,) int64`, the step that each snapshot was taken after.
         snapshots: `(F, snapshot.size) uint8`, packed rows.
         model_changes: in the order of their steps.
-        dropped: how many rows at the end were torn, and are not here.
+        dropped: how many rows and other records at the end of the log were torn or
+            damaged, as far as they can be counted, and are not here.
     """
 
     header: TrajectoryHeader

@@ -15,6 +15,7 @@ import io
 import json
 import math
 import os
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ __all__ = ["SIGNATURE", "TrajectoryHdf5Reader", "write_hdf5"]
 # How every HDF5 file begins.
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
-_FORMAT = "mjrec trajectory"
+_FORMAT = b"mjrec trajectory"
 
 # Written so, h5py of 2019 and later reads it; `latest` makes files that h5py of 2025
 # cannot open.
@@ -72,7 +73,6 @@ _LEVEL = 1
 _FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE))
 # Deflate makes at most 1032 bytes out of one.
 _MOST_EXPANSION = 1040
-_LONGEST_TEXT = 1 << 26
 _MOST_CHANGES = 1 << 20
 
 
@@ -108,8 +108,9 @@ class TrajectoryHdf5Reader(TrajectoryReader):
     def __init__(self, path: Path) -> None:
         self.path = path
         with _reading(path):
-            # It never changes under its name, and on some file systems nobody can lock.
-            self._file = h5py.File(path, "r", locking=False)
+            # Without any wish about locking: HDF5 refuses a file that is open in this
+            # process with another one, in the user's own code, say.
+            self._file = h5py.File(path, "r")
             try:
                 self._open()
             except BaseException:
@@ -122,13 +123,13 @@ class TrajectoryHdf5Reader(TrajectoryReader):
 
     def _open(self) -> None:
         attributes = self._file.attrs
-        if attributes.get("format") != _FORMAT:
+        if "format" not in attributes or _text(attributes, "format") != _FORMAT:
             raise ValueError("it is an HDF5 file, but no trajectory")
         check_version(_whole_number(attributes, "format_version"))
-        self.header = header = header_from_json(
-            json_object(_text(attributes, "facts")),
-            json_object(_text(attributes, "layout")),
-        )
+        facts, layout = _text(attributes, "facts"), _text(attributes, "layout")
+        if zlib.crc32(layout, zlib.crc32(facts)) != _whole_number(attributes, "crc32"):
+            raise ValueError("its facts or its layout are damaged")
+        self.header = header = header_from_json(json_object(facts), json_object(layout))
         self.dropped = _whole_number(attributes, "dropped")
         self.rewards = self._column("rewards", "<f8")
         steps = len(self.rewards)
@@ -282,18 +283,22 @@ def _checked_dataset(group: h5py.Group, name: str, path: Path) -> Any:
     return dataset
 
 
+def _attribute(attributes: Any, name: str, kinds: str) -> Any:
+    """Return a single value, of one of NumPy's `kinds` of dtypes."""
+    identifier = attributes.get_id(name)
+    # Asked before anything is read: a text of variable length is in a part of the file
+    # that has no checksum, and the HDF5 library may never come back from there.
+    if identifier.shape != () or identifier.dtype.kind not in kinds:
+        raise ValueError(f"its attribute {name!r} is of another type")
+    return attributes[name]
+
+
 def _text(attributes: Any, name: str) -> bytes:
-    value = attributes[name]
-    if not isinstance(value, str) or len(value) > _LONGEST_TEXT:
-        raise ValueError(f"its {name!r} is no text")
-    return value.encode()
+    return bytes(_attribute(attributes, name, "S"))
 
 
 def _whole_number(attributes: Any, name: str) -> int:
-    value = attributes[name]
-    if not isinstance(value, np.integer):
-        raise ValueError(f"its {name!r} is no whole number")
-    return int(value)
+    return int(_attribute(attributes, name, "iu"))
 
 
 def _row_type(layout: RowLayout) -> np.dtype[Any]:
@@ -320,10 +325,16 @@ def _write(file: h5py.File, reader: TrajectoryReader) -> None:
 
 def _write_attributes(file: h5py.File, reader: TrajectoryReader) -> None:
     header = reader.header
-    file.attrs["format"] = _FORMAT
+    # Of fixed length: see _attribute. Those that only strangers read need not be.
+    file.attrs["format"] = np.bytes_(_FORMAT)
     file.attrs["format_version"] = np.int64(FORMAT_VERSION)
-    file.attrs["facts"] = dumps(dict(header.facts))
-    file.attrs["layout"] = json.dumps(layout_to_json(header))
+    facts = dumps(dict(header.facts)).encode()
+    layout = json.dumps(layout_to_json(header)).encode()
+    file.attrs["facts"] = np.bytes_(facts)
+    file.attrs["layout"] = np.bytes_(layout)
+    # HDF5 has checksums of its own for what it thinks of as its structure, and the
+    # deflate filter for what it compressed; long texts have neither.
+    file.attrs["crc32"] = np.int64(zlib.crc32(layout, zlib.crc32(facts)))
     file.attrs["dropped"] = np.int64(reader.dropped)
     for name, value in _plain_facts(header.facts):
         file.attrs[name] = value

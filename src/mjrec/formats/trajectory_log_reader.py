@@ -50,9 +50,7 @@ from .trajectory_reader import TrajectoryReader
 
 __all__ = ["TrajectoryLogReader"]
 
-_ROWS = frozenset((STEP, FRAME))
-_NO_ROWS = frozenset((HEADER, CHANGE, FACTS))
-_KINDS = _ROWS | _NO_ROWS
+_KINDS = frozenset((HEADER, STEP, FRAME, CHANGE, FACTS))
 
 # What is read at once while looking through a log.
 _WINDOW = 1 << 20
@@ -93,10 +91,8 @@ class TrajectoryLogReader(TrajectoryReader):
         self._prepare()
         for record in records:
             if not (self._is_sound(window, record) and self._take(window, record)):
-                # What a torn record was is not always known; most are rows.
-                self.dropped = int(record.kind not in _NO_ROWS)
+                self.dropped = 1 + sum(1 for _ in records)
                 break
-        self.dropped += sum(record.kind in _ROWS for record in records)
         self._finish()
 
     def _prepare(self) -> None:

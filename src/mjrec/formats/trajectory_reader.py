@@ -36,7 +36,8 @@ class TrajectoryReader(abc.ABC):
         truncated: `(T,) bool`.
         frame_steps: `(F,) int64`, the step that each snapshot was taken after.
         change_count: how often the model changed.
-        dropped: how many rows at the end were torn, and are not here.
+        dropped: how many rows and other records at the end of the log were torn or
+            damaged, as far as they can be counted, and are not here.
     """
 
     path: Path
