@@ -188,7 +188,7 @@ def test_a_camera_that_the_model_lacks(ride: Ride, camera: Any, message: str) ->
 def test_a_picture_that_is_not_there(drawing: TrajectoryDrawing) -> None:
     """It says how many there are."""
     for number in (FRAMES, -1):
-        with pytest.raises(InvalidArgument, match="it holds 9 of them"):
+        with pytest.raises(InvalidArgument, match="there are 9"):
             drawing.draw(number)
 
 

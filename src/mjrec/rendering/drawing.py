@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..errors import InvalidArgument
 from ..formats.trajectory_file import open_trajectory
 from ..frames import Frame
 from ..simulation.cameras import Camera, camera_from_members
@@ -178,6 +179,9 @@ class _Scene(Protocol):
     @property
     def data(self) -> Any: ...
 
+    @property
+    def count(self) -> int: ...
+
     def bring_to(self, index: int) -> bool: ...
 
 
@@ -198,6 +202,11 @@ class _Pictures:
         self._context_is_old = False
 
     def draw(self, index: int, out: Frame | None) -> Frame:
+        if not 0 <= index < self._scene.count:
+            raise InvalidArgument(
+                f"There is no picture {index}: there are {self._scene.count}, numbered "
+                "from 0."
+            )
         if self._last is None or index != self._last + 1:
             self._prepare(index)
         self._last = None

@@ -178,6 +178,7 @@ class DrawingWorkers:
 
     def _settle(self, job: _Job, position: int) -> None:
         """Wait until a picture is drawn, or raise what there is instead of it."""
+        self._check_usable()
         self._listen(0)
         deadline = time.monotonic() + _PATIENCE_S
         while position not in job.drawn:

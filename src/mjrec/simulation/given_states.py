@@ -86,6 +86,11 @@ class GivenStates:
         # Only the rows that are asked for come into memory.
         self._states = np.load(directory / _STATES, mmap_mode="r", allow_pickle=False)
 
+    @property
+    def count(self) -> int:
+        """How many rows there are."""
+        return len(self._states)
+
     def bring_to(self, index: int) -> bool:
         """Put a row into the data; return False: the model never changes."""
         mujoco.mj_resetData(self.model, self.data)

@@ -73,22 +73,20 @@ class RecordedScene:
         self._block = range(0)
         self._values: dict[str, NDArray[Any]] = {}
 
+    @property
+    def count(self) -> int:
+        """How many pictures there are."""
+        return self._reader.frame_count
+
     def bring_to(self, index: int) -> bool:
-        """Bring back what was there at a picture.
+        """Bring back what was there at picture `index`, one of `count`.
 
         Returns:
             Whether something has changed in the model that an OpenGL context keeps.
 
         Raises:
-            InvalidArgument: there is no such picture.
             UnreadableFile: the file is damaged, or does not fit its model.
         """
-        count = self._reader.frame_count
-        if not 0 <= index < count:
-            raise InvalidArgument(
-                f"There is no picture {index} in {self._reader.path}: it holds {count} "
-                "of them, numbered from 0."
-            )
         try:
             changed = self._change_model(int(self._reader.frame_steps[index]))
             restore_snapshot(self._values_of(index), self.model, self.data)

@@ -1,0 +1,649 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import os
+import select
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from interruption import ctrl_c_soon
+from processes import children
+
+import mjrec
+from mjrec.errors import (
+    ClosedError,
+    Error,
+    GLError,
+    InvalidArgument,
+    UnknownName,
+    UnreadableFile,
+)
+from mjrec.rendering import worker_process, workers
+from mjrec.rendering.carried_errors import carried, unpacked
+from mjrec.rendering.child_python import environment_of_child
+from mjrec.rendering.views import View
+from mjrec.rendering.workers import DrawingWorkers
+from rides import FRAMES, HEIGHT, WIDTH, Ride, record
+
+
+@pytest.fixture(scope="module")
+def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
+    return record(tmp_path_factory.mktemp("ride"))
+
+
+@pytest.fixture(scope="module")
+def three() -> Iterator[DrawingWorkers]:
+    """Three workers, which stay from test to test."""
+    with DrawingWorkers(3) as three:
+        yield three
+
+
+@pytest.fixture
+def one() -> Iterator[DrawingWorkers]:
+    with DrawingWorkers(1) as one:
+        yield one
+
+
+@contextlib.contextmanager
+def new_children() -> Iterator[list[int]]:
+    """Fill the list with the processes that the block has started and not ended."""
+    before = children()
+    new: list[int] = []
+    yield new
+    new += children() - before
+
+
+def pids(pool: DrawingWorkers) -> list[int]:
+    return [seat.process.pid for seat in pool._seats if seat.process is not None]
+
+
+def wait_for_end(pid: int) -> None:
+    """Wait until a process that need not be a child is gone."""
+    with contextlib.suppress(ProcessLookupError):
+        descriptor = os.pidfd_open(pid)
+        ready, _, _ = select.select([descriptor], [], [], 30)
+        os.close(descriptor)
+        assert ready, f"process {pid} goes on"
+
+
+def use_process(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    """Let another program be the worker."""
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    monkeypatch.setattr(worker_process, "python_command", lambda _: command)
+
+
+# In order, whoever draws
+
+
+def test_one_worker_gives_what_was_seen(ride: Ride, one: DrawingWorkers) -> None:
+    """Byte for byte."""
+    assert np.array_equal(list(one.frames(ride.path, range(FRAMES))), ride.frames)
+
+
+def test_three_workers_give_the_same(ride: Ride, three: DrawingWorkers) -> None:
+    """Over an infinite plane, whose place depends on the picture before."""
+    drawn = list(three.frames(ride.path, range(FRAMES), View()))
+
+    assert len(pids(three)) == 3
+    assert np.array_equal(drawn, ride.frames)
+
+
+def test_many_pictures_from_workers_that_do_not_divide_the_slots(
+    ride: Ride, three: DrawingWorkers
+) -> None:
+    """Each worker has slots of its own: nobody takes one before its turn."""
+    indices = [number % FRAMES for number in range(70)]
+
+    for frame, index in zip(three.frames(ride.path, indices), indices, strict=True):
+        assert np.array_equal(frame, ride.frames[index])
+
+
+def test_any_order_and_repetition(ride: Ride, three: DrawingWorkers) -> None:
+    """As asked for."""
+    indices = [8, 0, 0, 3, 7, 2, 2, 8]
+    drawn = list(three.frames(ride.path, indices))
+    assert np.array_equal(drawn, [ride.frames[index] for index in indices])
+
+
+def test_pictures_are_the_callers_to_keep(ride: Ride, one: DrawingWorkers) -> None:
+    """Nothing is drawn over them, and they may be written to."""
+    frames = one.frames(ride.path, [0] * 12)
+    first = next(frames)
+    first[:] = 1
+    assert all(np.array_equal(frame, ride.frames[0]) for frame in frames)
+    assert (first == 1).all()
+
+
+def test_no_pictures_are_no_work() -> None:
+    """No process is started."""
+    with new_children() as new, DrawingWorkers(2) as pool:
+        assert list(pool.frames(Path("nothing.h5"), [])) == []
+        assert pids(pool) == []
+    assert new == []
+
+
+def test_workers_stay_and_go_over_to_other_views(
+    ride: Ride, three: DrawingWorkers
+) -> None:
+    """Larger and smaller pictures through the same memory."""
+    before = pids(three)
+    for height in (20, 90, 48):
+        for frame in three.frames(ride.path, range(5), View(height=height)):
+            assert frame.shape == (height, WIDTH, 3)
+    assert np.array_equal(list(three.frames(ride.path, [5])), [ride.frames[5]])
+    assert pids(three) == before
+
+
+def test_the_driver_is_told(ride: Ride, three: DrawingWorkers) -> None:
+    """Who draws is known from the first picture on."""
+    frames = three.frames(ride.path, [0])
+    assert three.gl_strings.keys() == {"gl_vendor", "gl_renderer", "gl_version"}
+    assert three.gl_strings["gl_renderer"]
+    list(frames)
+
+
+# What goes wrong
+
+
+def test_errors_are_raised_by_the_call(ride: Ride, three: DrawingWorkers) -> None:
+    """The same class and facts as in the worker; the workers go on."""
+    with pytest.raises(UnknownName, match="no camera 'sid'") as caught:
+        three.frames(ride.path, range(FRAMES), View(camera="sid"))
+    assert caught.value.available == ["side", "rider"]
+    with pytest.raises(UnreadableFile) as lost:
+        three.frames(ride.path.with_name("lost.h5"), range(4))
+    assert lost.value.path == ride.path.with_name("lost.h5")
+    assert np.array_equal(list(three.frames(ride.path, [3])), [ride.frames[3]])
+
+
+def test_an_error_comes_at_its_place(ride: Ride, three: DrawingWorkers) -> None:
+    """The pictures before it are given."""
+    frames = three.frames(ride.path, [0, 1, 2, 3, 99])
+    assert [np.array_equal(next(frames), ride.frames[n]) for n in range(4)] == [
+        True
+    ] * 4
+    with pytest.raises(InvalidArgument, match="no picture 99"):
+        next(frames)
+
+
+def test_a_killed_worker_is_replaced(
+    ride: Ride, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What it was drawing is drawn again, and the log says so."""
+    indices = [number % FRAMES for number in range(40)]
+    with DrawingWorkers(2) as pool:
+        frames = pool.frames(ride.path, indices)
+        drawn = [next(frames)]
+        for pid in pids(pool):
+            os.kill(pid, signal.SIGKILL)
+        drawn += frames
+
+    assert np.array_equal(drawn, [ride.frames[index] for index in indices])
+    assert "killed by SIGKILL" in caplog.text
+
+
+def test_a_worker_that_dies_twice_is_an_error(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It names the signal, the file and what the worker said."""
+    use_process(
+        monkeypatch,
+        """
+        import os, signal, sys
+        sys.stdin.readline()
+        print("llvm: out of registers", file=sys.stderr, flush=True)
+        os.kill(os.getpid(), signal.SIGSEGV)
+        """,
+    )
+    with (
+        DrawingWorkers(2) as pool,
+        pytest.raises(Error, match=r"(?s)SIGSEGV.*out of registers") as caught,
+    ):
+        pool.frames(ride.path, range(FRAMES))
+
+    assert str(ride.path) in str(caught.value)
+
+
+def test_a_worker_that_hangs_is_not_waited_for(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is ended, and the error says after how long."""
+    monkeypatch.setattr(workers, "_PATIENCE_S", 0.2)
+    use_process(monkeypatch, "import time; time.sleep(100)")
+    with (
+        new_children() as new,
+        DrawingWorkers(1) as pool,
+        pytest.raises(Error, match=r"no picture 0 of .* within 0 seconds"),
+    ):
+        pool.frames(ride.path, range(FRAMES))
+    assert new == []
+
+
+def test_a_worker_that_cannot_be_started(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error names the program."""
+    monkeypatch.setattr(sys, "executable", "/nonexistent/python")
+    with DrawingWorkers(1) as pool, pytest.raises(Error, match="/nonexistent/python"):
+        pool.frames(ride.path, range(FRAMES))
+
+
+def test_what_a_driver_prints_does_not_disturb(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither on the standard output nor as much of it as no pipe holds."""
+    use_process(
+        monkeypatch,
+        """
+        import os, sys
+        import mjrec.rendering.worker as worker
+        from mjrec.rendering import drawing
+        draw = drawing.TrajectoryDrawing.draw
+        def loud(*arguments, **options):
+            os.write(1, b"x" * 100_000)
+            print("a driver speaks")
+            return draw(*arguments, **options)
+        drawing.TrajectoryDrawing.draw = loud
+        worker.main()
+        """,
+    )
+    with DrawingWorkers(1) as pool:
+        assert np.array_equal(list(pool.frames(ride.path, range(4))), ride.frames[:4])
+
+
+def test_errors_that_nobody_foresaw_keep_their_traceback() -> None:
+    """They are ours to mend."""
+    try:
+        raise KeyError("qpos")
+    except KeyError as error:
+        told = unpacked(carried(error))
+
+    assert type(told) is Error
+    assert "test_rendering_workers.py" in str(told)
+    assert "KeyError: 'qpos'" in str(told)
+
+
+def test_errors_are_carried_without_pickle() -> None:
+    """A class that there is not is just an error."""
+    told = unpacked({"type": "Path", "message": "no"})
+    assert (type(told), str(told)) == (Error, "no")
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, True, "2"])
+def test_a_number_of_workers_that_cannot_be(count: Any) -> None:
+    """One error before anything is started."""
+    with pytest.raises(InvalidArgument, match="workers must be"):
+        DrawingWorkers(count)
+
+
+# Their life
+
+
+def test_dropping_the_iterator_leaves_the_workers_usable(
+    ride: Ride, three: DrawingWorkers
+) -> None:
+    """What was ordered and is not wanted any more does not come."""
+    for _ in range(3):
+        for number, frame in enumerate(three.frames(ride.path, range(FRAMES))):
+            assert np.array_equal(frame, ride.frames[number])
+            if number == 1:
+                break
+    backwards = list(three.frames(ride.path, range(FRAMES - 1, -1, -1)))
+    assert np.array_equal(backwards, ride.frames[::-1])
+
+
+def test_a_later_call_takes_the_workers_over(ride: Ride, three: DrawingWorkers) -> None:
+    """The iterator before says so."""
+    first = three.frames(ride.path, range(FRAMES))
+    next(first)
+    second = three.frames(ride.path, range(FRAMES))
+    with pytest.raises(ClosedError, match="taken"):
+        list(first)
+    assert np.array_equal(list(second), ride.frames)
+
+
+def test_closed_workers_say_so(ride: Ride) -> None:
+    """Closing twice is allowed, and leaves no process."""
+    with new_children() as new:
+        pool = DrawingWorkers(2)
+        frames = pool.frames(ride.path, range(FRAMES))
+        assert len(pids(pool)) == 2
+        pool.close()
+        pool.close()
+        with pytest.raises(ClosedError):
+            list(frames)
+        with pytest.raises(ClosedError):
+            pool.frames(ride.path, [0])
+    assert new == []
+
+
+def test_forgotten_workers_end(ride: Ride) -> None:
+    """Garbage collection is enough."""
+    with new_children() as new:
+        pool = DrawingWorkers(1)
+        frames = pool.frames(ride.path, range(FRAMES))
+        next(frames)
+        del pool, frames
+        gc.collect()
+    assert new == []
+
+
+def test_ctrl_c_while_a_picture_is_drawn(ride: Ride, one: DrawingWorkers) -> None:
+    """It reaches only the parent; the worker draws on for the next call."""
+    list(one.frames(ride.path, [0]))
+    [pid] = pids(one)
+    large = View(height=1000, width=1400)
+    with ctrl_c_soon(), pytest.raises(KeyboardInterrupt):
+        list(one.frames(ride.path, range(FRAMES), large))
+
+    assert np.array_equal(list(one.frames(ride.path, [4])), [ride.frames[4]])
+    assert pids(one) == [pid]
+    assert os.getsid(pid) == pid
+
+
+def test_a_worker_ends_with_its_input_in_mid_drawing(
+    ride: Ride, one: DrawingWorkers
+) -> None:
+    """Nobody is left to want what it draws."""
+    large = View(height=3000, width=3000)
+    frames = one.frames(ride.path, [0] * 50, View())
+    process = one._seats[0].process
+    assert process is not None
+    one._give_up()
+    process.send(
+        job=100,
+        drawing={"trajectory": str(ride.path), "view": large.as_json()},
+        pictures=[[number, 0, 0] for number in range(1000)],
+    )
+    process._process.stdin.close()  # type: ignore[union-attr]  # it has one
+    wait_for_end(process.pid)
+    del frames
+
+
+def test_workers_are_nice(ride: Ride, one: DrawingWorkers) -> None:
+    """They give way to the simulation."""
+    list(one.frames(ride.path, [0]))
+    [pid] = pids(one)
+    assert os.getpriority(os.PRIO_PROCESS, pid) == 10
+
+
+# Wherever the caller is
+
+CALLER = """
+import os, sys
+import numpy as np
+from pathlib import Path
+from mjrec.rendering.workers import DrawingWorkers
+with DrawingWorkers(2) as pool:
+    frames = list(pool.frames(Path(os.environ["RIDE"]), range(9)))
+print(len(frames), sum(int(frame.sum()) for frame in frames))
+"""
+
+
+def run(
+    arguments: list[str], ride: Ride, *, text: str | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    inherited = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
+    return subprocess.run(
+        [sys.executable, *arguments],
+        env={**inherited, "RIDE": str(ride.path), **environment},
+        input=text,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def said(ride: Ride) -> str:
+    return f"{FRAMES} {sum(int(frame.sum()) for frame in ride.frames)}\n"
+
+
+def test_from_standard_input(ride: Ride) -> None:
+    """`python -` has no main module that could be imported."""
+    done = run(["-"], ride, text=CALLER)
+    assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
+
+
+def test_from_a_script_without_a_guard(ride: Ride, tmp_path: Path) -> None:
+    """It runs once, and what lies beside it is not taken for Python's own modules."""
+    (tmp_path / "script.py").write_text(CALLER)
+    (tmp_path / "mujoco.py").write_text("raise RuntimeError('not this one')")
+    done = run([str(tmp_path / "script.py")], ride)
+    assert "not this one" not in done.stderr
+    assert (done.returncode, done.stdout) == (0, said(ride))
+
+
+def test_from_a_daemonic_process(ride: Ride) -> None:
+    """Which may have no children of multiprocessing's."""
+    script = f"""
+import multiprocessing
+def work():
+    exec({CALLER!r})
+if __name__ == "__main__":
+    process = multiprocessing.get_context("fork").Process(target=work, daemon=True)
+    process.start()
+    process.join()
+    raise SystemExit(process.exitcode)
+"""
+    done = run(["-c", script], ride)
+    assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
+
+
+def test_from_a_thread(ride: Ride, one: DrawingWorkers) -> None:
+    """Any thread, one at a time."""
+    drawn: list[Any] = []
+    thread = threading.Thread(
+        target=lambda: drawn.extend(one.frames(ride.path, range(FRAMES)))
+    )
+    thread.start()
+    thread.join()
+    assert np.array_equal(drawn, ride.frames)
+
+
+def test_a_killed_parent_leaves_no_workers(ride: Ride) -> None:
+    """Their input ends with it, whatever else it has started."""
+    script = """
+import os, signal, sys, time
+from pathlib import Path
+from mjrec.rendering.workers import DrawingWorkers
+pool = DrawingWorkers(2)
+frames = pool.frames(Path(os.environ["RIDE"]), range(9))
+if not os.fork():
+    # A forked child has copies of the pipes, and may not use them.
+    try:
+        pool.frames(Path(os.environ["RIDE"]), range(9))
+    except Exception as error:
+        os.write(1, f"{type(error).__name__}\\n".encode())
+    sys.stdin.read()
+    os._exit(0)
+os.write(1, " ".join(str(s.process.pid) for s in pool._seats).encode() + b"\\n")
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    # The child reads this end until the test is over.
+    reading, writing = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", script],
+        env={**os.environ, "RIDE": str(ride.path)},
+        stdin=reading,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    lines = [process.stdout.readline(), process.stdout.readline()]
+    process.wait()
+    # Two processes say a line each, in any order.
+    told, numbers = sorted(lines, reverse=True)
+    assert told == "ClosedError\n"
+
+    for pid in numbers.split():
+        wait_for_end(int(pid))
+    os.close(writing)
+    os.close(reading)
+    process.stdout.close()
+
+
+def test_leaving_in_mid_drawing_is_silent(ride: Ride) -> None:
+    """At interpreter exit the workers end, and nothing waits for them."""
+    script = """
+import os
+from pathlib import Path
+from mjrec.rendering.workers import DrawingWorkers
+pool = DrawingWorkers(2)
+frames = pool.frames(Path(os.environ["RIDE"]), [0] * 1000)
+print("end")
+"""
+    done = run(["-W", "error", "-c", script], ride)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "end\n", "")
+
+
+# What draws
+
+
+@pytest.mark.parametrize("setting", ["disable", None])
+def test_a_backend_is_chosen_where_none_is_named(
+    ride: Ride, setting: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where rendering is turned off, which is for the simulation."""
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    if setting is None:
+        monkeypatch.delenv("MUJOCO_GL")
+    else:
+        monkeypatch.setenv("MUJOCO_GL", setting)
+    with DrawingWorkers(3) as pool:
+        drawn = list(pool.frames(ride.path, range(FRAMES)))
+        assert len(pids(pool)) == 3
+    assert [frame.shape for frame in drawn] == [(HEIGHT, WIDTH, 3)] * FRAMES
+    assert os.environ.get("MUJOCO_GL") == setting
+
+
+def test_a_backend_that_is_named_is_used(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In mjrec's spelling or another."""
+    monkeypatch.setenv("MUJOCO_GL", "OSMesa")
+    with DrawingWorkers(1) as pool:
+        list(pool.frames(ride.path, [0]))
+        [pid] = pids(pool)
+        environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    assert b"MUJOCO_GL=osmesa" in environment
+    assert b"PYOPENGL_PLATFORM=osmesa" in environment
+
+
+def test_a_backend_that_there_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error before anything is started."""
+    monkeypatch.setenv("MUJOCO_GL", "vulkan")
+    with pytest.raises(UnknownName, match="MUJOCO_GL"):
+        DrawingWorkers(1)
+
+
+def test_a_backend_that_does_not_work(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The error has the way out."""
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
+    with DrawingWorkers(2) as pool, pytest.raises(GLError, match="mjrec doctor"):
+        pool.frames(ride.path, range(FRAMES))
+
+
+def test_no_backend_works(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One error with the reasons of all; the workers may be asked again."""
+    use_process(
+        monkeypatch,
+        """
+        import sys
+        import mjrec.gl.choice, mjrec.gl.probing
+        from mjrec.gl.probing import Probe
+        mjrec.gl.choice.probe = lambda name: Probe(name, False, cause="it is broken")
+        from mjrec.rendering import worker
+        worker.main()
+        """,
+    )
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with DrawingWorkers(2) as pool:
+        for _ in range(2):
+            with pytest.raises(GLError, match=r"(?s)egl.*broken.*osmesa.*broken"):
+                pool.frames(ride.path, range(FRAMES))
+
+
+def test_workers_beside_each_other_use_one_cpu_each(
+    ride: Ride, three: DrawingWorkers
+) -> None:
+    """And one alone uses all; the caller's own setting is left alone."""
+    list(three.frames(ride.path, range(6)))
+    for pid in pids(three):
+        assert b"LP_NUM_THREADS=1\0" in Path(f"/proc/{pid}/environ").read_bytes()
+    assert "LP_NUM_THREADS" not in workers._environment({}, alone=True)
+    asked = workers._environment({"LP_NUM_THREADS": "2"}, alone=False)
+    assert asked["LP_NUM_THREADS"] == "2"
+
+
+def test_a_setting_that_crashes_mesa_is_left_out(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And the log says so."""
+    monkeypatch.setenv("LP_NATIVE_VECTOR_WIDTH", "512")
+    with DrawingWorkers(1) as pool:
+        assert np.array_equal(list(pool.frames(ride.path, [2])), [ride.frames[2]])
+    assert "LP_NATIVE_VECTOR_WIDTH" in caplog.text
+
+
+def test_warnings_of_workers_are_logged_here(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With their level."""
+    use_process(
+        monkeypatch,
+        """
+        import logging, os
+        from mjrec.rendering import worker
+        def use_gl():
+            logging.getLogger("x").error("no %s", "GPU")
+            os.environ["MUJOCO_GL"] = "egl"
+            return "egl"
+        worker.use_gl = use_gl
+        worker.main()
+        """,
+    )
+    monkeypatch.setenv("MUJOCO_GL", "")
+    with DrawingWorkers(1) as pool:
+        list(pool.frames(ride.path, [0]))
+    levels = {r.getMessage(): r.levelno for r in caplog.records}
+    assert levels["no GPU"] == logging.ERROR
+
+
+def test_workers_find_what_their_parent_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The main script's directory last, everything else in its order."""
+    main = sys.modules["__main__"]
+    monkeypatch.setattr(main, "__file__", "/scripts/train.py", raising=False)
+    monkeypatch.setattr(sys, "path", ["/scripts", "/b", "relative", "/with:colon"])
+    found = environment_of_child({"A": "1"})
+    relative = Path("relative").absolute()
+    assert found == {"A": "1", "PYTHONPATH": f"/b:{relative}:/scripts"}
+
+
+def test_a_parent_that_found_mjrec_by_itself(ride: Ride, tmp_path: Path) -> None:
+    """By a change of `sys.path`, in a Python that looks nowhere else."""
+    package = Path(mjrec.__file__).parent
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "mjrec").symlink_to(package)
+    script = f"""
+import sys
+sys.path.insert(0, {str(tmp_path / "elsewhere")!r})
+{CALLER}
+import mjrec
+assert "elsewhere" in mjrec.__file__
+"""
+    done = run(["-c", script], ride)
+    assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
