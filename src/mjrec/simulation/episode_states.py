@@ -24,7 +24,7 @@ from .picture_states import (
     CheckedPictures,
     KeptCameras,
     PictureStates,
-    has_infinite_plane,
+    moves_cameras,
 )
 from .scene_view import SceneView
 from .state_source import EpisodeStart
@@ -289,9 +289,7 @@ class _StoredModel:
         )
 
     def _kept_cameras(self, view: SceneView) -> KeptCameras | None:
-        if view.fresh:
-            return None
-        if self._kept is None and has_infinite_plane(self._model):
+        if self._kept is None and moves_cameras(self._model, view):
             self._kept = KeptCameras(self._model)
         return self._kept
 

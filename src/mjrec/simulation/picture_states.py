@@ -16,8 +16,9 @@ from .scene_check import scene_difference
 from .scene_view import SceneView, ViewMemory
 from .snapshot import SnapshotSource, needs_constraints, snapshot_layout
 
-__all__ = ["CheckedPictures", "KeptCameras", "PictureStates", "has_infinite_plane"]
+__all__ = ["CheckedPictures", "KeptCameras", "PictureStates", "moves_cameras"]
 
+_TRACKING = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 # Fields of a model that `snapshot_layout` looks at, which environments leave alone.
@@ -53,8 +54,9 @@ class CheckedPictures:
 class KeptCameras:
     """The cameras that each picture leaves in a scene that stays.
 
-    An infinite plane is drawn around the camera of the picture before. The positions
-    are those that MuJoCo computes, without any drawing.
+    An infinite plane is drawn around the camera of the picture before, and a camera
+    that tracks a body is moved by each picture. The positions are those that MuJoCo
+    computes, without any drawing.
 
     Args:
         model: the model of the scene.
@@ -73,9 +75,13 @@ class KeptCameras:
         return [camera.pos.tolist() for camera in self._scene.camera]
 
     def drawn(self, data: mujoco.MjData, camera: mujoco.MjvCamera) -> None:
-        """Note that a picture of `data` has been made."""
-        # A camera that follows something would be moved.
-        mujoco.mjv_updateCamera(self._model, data, copy.copy(camera), self._scene)
+        """Note that a picture of `data` has been made.
+
+        Args:
+            data: of the picture.
+            camera: what it was made with; one that tracks a body is moved.
+        """
+        mujoco.mjv_updateCamera(self._model, data, camera, self._scene)
         self._drawn = True
 
 
@@ -114,6 +120,9 @@ class PictureStates:
         self._source = SnapshotSource(model, data, self.layout)
         self._watched = ViewMemory(view)
         self._facts = view.facts()
+        # Moved as pictures move it; the environment's own stays where it is.
+        self._camera = copy.copy(view.camera)
+        self._told = self._camera.lookat.tolist()
         self._is_settled_anew = _settle(changed_fields)
         # Whether the camera or an option is other than in the facts.
         self._has_moved = False
@@ -141,8 +150,13 @@ class PictureStates:
 
     def facts(self) -> dict[str, Any]:
         """Return the facts of the scene, and what the picture before left in it."""
-        previous = None if self._kept is None else self._kept.positions
-        return {**self._facts, "previous_cameras": previous}
+        facts = {**self._facts}
+        if self._kept is not None and not self.view.fresh:
+            facts["previous_cameras"] = self._kept.positions
+        if _tracks(self._camera):
+            self._told = self._camera.lookat.tolist()
+            facts["camera"] = {**facts["camera"], "lookat": self._told}
+        return facts
 
     def is_sound(self, changed_fields: Iterable[str]) -> bool:
         """Tell whether pictures with these fields changed were checked before."""
@@ -166,11 +180,28 @@ class PictureStates:
     def take(self, out: NDArray[np.uint8]) -> dict[str, NDArray[Any]] | None:
         """Write a snapshot into `out`, and return what of the view has changed."""
         self._source.take(out)
-        if self._kept is not None:
-            self._kept.drawn(self._data, self.view.camera)
         changed = self._watched.changed()
         if changed is not None:
             self._has_moved = True
+            self._camera = copy.copy(self.view.camera)
+            self._told = self._camera.lookat.tolist()
+        if self._kept is None:
+            return changed
+        return self._drawn(self._kept, changed)
+
+    def _drawn(
+        self, kept: KeptCameras, changed: dict[str, NDArray[Any]] | None
+    ) -> dict[str, NDArray[Any]] | None:
+        """Let the camera move as a picture moves it.
+
+        A camera that tracks a body goes a fifth of the way to it in each picture, so
+        that where it looks depends on all pictures before.
+        """
+        lookat = self._camera.lookat
+        if _tracks(self._camera) and lookat.tolist() != self._told:
+            self._told = lookat.tolist()
+            changed = {**(changed or {}), "camera.lookat": lookat.copy()}
+        kept.drawn(self._data, self._camera)
         return changed
 
     def objection(self, row: NDArray[np.uint8], changed: Iterable[str]) -> str | None:
@@ -207,6 +238,10 @@ class PictureStates:
         return f"drawn from its snapshot the scene is another one: {difference}"
 
 
+def _tracks(camera: mujoco.MjvCamera) -> bool:
+    return bool(camera.type == _TRACKING)
+
+
 def _settle(changed_fields: Iterable[str]) -> bool:
     return any(name.startswith(_SETTLING_THE_LAYOUT) for name in changed_fields)
 
@@ -222,7 +257,12 @@ def _is_same(view: SceneView, other: SceneView) -> bool:
     )
 
 
-def has_infinite_plane(model: mujoco.MjModel) -> bool:
+def moves_cameras(model: mujoco.MjModel, view: SceneView) -> bool:
+    """Tell whether a picture has an influence on the next one."""
+    return _tracks(view.camera) or (not view.fresh and _has_infinite_plane(model))
+
+
+def _has_infinite_plane(model: mujoco.MjModel) -> bool:
     """Tell whether the model has a plane without an edge."""
     planes = model.geom_size[model.geom_type == _PLANE]
     return bool((planes[:, :2] <= 0).any())

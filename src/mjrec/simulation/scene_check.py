@@ -23,7 +23,7 @@ from .scene_view import SceneView
 from .snapshot import restore_snapshot
 from .struct_memory import kind_of
 
-__all__ = ["scene_difference", "updated_scene"]
+__all__ = ["differences", "scene_difference", "updated_scene"]
 
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 
@@ -61,7 +61,7 @@ def scene_difference(
     restore_snapshot(layout.unpack(row), restored_model, restored)
     live = updated_scene(model, data, view)
     again = updated_scene(restored_model, restored, view)
-    return next(_differences(live, again, view), None)
+    return next(differences(live, again, view.option), None)
 
 
 def updated_scene(
@@ -69,6 +69,9 @@ def updated_scene(
 ) -> mujoco.MjvScene:
     """Return a new scene of `data`; the view is left as it is."""
     scene = mujoco.MjvScene(model, maxgeom=view.max_geom)
+    for name in _shapes():
+        # What is not shown is not set either, and may be anything.
+        getattr(scene, name)[...] = 0
     # A camera that follows something is moved by what it follows.
     camera = copy.copy(view.camera)
     mujoco.mjv_updateScene(model, data, view.option, None, camera, _EVERYTHING, scene)
@@ -79,13 +82,14 @@ def _sets_model(layout: RowLayout) -> bool:
     return any(field.name == "tendon_rgba" for field in layout.fields)
 
 
-def _differences(
-    live: mujoco.MjvScene, again: mujoco.MjvScene, view: SceneView
+def differences(
+    live: mujoco.MjvScene, again: mujoco.MjvScene, option: mujoco.MjvOption
 ) -> Iterator[str]:
+    """Yield in words what of `again` is not, to the last bit, as in `live`."""
     if live.ngeom != again.ngeom:
         yield f"{again.ngeom} geoms instead of {live.ngeom}"
     shown = min(live.ngeom, again.ngeom)
-    labelled = view.option.label != int(mujoco.mjtLabel.mjLABEL_NONE)
+    labelled = option.label != int(mujoco.mjtLabel.mjLABEL_NONE)
     without = tuple(n for n in _NOT_SET if not (labelled and n == "label"))
     yield from _different("geom", live.geoms[:shown], again.geoms[:shown], without)
     if live.nlight != again.nlight:
@@ -93,7 +97,7 @@ def _differences(
     lights = slice(min(live.nlight, again.nlight))
     yield from _different("light", live.lights[lights], again.lights[lights])
     yield from _different("camera", live.camera, again.camera)
-    for name in _scene_arrays():
+    for name in _shapes():
         if _value(live, name) != _value(again, name):
             yield f"the scene's {name}"
 
@@ -124,7 +128,9 @@ def _members(kind: Any) -> tuple[str, ...]:
 
 
 @functools.cache
-def _scene_arrays() -> tuple[str, ...]:
-    """Return the names of what holds the shapes of skins and flexes."""
-    names = (name for name in dir(mujoco.MjvScene) if not name.startswith("_"))
-    return tuple(name for name in names if name.startswith(("skin", "flex")))
+def _shapes() -> tuple[str, ...]:
+    """Return the names of the arrays that hold the shapes of skins and flexes."""
+    scene = mujoco.MjvScene()
+    names = (name for name in dir(scene) if name.startswith(("skin", "flex")))
+    values = {name: getattr(scene, name) for name in names}
+    return tuple(n for n, v in values.items() if getattr(v, "dtype", None) == "<f4")

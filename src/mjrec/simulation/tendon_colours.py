@@ -9,6 +9,8 @@ so it does not come back with the arrays of a snapshot; the colour itself is rec
 
 from __future__ import annotations
 
+import functools
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,20 @@ _LIMIT_TENDON = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
 _JOINT_WRAP = int(mujoco.mjtWrap.mjWRAP_JOINT)
 _TENDON_TRANSMISSION = int(mujoco.mjtTrn.mjTRN_TENDON)
 _NO_GRAVITY = int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+_TENDON = int(mujoco.mjtObj.mjOBJ_TENDON)
+
+_AT_ITS_LIMIT = """
+<mujoco>
+  <worldbody>
+    <site name="a"/>
+    <body pos="0 0 1"><freejoint/><geom size=".1"/><site name="b"/></body>
+  </worldbody>
+  <tendon>
+    <spatial limited="true" range="0 .5"><site site="a"/><site site="b"/></spatial>
+  </tendon>
+</mujoco>
+"""
+
 _MINVAL = float(mujoco.mjMINVAL)
 
 
@@ -28,11 +44,24 @@ def has_limited_tendons(model: mujoco.MjModel) -> bool:
     """Tell whether a tendon may be drawn in another colour than the model's."""
     if not model.ntendon:
         return False
-    first = model.wrap_type[model.tendon_adr]
-    could = (
-        (first != _JOINT_WRAP) & (model.tendon_limited != 0) & (model.tendon_matid < 0)
-    )
-    return bool(could.any())
+    spatial = model.wrap_type[model.tendon_adr] != _JOINT_WRAP
+    plain = model.tendon_matid < 0
+    could = spatial & plain & (model.tendon_limited != 0)
+    return bool(could.any()) and _mixes_colours()
+
+
+@functools.cache
+def _mixes_colours() -> bool:
+    """Tell whether this version of MuJoCo mixes colours; the first ones did not."""
+    model = mujoco.MjModel.from_xml_string(_AT_ITS_LIMIT)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    scene = mujoco.MjvScene(model, maxgeom=10)
+    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+    everything = int(mujoco.mjtCatBit.mjCAT_ALL)
+    mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
+    tendons = [g for g in scene.geoms[: scene.ngeom] if g.objtype == _TENDON]
+    return any(geom.rgba[0] != _UNCHOSEN[0] for geom in tendons)
 
 
 def has_plastic_tendons(model: mujoco.MjModel) -> bool:

@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Snapshots: restored into data that is not a number, they give the same scene."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+from mjrec.errors import InvalidArgument
+from mjrec.simulation.scene_check import differences, updated_scene
+from mjrec.simulation.scene_view import SceneView
+from mjrec.simulation.snapshot import (
+    SnapshotSource,
+    needs_constraints,
+    restore_snapshot,
+    snapshot_layout,
+)
+from mjrec.simulation.tendon_colours import has_limited_tendons
+
+ASSETS = Path(__file__).parent.parent / "assets"
+
+# A weight on a cable that is pulled beyond its length, a slack cable that hangs
+# through although its limit is active already, and one with a colour of its own.
+TENDONS = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <site name="top" pos="0 0 1"/>
+    <body pos="0 0 .4"><freejoint/><geom size=".05"/><site name="a"/></body>
+    <body pos=".3 0 1"><freejoint/><geom size=".05"/><site name="b"/></body>
+  </worldbody>
+  <tendon>
+    <spatial limited="true" range="0 .5"><site site="top"/><site site="a"/></spatial>
+    <spatial limited="true" range="0 .305" margin=".1">
+      <site site="top"/><site site="b"/></spatial>
+    <spatial limited="true" range="0 .5" rgba="1 0 0 1">
+      <site site="top"/><site site="a"/></spatial>
+    <spatial><site site="a"/><site site="b"/></spatial>
+  </tendon>
+</mujoco>
+"""
+
+SENSORS = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="2 2 .1"/>
+    <body pos="0 0 1"><freejoint/><geom name="g" size=".1"/>
+      <site name="s" pos="0 0 -.2" zaxis="0 0 -1"/></body>
+    <geom name="h" pos="1 0 1" size=".1"/>
+  </worldbody>
+  <sensor>
+    <rangefinder site="s"/>
+    <fromto geom1="g" geom2="h" cutoff="10"/>
+  </sensor>
+</mujoco>
+"""
+
+FLEX = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <flexcomp name="f" type="grid" count="4 4 1" spacing=".1 .1 .1" pos="0 0 1"
+      radius=".01" dim="2"><edge equality="true"/></flexcomp>
+  </worldbody>
+</mujoco>
+"""
+
+# A little of everything that a visual option shows.
+THINGS = """
+<mujoco>
+  <option timestep=".005"/>
+  <asset><mesh name="m" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/></asset>
+  <worldbody>
+    <light name="l" pos="0 0 3"/>
+    <camera name="c" pos="0 -3 1" xyaxes="1 0 0 0 .3 1"/>
+    <geom type="plane" size="2 2 .1"/>
+    <body name="arm" pos="0 0 .5">
+      <joint name="hinge" axis="0 1 0"/>
+      <geom name="link" type="capsule" fromto="0 0 0 .4 0 0" size=".05"/>
+      <site name="tip" pos=".4 0 0"/>
+      <body name="hand" pos=".5 0 0"><joint name="wrist" axis="0 0 1"/>
+        <geom type="mesh" mesh="m"/></body>
+    </body>
+    <body name="free" pos="1 0 .099"><freejoint/><geom size=".1"/></body>
+    <body name="other" pos="1 1 1"><freejoint/><geom size=".1"/></body>
+  </worldbody>
+  <equality><connect body1="free" body2="other" anchor="0 0 0"/></equality>
+  <actuator>
+    <general name="m" joint="hinge" dyntype="filter" dynprm="1"/>
+    <motor site="tip" gear="0 0 1 0 0 0"/>
+  </actuator>
+</mujoco>
+"""
+
+Simulation = tuple[mujoco.MjModel, mujoco.MjData]
+
+
+def simulated(xml: str, steps: int = 5) -> Simulation:
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.7
+    data.xfrc_applied[-1, :3] = (1, 2, 3)
+    mujoco.mj_step(model, data, nstep=steps)
+    return model, data
+
+
+def view(
+    model: mujoco.MjModel, option: mujoco.MjvOption | None = None, **kwargs: Any
+) -> SceneView:
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    settings = {"max_geom": 1000, "fresh": False, "height": 48, "width": 64}
+    return SceneView(
+        camera=camera,
+        option=option or mujoco.MjvOption(),
+        label=-1,
+        **{**settings, **kwargs},
+    )
+
+
+def row_of(
+    model: mujoco.MjModel, data: mujoco.MjData, option: mujoco.MjvOption | None = None
+) -> dict[str, Any]:
+    layout = snapshot_layout(model, option)
+    row = np.empty(layout.size, np.uint8)
+    SnapshotSource(model, data, layout).take(row)
+    return layout.unpack(row)
+
+
+def without_numbers(model: mujoco.MjModel) -> mujoco.MjData:
+    """Return fresh data in which every number with a point is NaN."""
+    data = mujoco.MjData(model)
+    for name in dir(data):
+        value = None if name.startswith("_") else getattr(data, name)
+        if isinstance(value, np.ndarray) and value.dtype == np.float64:
+            value[...] = np.nan
+    return data
+
+
+def differences_of(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    option: mujoco.MjvOption | None = None,
+    *,
+    drop: str = "",
+) -> list[str]:
+    """Return in what the scene of a restored snapshot differs from the live one."""
+    values = row_of(model, data, option)
+    values.pop(drop, None)
+    fresh_model = copy.copy(model)
+    fresh = without_numbers(fresh_model)
+    restore_snapshot(values, fresh_model, fresh)
+    shown = view(model, option)
+    live = updated_scene(model, data, shown)
+    assert live.ngeom
+    return list(
+        differences(live, updated_scene(fresh_model, fresh, shown), shown.option)
+    )
+
+
+@pytest.mark.parametrize("xml", [TENDONS, SENSORS, FLEX, THINGS])
+def test_a_restored_snapshot_gives_the_same_scene(xml: str) -> None:
+    """Byte by byte, with tendons, rays, flexes and all that is shown by default."""
+    assert differences_of(*simulated(xml)) == []
+
+
+def test_a_skin_is_restored() -> None:
+    """Skins follow positions and orientations of bodies, which nothing else does."""
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / "showcase.xml"))
+    data = mujoco.MjData(model)
+    data.qvel[:] = 1
+    mujoco.mj_step(model, data, nstep=20)
+    assert model.nskin
+    assert differences_of(model, data) == []
+    assert any("skin" in text for text in differences_of(model, data, drop="xquat"))
+
+
+@pytest.mark.parametrize("name", ["HalfCheetah-v5", "Humanoid-v5", "Reacher-v5"])
+def test_an_environments_picture_lags_its_state_and_is_restored(name: str) -> None:
+    """After a step the positions belong to the state before its last substep."""
+    with gymnasium.make(name) as env:
+        env.reset(seed=1)
+        for _ in range(5):
+            env.step(env.action_space.sample())
+        simulation: Any = env.unwrapped
+        assert differences_of(simulation.model, simulation.data) == []
+
+
+@pytest.mark.parametrize(
+    ("xml", "field"),
+    [
+        (TENDONS, "tendon_rgba"),
+        (TENDONS, "ten_length"),
+        (TENDONS, "wrap_xpos"),
+        (SENSORS, "sensordata"),
+        (FLEX, "flexvert_xpos"),
+        (THINGS, "geom_xmat"),
+        (THINGS, "light_xdir"),
+    ],
+)
+def test_what_a_snapshot_holds_is_needed(xml: str, field: str) -> None:
+    """Without one of its arrays the scene is another one: the test above can fail."""
+    model, data = simulated(xml)
+    if field == "tendon_rgba" and not has_limited_tendons(model):
+        pytest.skip("this MuJoCo mixes no colours")
+    assert differences_of(model, data, drop=field)
+
+
+@pytest.mark.parametrize("flag", [*mujoco.mjtVisFlag.__members__][:-1])
+def test_every_flag_is_exact_or_refused(flag: str) -> None:
+    """Each visual flag, turned over, is restored exactly or said to be impossible."""
+    option = mujoco.MjvOption()
+    index = int(mujoco.mjtVisFlag.__members__[flag])
+    option.flags[index] = not option.flags[index]
+    _check_exact_or_refused(option, mentioned=flag)
+
+
+@pytest.mark.parametrize("frame", [*mujoco.mjtFrame.__members__][:-1])
+def test_every_frame_is_exact_or_refused(frame: str) -> None:
+    """So is each kind of coordinate frames."""
+    option = mujoco.MjvOption()
+    option.frame = int(mujoco.mjtFrame.__members__[frame])
+    _check_exact_or_refused(option, mentioned=frame)
+
+
+@pytest.mark.parametrize("label", [*mujoco.mjtLabel.__members__][:-1])
+def test_every_label_is_exact_or_refused(label: str) -> None:
+    """So is each kind of labels, their text included."""
+    option = mujoco.MjvOption()
+    option.label = int(mujoco.mjtLabel.__members__[label])
+    _check_exact_or_refused(option, mentioned=label)
+
+
+def test_activations_and_bounding_boxes_are_exact() -> None:
+    """Flags that show something only together with another one."""
+    for names in (["ACTUATOR", "ACTIVATION"], ["INERTIA", "SCLINERTIA"]):
+        option = mujoco.MjvOption()
+        for name in names:
+            option.flags[int(mujoco.mjtVisFlag.__members__[f"mjVIS_{name}"])] = True
+        _check_exact_or_refused(option, mentioned="")
+
+
+def test_joints_are_shown_where_none_has_a_limit() -> None:
+    """Only the colour of a joint at its limit comes from the constraints."""
+    option = mujoco.MjvOption()
+    option.flags[int(mujoco.mjtVisFlag.mjVIS_JOINT)] = True
+    model, data = simulated(THINGS)
+    assert needs_constraints(model, option) is None
+    assert differences_of(model, data, option) == []
+    model.jnt_limited[0] = True
+    assert "mjVIS_JOINT" in (needs_constraints(model, option) or "")
+
+
+def _check_exact_or_refused(option: mujoco.MjvOption, *, mentioned: str) -> None:
+    model, data = simulated(THINGS)
+    assert data.ncon
+    reason = needs_constraints(model, option)
+    if reason is None:
+        assert differences_of(model, data, option) == []
+    else:
+        assert mentioned in reason
+
+
+def test_what_is_refused_could_not_be_exact() -> None:
+    """Contacts are gone in fresh data: the refusal has a reason."""
+    option = mujoco.MjvOption()
+    option.flags[int(mujoco.mjtVisFlag.mjVIS_CONTACTPOINT)] = True
+    assert differences_of(*simulated(THINGS), option)
+
+
+def test_the_layout_has_what_the_model_has() -> None:
+    """Nothing empty is in it, and skins, rays and tendons add what they need."""
+    names = {field.name for field in snapshot_layout(simulated(THINGS)[0]).fields}
+    assert names == {
+        *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat"),
+        *("cam_xpos", "cam_xmat", "light_xpos", "light_xdir", "subtree_com"),
+    }
+    names = {field.name for field in snapshot_layout(simulated(SENSORS)[0]).fields}
+    assert "sensordata" in names
+    names = {field.name for field in snapshot_layout(simulated(TENDONS)[0]).fields}
+    assert {"ten_length", "wrap_obj", "ten_wrapadr"} <= names
+
+
+def test_the_layout_of_the_data_is_that_of_its_arrays() -> None:
+    """Types and shapes are those of the bindings, a flag being a byte."""
+    model, data = simulated(THINGS)
+    option = mujoco.MjvOption()
+    option.flags[:] = True
+    for field in snapshot_layout(model, option).fields:
+        array = getattr(data, field.name)
+        assert array.shape == field.array.shape
+        assert array.dtype.itemsize == np.dtype(field.array.dtype).itemsize
+
+
+def test_a_tendons_spring_that_has_yielded_is_restored() -> None:
+    """Since mujoco 4 how far a cable hangs through depends on what it went through."""
+    xml = TENDONS.replace(
+        "<spatial><site",
+        '<spatial springlength="0 .4" stiffness="1" springyield="1"><site',
+    )
+    try:
+        model, data = simulated(xml)
+    except ValueError:
+        pytest.skip("no plastic tendons before mujoco 4")
+    data.plastic[1] = 0.9
+    assert differences_of(model, data) == []
+    assert differences_of(model, data, drop="plastic")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda values: values.update(qpos=np.zeros(1)),
+        lambda values: values.update(geom_xpos=np.zeros((1, 3))),
+        lambda values: values.update(__class__=np.zeros(1)),
+    ],
+)
+def test_a_foreign_snapshot_is_refused(
+    change: Callable[[dict[str, Any]], None],
+) -> None:
+    """Only what a snapshot holds is set, and only in its own shape."""
+    model, data = simulated(THINGS)
+    values = row_of(model, data)
+    change(values)
+    with pytest.raises(InvalidArgument, match="belongs to another model or version"):
+        restore_snapshot(values, model, data)
