@@ -1,0 +1,532 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A finished trajectory holds what its log held, for mjrec and for plain h5py."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+import mjrec.formats.trajectory_file as trajectory_file
+from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
+from mjrec.formats.monitor_directory import Infix, trajectory_prefix
+from mjrec.formats.trajectory import (
+    Array,
+    ModelChange,
+    RowLayout,
+    StateComponent,
+    TrajectoryContent,
+    TrajectoryHeader,
+)
+from mjrec.formats.trajectory_file import (
+    find_trajectory,
+    finish_trajectory,
+    open_trajectory,
+)
+from mjrec.formats.trajectory_log import TrajectoryLogWriter
+
+HEADER = TrajectoryHeader(
+    facts={
+        "env_id": "E-v0",
+        "episode_id": 27,
+        "seed": 7,
+        "model": {"mujoco": "3.17.0"},
+        "limit": float("inf"),
+        "rate": "20",
+    },
+    state=(StateComponent("qpos", 0, 2), StateComponent("time", 2, 1)),
+    snapshot=RowLayout.packed(
+        [
+            ("geom_xpos", Array("<f8", (2, 3))),
+            ("wrap_obj", Array("<i4", (3,))),
+            ("flexvert_xpos", Array("<f8", (0, 3))),
+            ("eq_active", Array("|b1", (1,))),
+        ]
+    ),
+    action=Array("<f4", (3,)),
+    observation=Array("|u1", (2, 2)),
+)
+NAME = f"{trajectory_prefix(Infix(0, '1'), 27)}.log"
+CHANGES = (
+    ModelChange(
+        step=0,
+        fields={
+            "geom_rgba": np.arange(8, dtype=np.float32).reshape(2, 4),
+            "opt.timestep": np.array(0.002),
+            "hfield_data": np.empty((0, 3), np.float32),
+        },
+    ),
+    ModelChange(step=5, fields={"site_pos": np.array([[1.0, np.nan, 3.0]])}),
+)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return tmp_path / NAME
+
+
+def write(
+    log: Path,
+    steps: int = 40,
+    *,
+    every: int = 2,
+    header: TrajectoryHeader = HEADER,
+) -> None:
+    """Write rows of random bytes: NaNs of every kind are among the numbers."""
+    chance = random.Random(1)
+    writer = TrajectoryLogWriter(log, header)
+    for change in CHANGES:
+        writer.add_model_change(change)
+    for step in range(steps + 1):
+        row = writer.step_row(step, step / 3, False, step == steps)
+        row[:] = np.frombuffer(chance.randbytes(row.size), np.uint8)
+        if step % every == 0 and header.snapshot.fields:
+            row = writer.frame_row(step)
+            row[:] = np.frombuffer(chance.randbytes(row.size), np.uint8)
+    writer.add_facts({"complete": True, "length": steps})
+    writer.close()
+
+
+def read(path: Path) -> TrajectoryContent:
+    with open_trajectory(path) as reader:
+        return reader.content()
+
+
+def assert_same(one: TrajectoryContent, other: TrajectoryContent) -> None:
+    """Check that two are equal bit for bit."""
+    for field in dataclasses.fields(TrajectoryContent):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(a, np.ndarray):
+            assert (a.dtype, a.shape) == (b.dtype, b.shape), field.name
+            assert a.tobytes() == b.tobytes(), field.name
+        elif field.name != "model_changes":
+            assert a == b, field.name
+    assert len(one.model_changes) == len(other.model_changes)
+    for change, again in zip(one.model_changes, other.model_changes, strict=True):
+        assert change.step == again.step
+        assert sorted(change.fields) == sorted(again.fields)
+        for name, values in change.fields.items():
+            np.testing.assert_array_equal(values, again.fields[name], strict=True)
+
+
+def test_the_finished_file_holds_what_the_log_held(log: Path) -> None:
+    """Bit for bit, NaNs with their payloads; the log is gone."""
+    write(log)
+    content = read(log)
+    finished = finish_trajectory(log)
+    assert finished == log.with_suffix(".h5")
+    assert not log.exists()
+    assert_same(read(finished), content)
+    assert content.header.facts == {**HEADER.facts, "complete": True, "length": 40}
+
+
+@pytest.mark.parametrize("steps", [0, 1, 700])
+def test_episodes_of_any_length_are_finished(log: Path, steps: int) -> None:
+    """The reset alone, and more than fits into one chunk of any dataset."""
+    write(log, steps, every=1)
+    content = read(log)
+    assert_same(read(finish_trajectory(log)), content)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        TrajectoryHeader(facts={}),
+        TrajectoryHeader(facts={}, action=Array("<i8", ()), state=HEADER.state),
+        TrajectoryHeader(facts={}, action=Array("<f8", (0,)), state=HEADER.state),
+        TrajectoryHeader(facts={"long": "x" * 200_000}, snapshot=HEADER.snapshot),
+    ],
+)
+def test_what_is_not_recorded_is_not_there(log: Path, header: TrajectoryHeader) -> None:
+    """Without simulation, pictures, actions or observations; facts of any length."""
+    write(log, 3, header=header)
+    content = read(log)
+    assert_same(read(finish_trajectory(log)), content)
+
+
+def test_an_episode_killed_at_its_beginning_is_finished(log: Path) -> None:
+    """Not even the state after the reset was written."""
+    TrajectoryLogWriter(log, HEADER).close()
+    content = read(log)
+    assert content.states.shape == (0, 3)
+    assert_same(read(finish_trajectory(log)), content)
+
+
+def test_a_torn_log_is_finished_and_says_what_it_lacks(log: Path) -> None:
+    """The whole records are kept, the number of the others too."""
+    write(log)
+    os.truncate(log, log.stat().st_size - 120)
+    content = read(log)
+    assert content.dropped > 0
+    assert_same(read(finish_trajectory(log)), content)
+
+
+def test_ranges_of_snapshots_are_packed_rows(log: Path) -> None:
+    """A render worker gets the same bytes from the log and from the file."""
+    write(log, 200, every=1)
+    with open_trajectory(log) as reader:
+        rows = reader.snapshots(0, 201)
+    with open_trajectory(finish_trajectory(log)) as reader:
+        for start, stop in [(0, 0), (0, 8), (30, 34), (70, 102), (200, 201)]:
+            part = reader.snapshots(start, stop)
+            assert part.dtype == np.uint8
+            np.testing.assert_array_equal(part, rows[start:stop])
+        with pytest.raises(InvalidArgument, match="has 201 snapshots"):
+            reader.snapshots(200, 202)
+
+
+def test_plain_h5py_finds_every_array_by_its_name(log: Path) -> None:
+    """Without mjrec: names, shapes and the facts that one looks for first."""
+    write(log)
+    content = read(log)
+    fields = HEADER.snapshot.unpack(content.snapshots)
+    with h5py.File(finish_trajectory(log)) as file:
+        assert set(file) == {
+            *("states", "actions", "rewards", "terminated", "truncated", "time"),
+            *("observations", "frame_steps", "snapshots", "model_changes"),
+        }
+        for name in ("states", "actions", "rewards", "truncated", "frame_steps"):
+            assert file[name][()].tobytes() == getattr(content, name).tobytes()
+        assert file["time"][()].tobytes() == content.states[:, 2].tobytes()
+        assert file["snapshots"].dtype.names == ("geom_xpos", "wrap_obj", "eq_active")
+        for name in file["snapshots"].dtype.names:
+            assert file["snapshots"][name].tobytes() == fields[name].tobytes()
+        assert list(file["states"].attrs["components"]) == ["qpos", "time"]
+        assert file["states"].attrs["offsets"].tolist() == [0, 2]
+        assert file["model_changes/1"].attrs["step"] == 5
+        assert file["model_changes/0/opt.timestep"][()] == 0.002
+        assert file.attrs["env_id"] == "E-v0"
+        assert file.attrs["mujoco_version"] == "3.17.0"
+        assert (file.attrs["episode_id"], file.attrs["seed"]) == (27, 7)
+        assert file.attrs["complete"]
+
+
+def test_old_hdf5_libraries_can_read_it(log: Path) -> None:
+    """The format of HDF5 1.10, and no filter that is not built in."""
+    write(log)
+    path = finish_trajectory(log)
+    # Version 3 of the superblock is 1.10's; `latest` writes a newer one.
+    assert path.read_bytes()[8] == 3
+    with h5py.File(path) as file:
+        for dataset in (file["states"], file["snapshots"], file["actions"]):
+            properties = dataset.id.get_create_plist()
+            filters = [
+                properties.get_filter(i)[0] for i in range(properties.get_nfilters())
+            ]
+            assert filters == [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
+
+
+def test_the_same_log_makes_the_same_file(log: Path, tmp_path: Path) -> None:
+    """No time and no chance gets into it."""
+    write(log)
+    other = shutil.copy(log, tmp_path / "copy.log")
+    one, two = finish_trajectory(log), finish_trajectory(Path(other))
+    assert one.read_bytes() == two.read_bytes()
+
+
+def test_the_user_may_have_the_file_open_as_well(log: Path) -> None:
+    """HDF5 refuses a file that is open in one process in two different ways."""
+    write(log)
+    path = finish_trajectory(log)
+    with h5py.File(path), open_trajectory(path) as reader:
+        assert reader.frame_count == 21
+    with open_trajectory(path), h5py.File(path) as file:
+        assert len(file["frame_steps"]) == 21
+
+
+def test_the_example_of_the_specification_runs(
+    log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What docs/format.md shows a stranger works on a real file."""
+    write(log)
+    finish_trajectory(log).rename(log.with_name("episode.h5"))
+    text = Path(__file__).parents[1].joinpath("docs", "format.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(log.parent)
+    exec(compile(code, "docs/format.md", "exec"), {})
+    assert "E-v0" in capsys.readouterr().out
+
+
+def test_finishing_twice_changes_nothing(log: Path) -> None:
+    """The second time the log is gone, and the file is as it was."""
+    write(log)
+    path = finish_trajectory(log)
+    before = path.stat()
+    assert finish_trajectory(log) == path
+    assert path.stat() == before
+
+
+def test_a_log_left_beside_its_finished_file_is_removed(log: Path) -> None:
+    """Killed between rename and removal: nothing is made again."""
+    write(log)
+    kept = log.read_bytes()
+    path = finish_trajectory(log)
+    before = path.stat()
+    log.write_bytes(kept)
+    assert finish_trajectory(log) == path
+    assert not log.exists()
+    assert path.stat() == before
+
+
+def test_a_damaged_finished_file_is_made_again(log: Path) -> None:
+    """While there is a log, nothing is lost."""
+    write(log)
+    content = read(log)
+    log.with_suffix(".h5").write_bytes(b"\x89HDF\r\n\x1a\nnothing of use")
+    assert_same(read(finish_trajectory(log)), content)
+
+
+def test_only_a_log_can_be_finished(log: Path) -> None:
+    """The finished file itself is not removed for being one."""
+    write(log)
+    path = finish_trajectory(log)
+    with pytest.raises(InvalidArgument, match=r"ends in \.log"):
+        finish_trajectory(path)
+    assert path.exists()
+
+
+def test_two_may_finish_the_same_log(
+    log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever comes second finds the file instead of the log."""
+    write(log)
+    is_whole: Callable[[Path], bool] = trajectory_file._is_whole
+    answers = [False]
+
+    def late(path: Path) -> bool:
+        if answers:
+            # The other one does it all just after this one has looked.
+            answer = answers.pop()
+            finish_trajectory(log)
+            return answer
+        return is_whole(path)
+
+    monkeypatch.setattr(trajectory_file, "_is_whole", late)
+    assert read(finish_trajectory(log)).frame_steps.size == 21
+    assert not log.exists()
+
+
+def test_nothing_to_finish_is_one_clear_error(log: Path) -> None:
+    """Neither log nor file; or a log that cannot be read, which stays."""
+    with pytest.raises(UnreadableFile, match="No such file"):
+        finish_trajectory(log)
+    log.write_bytes(b"something else")
+    with pytest.raises(UnreadableFile, match="no trajectory"):
+        finish_trajectory(log)
+    assert log.read_bytes() == b"something else"
+
+
+@pytest.mark.parametrize("room", [0, 700, 5000])
+def test_a_full_disk_leaves_the_log_and_nothing_else(log: Path, room: int) -> None:
+    """One error that names the file; with room again it succeeds."""
+    write(log)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+    try:
+        with pytest.raises(FileNotWritten, match=r"\.h5: File too large"):
+            finish_trajectory(log)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(log.parent.iterdir()) == [log]
+    finish_trajectory(log)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import mjrec.formats.trajectory_file as trajectory_file
+where, path = sys.argv[1], Path(sys.argv[2])
+die = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
+if where == "before the name":
+    os.fsync = die
+else:
+    Path.unlink = die
+trajectory_file.finish_trajectory(path)
+"""
+
+
+@pytest.mark.parametrize("where", ["before the name", "before the removal"])
+def test_a_killed_finish_is_done_again(log: Path, where: str) -> None:
+    """There is always the log or the whole file, and never half of one."""
+    write(log)
+    content = read(log)
+    process = subprocess.run(
+        [sys.executable, "-c", KILLED, where, str(log)], check=False
+    )
+    assert process.returncode == -signal.SIGKILL
+    assert log.exists()
+    assert log.with_suffix(".h5").exists() == (where == "before the removal")
+    assert_same(read(finish_trajectory(log)), content)
+
+
+def test_the_file_of_an_episode_is_found(tmp_path: Path) -> None:
+    """The finished one if there is one, else the log, else nothing."""
+    infix = Infix(0, "1")
+    log = tmp_path / NAME
+    assert find_trajectory(tmp_path, infix, 27) is None
+    write(log)
+    assert find_trajectory(tmp_path, infix, 27) == log
+    kept = log.read_bytes()
+    finished = finish_trajectory(log)
+    log.write_bytes(kept)
+    assert find_trajectory(tmp_path, infix, 27) == finished
+    assert find_trajectory(tmp_path, "0.1", 27) == finished
+    assert find_trajectory(tmp_path, infix, 28) is None
+    assert find_trajectory(tmp_path, "nonsense", 27) is None
+
+
+def test_a_log_that_was_finished_meanwhile_is_opened(log: Path) -> None:
+    """Whoever was told the log's name just before gets what it has become."""
+    write(log)
+    path = finish_trajectory(log)
+    with open_trajectory(log) as reader:
+        assert reader.path == path
+
+
+def test_what_a_file_is_its_content_says(log: Path, tmp_path: Path) -> None:
+    """A name may be anything."""
+    write(log)
+    content = read(log)
+    copy = tmp_path / "renamed.h5"
+    shutil.copy(log, copy)
+    assert_same(read(copy), content)
+
+
+def test_a_closed_file_says_so(log: Path) -> None:
+    """Closing is idempotent; what is in memory stays."""
+    write(log)
+    reader = open_trajectory(finish_trajectory(log))
+    reader.close()
+    reader.close()
+    assert reader.step_count == 40
+    for use in (
+        lambda: reader.states(0, 1),
+        lambda: reader.snapshots(0, 1),
+        lambda: reader.model_changes,
+    ):
+        with pytest.raises(ClosedError, match="is closed"):
+            use()
+
+
+def replace_attribute(name: str, value: Any) -> Callable[[h5py.File], None]:
+    return lambda file: file.attrs.__setitem__(name, value)
+
+
+def replace_dataset(name: str, **options: Any) -> Callable[[h5py.File], None]:
+    def replace(file: h5py.File) -> None:
+        del file[name]
+        file.create_dataset(name, **options)
+
+    return replace
+
+
+def link(name: str, target: Any) -> Callable[[h5py.File], None]:
+    def replace(file: h5py.File) -> None:
+        del file[name]
+        file[name] = target
+
+    return replace
+
+
+def external(file: h5py.File) -> None:
+    del file["rewards"]
+    file.create_dataset("rewards", (40,), "<f8", external=[("/etc/passwd", 0, 320)])
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (replace_attribute("format", np.bytes_(b"robomimic")), "no trajectory"),
+        (replace_attribute("format", "mjrec trajectory"), "of another type"),
+        (replace_attribute("format_version", np.int64(2)), "update mjrec"),
+        (replace_attribute("format_version", np.ones(3, int)), "of another type"),
+        (replace_attribute("facts", np.bytes_(b"{}")), "facts or its layout are dam"),
+        (replace_attribute("layout", "{}"), "of another type"),
+        (replace_dataset("states", data=np.zeros((41, 4))), "have the shape"),
+        (replace_dataset("states", data=np.zeros((9, 3))), "9 states for 40 steps"),
+        (replace_dataset("states", data=np.zeros((41, 3), "f4")), "of dtype float32"),
+        (replace_dataset("rewards", data=["a"] * 40), "of dtype object"),
+        (replace_dataset("rewards", data=h5py.Empty("f8")), "no dataset"),
+        (replace_dataset("actions", data=np.zeros((3, 3), "f4")), "3 actions, not 40"),
+        (replace_dataset("snapshots", data=np.zeros(21)), "snapshots are of dtype"),
+        (replace_dataset("frame_steps", data=np.full(21, 99)), "not of its steps"),
+        (replace_dataset("frame_steps", data=np.arange(21)[::-1]), "not of its steps"),
+        (
+            replace_dataset("rewards", shape=(10**13,), dtype="<f8", chunks=(1000,)),
+            "more memory than it can hold",
+        ),
+        (
+            replace_dataset(
+                "rewards", data=np.ones(40), chunks=(40,), compression="lzf"
+            ),
+            "in a way that mjrec does not write",
+        ),
+        (external, "in a way that mjrec does not write"),
+        (link("rewards", h5py.ExternalLink("other.h5", "/x")), "no 'rewards' of its"),
+        (link("rewards", h5py.SoftLink("/truncated")), "no 'rewards' of its own"),
+        (link("model_changes", np.zeros(3)), "is no group"),
+        (lambda file: file.__delitem__("truncated"), "no 'truncated' of its own"),
+        (
+            lambda file: file["model_changes/0"].create_dataset("x", data=["a"]),
+            "no dtype",
+        ),
+        (
+            lambda file: file.move("model_changes/0", "model_changes/9"),
+            "no '0' of its own",
+        ),
+    ],
+)
+def test_a_file_of_another_making_is_refused(
+    log: Path, change: Callable[[h5py.File], None], reason: str
+) -> None:
+    """One clear error for each thing that is not as mjrec writes it."""
+    write(log)
+    path = finish_trajectory(log)
+    with h5py.File(path, "r+") as file:
+        change(file)
+    with pytest.raises(UnreadableFile, match=reason) as error:
+        read(path)
+    assert error.value.path == path
+
+
+def test_a_truncated_file_is_refused(log: Path) -> None:
+    """At whatever length."""
+    write(log)
+    path = finish_trajectory(log)
+    data = path.read_bytes()
+    for size in [*range(0, 200, 20), len(data) // 2, len(data) - 1]:
+        path.write_bytes(data[:size])
+        with pytest.raises(UnreadableFile, match=path.name):
+            read(path)
+
+
+def test_random_damage_is_noticed(log: Path) -> None:
+    """A changed byte is an error, or is one that nothing depends on."""
+    write(log)
+    content = dataclasses.replace(read(log), model_changes=())
+    path = finish_trajectory(log)
+    data = path.read_bytes()
+    chance = random.Random(1)
+    for _ in range(60):
+        damaged = bytearray(data)
+        damaged[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            again = read(path)
+        except UnreadableFile:
+            continue
+        # Single numbers among the model's fields are stored as they are.
+        assert_same(dataclasses.replace(again, model_changes=()), content)
