@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known of dm_control's environments, and their resets without OpenGL."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+pytest.importorskip("dm_control")
+
+from dm_control import suite
+from dm_control.mujoco import Physics
+from dm_control.suite.wrappers import pixels
+
+from mjrec.environments.dm_control_contexts import ContextsOnDemand
+from mjrec.environments.dm_control_scenes import dm_control_scenes
+from mjrec.environments.dm_env_episodes import StepLimit
+from mjrec.errors import UnknownName
+
+pytestmark = pytest.mark.dm_control
+
+
+def load(domain: str = "cheetah", task: str = "run", **kwargs: Any) -> Any:
+    env = suite.load(domain, task, task_kwargs={"random": 0}, **kwargs)
+    quality = env.physics.model.vis.quality
+    quality.shadowsize, quality.offsamples = 64, 0
+    return env
+
+
+def begun(env: Any, directory: Path, **asked: Any) -> dict[str, Any]:
+    """Return the facts of the scene of an episode that begins now."""
+    scenes = dm_control_scenes(env, **asked)
+    assert scenes.states is not None
+    scenes.states.open(directory)
+    with scenes.states.resetting():
+        env.reset()
+    start = scenes.states.begin_episode()
+    assert start.refusal is None
+    assert start.scene is not None
+    scenes.states.finish()
+    scenes.states.close()
+    return dict(start.scene)
+
+
+def test_shown_as_by_physics(tmp_path: Path) -> None:
+    """dm_control's size, number of geoms and option, and a new scene each time."""
+    scene = begun(load(), tmp_path)
+    assert (scene["height"], scene["width"], scene["label"]) == (240, 320, -1)
+    assert scene["fresh"] is True
+    assert scene["max_geom"] == 1000
+    assert scene["option"]["flags"][int(mujoco.mjtVisFlag.mjVIS_RANGEFINDER)] == 0
+    named = begun(StepLimit(load(), 3), tmp_path, camera="side", height=32)
+    assert (named["camera"]["fixedcamid"], named["label"]) == (0, "side")
+
+
+def test_what_physics_cannot_draw_is_shown_as_it_is_live(tmp_path: Path) -> None:
+    """Larger pictures than its buffer, and cameras of one's own."""
+    camera = mujoco.MjvCamera()
+    for asked in ({"width": 4000}, {"camera": camera}):
+        scene = begun(load(), tmp_path, **asked)
+        assert (scene["fresh"], scene["max_geom"]) == (False, 10000)
+
+
+def test_free_camera_moves_with_the_model(tmp_path: Path) -> None:
+    """physics.render() places it anew for every picture."""
+    env = load()
+    scenes = dm_control_scenes(env)
+    assert scenes.states is not None
+    scenes.states.open(tmp_path)
+    env.reset()
+    row = np.empty(scenes.states.begin_episode().snapshot.size, np.uint8)
+    env.physics.model.vis.global_.azimuth += 30
+    changed = scenes.states.capture_snapshot(row)
+    assert changed is not None
+    assert changed["camera.azimuth"] == 120
+    scenes.states.close()
+
+
+def test_camera_is_checked_at_once() -> None:
+    """Not at the first picture."""
+    with pytest.raises(UnknownName, match="side"):
+        dm_control_scenes(load(), camera="sideways")
+
+
+def test_a_physics_that_overrides_is_named() -> None:
+    """Of a class, or on the object."""
+
+    class Drawing(Physics):  # type: ignore[misc]  # untyped
+        def render(self, *args: Any, **kwargs: Any) -> Any:
+            return 255 - super().render(*args, **kwargs)
+
+    env = load()
+    assert dm_control_scenes(env).obstacle is None
+    env._physics = Drawing.from_model(env.physics.model)
+    assert "Drawing overrides render()" in str(dm_control_scenes(env).obstacle)
+    assert dm_control_scenes(env, camera=mujoco.MjvCamera()).obstacle is None
+    env = load()
+    env.physics.render = lambda: None
+    assert "Physics overrides render()" in str(dm_control_scenes(env).obstacle)
+
+
+def test_name_and_random_state() -> None:
+    """The name is what the user says; a generator with that state draws the same."""
+    env = load()
+    scenes = dm_control_scenes(env, env_id="dm_control/cheetah-run")
+    assert scenes.environment == {
+        "framework": "dm_control",
+        "id": "dm_control/cheetah-run",
+        "kwargs": None,
+    }
+    assert dm_control_scenes(env, env_id="mine").environment is None
+    state = json.loads(json.dumps(scenes.random_state()))
+    again = np.random.RandomState()
+    again.set_state(state)
+    assert again.rand() == env.task.random.rand()
+
+
+def test_composers_model_is_stored_as_it_was_written(tmp_path: Path) -> None:
+    """With what makes it again in any version of MuJoCo."""
+    from dm_control import manipulation
+
+    env = manipulation.load("reach_site_features", seed=1)
+    scenes = dm_control_scenes(env)
+    assert scenes.obstacle is None
+    assert scenes.random_state()["bit_generator"] == "MT19937"
+    begun(env, tmp_path)
+    assert len(list(tmp_path.glob("*.mjb.gz"))) == 1
+    assert len(list(tmp_path.glob("*.zip"))) == 1
+
+
+WITHOUT_GL = """
+import numpy as np
+from dm_control import composer, suite
+from dm_control.locomotion.arenas import bowl
+from dm_control.locomotion.tasks import escape
+from dm_control.locomotion.walkers import rodent
+from mjrec.environments.dm_control_contexts import ContextsOnDemand
+
+def quadruped():
+    return suite.load("quadruped", "escape", task_kwargs={"random": 0})
+
+def rat():
+    walker = rodent.Rat()
+    task = escape.Escape(walker=walker, arena=bowl.Bowl(size=(4.0, 4.0)))
+    walker.observables.egocentric_camera.enabled = False
+    return composer.Environment(task, random_state=np.random.RandomState(0))
+
+for make in (quadruped, rat):
+    env = make()
+    contexts = ContextsOnDemand(env)
+    for _ in range(2):
+        with contexts.resetting():
+            env.reset()
+        print(env.physics._contexts, env.physics.model.hfield_data.std() > 0.1)
+    try:
+        env.reset()
+    except RuntimeError as error:
+        print(error)
+"""
+
+
+def test_terrain_is_made_without_gl() -> None:
+    """Where a reset asks for the context, and only inside a recorded reset."""
+    run = subprocess.run(
+        [sys.executable, "-c", WITHOUT_GL],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "MUJOCO_GL": "disable"},
+    )
+    each = ["None True", "None True", "No OpenGL rendering backend is available."]
+    assert run.stdout.splitlines() == 2 * each
+
+
+def test_a_reset_that_draws_gets_its_pictures() -> None:
+    """Pixel observations are the same, and the contexts are real ones by then."""
+    seen = []
+    for recorded in (False, True):
+        kwargs = {"height": 24, "width": 32, "camera_id": 0}
+        env = pixels.Wrapper(load("quadruped", "escape"), render_kwargs=kwargs)
+        contexts = ContextsOnDemand(env)
+        if recorded:
+            with contexts.resetting():
+                timestep = env.reset()
+        else:
+            timestep = env.reset()
+        assert type(env.physics._contexts).__name__ == "Contexts"
+        seen.append(timestep.observation["pixels"].copy())
+        env.physics.free()
+    np.testing.assert_array_equal(*seen)
+    assert seen[0].std() > 5
+
+
+def test_an_error_in_a_reset_leaves_the_physics_as_it_was() -> None:
+    """No stand-in stays behind."""
+    env = load()
+
+    def fail() -> None:
+        with ContextsOnDemand(env).resetting():
+            assert env.physics._contexts is not None
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert env.physics._contexts is None
+
+
+def test_contexts_that_are_there_are_left_alone() -> None:
+    """The user's own pictures need the terrain too."""
+    env = load()
+    env.physics.render(8, 8)
+    own = env.physics._contexts
+    with ContextsOnDemand(env).resetting():
+        assert env.physics._contexts is own
+    assert env.physics._contexts is own
+    env.physics.free()

@@ -1,0 +1,360 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known of Gymnasium environments: whose pictures follow from states."""
+
+from __future__ import annotations
+
+import functools
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from gymnasium import wrappers
+from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
+from gymnasium.envs.mujoco.mujoco_env import MujocoEnv
+from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+
+from mjrec.environments.gymnasium_scenes import gymnasium_scenes
+from mjrec.environments.viewer_scene import ViewerScene
+from mjrec.errors import InvalidArgument, UnknownName
+
+CAMERA_MEMBERS = (
+    *("type", "fixedcamid", "trackbodyid", "lookat", "distance"),
+    *("azimuth", "elevation", "orthographic"),
+)
+
+
+def make(env_id: str = "InvertedPendulum-v5", **kwargs: Any) -> Any:
+    kwargs = {"render_mode": "rgb_array", "width": 64, "height": 48, **kwargs}
+    env = gymnasium.make(env_id, **kwargs)
+    quality = env.get_wrapper_attr("model").vis.quality
+    quality.shadowsize, quality.offsamples = 64, 0
+    return env
+
+
+def scene_of(env: Any, **asked: Any) -> ViewerScene:
+    view = {"camera": None, "height": None, "width": None, **asked}
+    return ViewerScene(env.unwrapped, **view)
+
+
+def pose(camera: mujoco.MjvCamera) -> list[Any]:
+    return [np.array(getattr(camera, name)).tolist() for name in CAMERA_MEMBERS]
+
+
+class Overlay(gymnasium.Wrapper[Any, Any, Any, Any]):
+    def render(self) -> Any:
+        frame = super().render()
+        frame[:8] = 255
+        return frame
+
+
+class OverlayBelow(Overlay):
+    """Inherits what overrides."""
+
+
+class DrawsMore(HalfCheetahEnv):
+    def render(self) -> Any:
+        return super().render() // 2
+
+
+class PassesOn(gymnasium.Wrapper[Any, Any, Any, Any]):
+    def step(self, action: Any) -> Any:
+        return super().step(action * 0.5)
+
+
+def test_wrappers_that_show_what_is_inside_are_no_obstacle() -> None:
+    """gymnasium.make's own, a user's, and most of Gymnasium's."""
+    env = wrappers.RecordEpisodeStatistics(PassesOn(make()))
+    env = wrappers.NormalizeReward(wrappers.Autoreset(env))
+    assert gymnasium_scenes(env).obstacle is None
+    assert gymnasium_scenes(make(render_mode=None)).obstacle is None
+
+
+def test_recorded_by_gymnasium_too(tmp_path: Path) -> None:
+    """RecordVideo gives single pictures as it gets them."""
+    pytest.importorskip("moviepy")
+    env = wrappers.RecordVideo(make(), str(tmp_path / "new"))
+    assert gymnasium_scenes(env).obstacle is None
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("wrap", "name"),
+    [
+        (Overlay, "Overlay"),
+        (lambda env: PassesOn(Overlay(env)), "Overlay"),
+        (OverlayBelow, "Overlay"),
+        (wrappers.RenderCollection, "gymnasium.wrappers.rendering.RenderCollection"),
+        (
+            lambda env: wrappers.AddWhiteNoise(env, 0.1),
+            "gymnasium.wrappers.rendering.AddWhiteNoise",
+        ),
+        (
+            lambda env: wrappers.ObstructView(env, 0.1, 4),
+            "gymnasium.wrappers.rendering.ObstructView",
+        ),
+    ],
+)
+def test_wrappers_that_draw_are_named(wrap: Any, name: str) -> None:
+    """Wherever they are in the chain; the class that overrides is what is named."""
+    obstacle = gymnasium_scenes(wrap(make())).obstacle
+    assert obstacle is not None
+    assert obstacle.startswith("the wrapper ")
+    assert obstacle.endswith(f"{name} overrides render()")
+
+
+def test_a_render_of_one_object_is_an_obstacle() -> None:
+    """On a wrapper, on the environment, and on its renderer."""
+    wrapped = PassesOn(make())
+    wrapped.render = lambda: None  # type: ignore[method-assign]  # what users do
+    assert "PassesOn overrides" in str(gymnasium_scenes(wrapped).obstacle)
+    env = make()
+    env.unwrapped.render = lambda: None
+    assert "InvertedPendulumEnv overrides" in str(gymnasium_scenes(env).obstacle)
+    env = make()
+    env.unwrapped.mujoco_renderer.render = lambda _: None
+    assert "is not Gymnasium's own" in str(gymnasium_scenes(env).obstacle)
+
+
+def test_an_environment_that_overrides_is_named() -> None:
+    """The class itself, not the one that it extends."""
+    env = DrawsMore(render_mode="rgb_array")
+    obstacle = gymnasium_scenes(env).obstacle
+    assert obstacle == f"the environment {__name__}.DrawsMore overrides render()"
+
+
+def test_a_patched_class_is_an_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A function in the place of Gymnasium's, even if it copies all names."""
+    original = MujocoEnv.render
+
+    @functools.wraps(original)
+    def patched(self: Any) -> Any:
+        return 255 - original(self)
+
+    monkeypatch.setattr(MujocoEnv, "render", patched)
+    assert "overrides render()" in str(gymnasium_scenes(make()).obstacle)
+
+
+@pytest.mark.parametrize("mode", ["depth_array", "rgbd_tuple", "human"])
+def test_other_pictures_are_an_obstacle(mode: str) -> None:
+    """Depths are not drawn from states, and a window is nothing to record."""
+    env = HalfCheetahEnv(render_mode=mode)
+    assert repr(mode) in str(gymnasium_scenes(env).obstacle)
+
+
+def test_a_foreign_renderer_is_an_obstacle() -> None:
+    """Also one that extends Gymnasium's."""
+
+    class Renderer(MujocoRenderer):
+        pass
+
+    env = make()
+    old = env.unwrapped.mujoco_renderer
+    env.unwrapped.mujoco_renderer = Renderer(old.model, old.data, None, 64, 48)
+    assert "Renderer is not Gymnasium's own" in str(gymnasium_scenes(env).obstacle)
+
+
+@pytest.mark.parametrize("asked", [{"camera": -1}, {"height": 32}, {"width": 32}])
+def test_a_view_that_was_asked_for_is_of_the_scene(asked: dict[str, int]) -> None:
+    """What wrappers draw is not in it, live or later."""
+    assert gymnasium_scenes(Overlay(make()), **asked).obstacle is None
+
+
+def test_an_environment_without_mujoco_loads_none() -> None:
+    """Importing mujoco settles its OpenGL backend."""
+    code = (
+        "import gymnasium, sys\n"
+        "from mjrec.environments.gymnasium_scenes import gymnasium_scenes\n"
+        "scenes = gymnasium_scenes(gymnasium.make('CartPole-v1'))\n"
+        "print(scenes.states, scenes.environment['id'], 'mujoco' in sys.modules)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert run.stdout.split() == ["None", "CartPole-v1", "False"]
+
+
+def test_what_makes_the_environment_again() -> None:
+    """Its id and arguments, as far as JSON can hold them."""
+    env = make("Hopper-v5", healthy_z_range=(0.5, np.float32(2.5)))
+    environment = gymnasium_scenes(env).environment
+    assert environment is not None
+    assert (environment["framework"], environment["id"]) == ("gymnasium", "Hopper-v5")
+    assert environment["kwargs"]["healthy_z_range"] == [0.5, 2.5]
+    assert json.loads(json.dumps(environment)) == environment
+    odd = make(default_camera_config={"lookat": np.zeros(3)})
+    assert gymnasium_scenes(odd).environment == {
+        "framework": "gymnasium",
+        "id": "InvertedPendulum-v5",
+        "kwargs": None,
+    }
+    assert gymnasium_scenes(HalfCheetahEnv()).environment is None
+
+
+def test_random_state_is_told_and_not_made() -> None:
+    """A generator with that state draws the same numbers."""
+    env = make()
+    scenes = gymnasium_scenes(env)
+    assert scenes.random_state() is None
+    assert env.unwrapped._np_random is None
+    env.reset(seed=7)
+    state = json.loads(json.dumps(scenes.random_state()))
+    again = np.random.Generator(np.random.PCG64())
+    again.bit_generator.state = state
+    assert again.random() == env.unwrapped.np_random.random()
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Pusher-v5", "Swimmer-v5"])
+def test_view_is_that_of_a_viewer_made_now(env_id: str) -> None:
+    """Camera, options, size and the number of geoms, without a viewer."""
+    env = make(env_id, max_geom=700, visual_options={0: True})
+    env.reset(seed=1)
+    view = scene_of(env)()
+    env.render()
+    viewer = env.unwrapped.mujoco_renderer.viewer
+    assert pose(view.camera) == pose(viewer.cam)
+    assert view.option.flags.tolist() == viewer.vopt.flags.tolist()
+    assert (view.height, view.width, view.fresh) == (48, 64, False)
+    assert view.max_geom == viewer.scn.maxgeom == 700
+    env.close()
+
+
+def test_camera_is_kept_from_the_first_picture_on() -> None:
+    """As a viewer keeps its own, wherever the robot goes."""
+    env = make("HalfCheetah-v5")
+    env.reset(seed=1)
+    scene = scene_of(env)
+    env.step(env.action_space.sample())
+    scene.at_picture(lambda: None)
+    first = pose(scene().camera)
+    for _ in range(20):
+        env.step(env.action_space.sample())
+    scene.at_picture(lambda: None)
+    assert pose(scene().camera) == first
+    assert pose(scene_of(env)().camera) != first
+
+
+def test_viewer_of_the_environment_counts_in_its_moment() -> None:
+    """What the user makes of it is in the next picture, in the same objects."""
+    env = make()
+    env.reset(seed=1)
+    scene = scene_of(env)
+    view = scene()
+    scene.at_picture(lambda: None)
+    env.render()
+    viewer = env.unwrapped.mujoco_renderer.viewer
+    viewer.cam.azimuth, viewer.cam.lookat[0] = 33, 5
+    viewer.vopt.label = int(mujoco.mjtLabel.mjLABEL_BODY)
+    scene.at_picture(lambda: None)
+    assert pose(view.camera) == pose(viewer.cam)
+    assert view.option.label == viewer.vopt.label
+    env.close()
+
+
+def test_camera_number_of_the_renderer_counts_in_its_moment() -> None:
+    """As OffScreenViewer.render settles it, at each picture."""
+    env = make("HalfCheetah-v5", camera_name="track")
+    env.reset(seed=1)
+    scene = scene_of(env)
+    view = scene()
+    assert (view.label, view.camera.fixedcamid) == ("track", 0)
+    env.unwrapped.mujoco_renderer.camera_id = -1
+    scene.at_picture(lambda: None)
+    assert view.camera.type == int(mujoco.mjtCamera.mjCAMERA_FREE)
+
+
+def test_another_renderer_has_another_camera() -> None:
+    """An environment that makes both anew is shown as if it were new."""
+    env = make("HalfCheetah-v5")
+    env.reset(seed=1)
+    scene = scene_of(env)
+    scene.at_picture(lambda: None)
+    first = pose(scene().camera)
+    for _ in range(20):
+        env.step(env.action_space.sample())
+    base = env.unwrapped
+    base.mujoco_renderer = MujocoRenderer(base.model, base.data, None, 64, 48)
+    assert pose(scene().camera) != first
+
+
+def add_marker(viewer: Any) -> None:
+    viewer.add_marker(pos=np.zeros(3))
+
+
+def lay_text_over(viewer: Any) -> None:
+    viewer.add_overlay(0, "a", "b")
+
+
+def change_flag(viewer: Any) -> None:
+    viewer.scn.flags[int(mujoco.mjtRndFlag.mjRND_WIREFRAME)] = 1
+
+
+def select_body(viewer: Any) -> None:
+    viewer.pert.select = 1
+
+
+def draw_otherwise(viewer: Any) -> None:
+    viewer.render = lambda **_: None
+
+
+@pytest.mark.parametrize(
+    ("add", "text"),
+    [
+        (add_marker, "markers"),
+        (lay_text_over, "text"),
+        (change_flag, "flags"),
+        (select_body, "selected"),
+        (draw_otherwise, "not Gymnasium's own"),
+    ],
+)
+def test_what_is_added_in_the_viewer_is_a_momentary_obstacle(
+    add: Any, text: str
+) -> None:
+    """It is in env.render() and not in the scene."""
+    env = make()
+    env.reset(seed=1)
+    scene = scene_of(env)
+    assert scene.obstacle() is None
+    env.render()
+    assert scene.obstacle() is None
+    add(env.unwrapped.mujoco_renderer.viewer)
+    assert text in str(scene.obstacle())
+    env.close()
+
+
+def test_a_renderer_of_another_model_is_a_momentary_obstacle() -> None:
+    """It would show the old one."""
+    env = make()
+    scene = scene_of(env)
+    env.unwrapped.model = mujoco.MjModel.from_xml_path(env.unwrapped.fullpath)
+    assert "another model" in str(scene.obstacle())
+
+
+def test_camera_that_was_asked_for() -> None:
+    """A name, a number, the free camera where the model has it, or an MjvCamera."""
+    env = make("HalfCheetah-v5")
+    env.reset(seed=1)
+    view = scene_of(env, camera="track", height=32)()
+    assert (view.camera.fixedcamid, view.label) == (0, "track")
+    assert (view.height, view.width) == (32, 64)
+    scene = scene_of(env, camera=-1)
+    view = scene()
+    before = pose(view.camera)
+    env.unwrapped.model.vis.global_.azimuth += 45
+    scene.at_picture(lambda: None)
+    assert pose(view.camera) != before
+    camera = mujoco.MjvCamera()
+    assert scene_of(env, camera=camera)().camera is camera
+
+
+def test_camera_and_size_are_checked_at_once() -> None:
+    """Not at the first picture."""
+    with pytest.raises(UnknownName, match="track"):
+        gymnasium_scenes(make("HalfCheetah-v5"), camera="tracking")
+    with pytest.raises(InvalidArgument, match="height"):
+        gymnasium_scenes(make(), height=0)

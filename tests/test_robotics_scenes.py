@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The moment in which Gymnasium-Robotics' environments draw themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+from mjrec.environments.gymnasium_scenes import gymnasium_scenes
+from mjrec.environments.robotics_scenes import drawn_part, picture_moment
+from robots import robots_that_reset
+
+pytest.importorskip("gymnasium_robotics")
+
+
+@pytest.fixture(autouse=True)
+def _robots() -> Iterator[None]:
+    with robots_that_reset():
+        yield
+
+
+def make(env_id: str, **kwargs: Any) -> Any:
+    env = gymnasium.make(env_id, **kwargs)
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    return env
+
+
+def everything(env: Any) -> list[Any]:
+    """Return the state, and what a callback moves."""
+    model, data = env.unwrapped.model, env.unwrapped.data
+    spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    state = np.empty(mujoco.mj_stateSize(model, spec))
+    mujoco.mj_getState(model, data, state, spec)
+    arrays = (state, data.site_xpos, data.geom_xpos, data.qacc, data.sensordata)
+    moved = (model.site_pos, model.site_rgba, model.geom_rgba)
+    return [array.copy() for array in arrays + moved]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "inside"),
+    [
+        ("PointMaze_UMaze-v3", "point_env"),
+        ("AntMaze_UMaze-v5", "ant_env"),
+        ("FrankaKitchen-v1", "robot_env"),
+        ("AdroitHandDoor-v1", None),
+        ("FetchReach-v4", None),
+    ],
+)
+def test_what_is_shown(env_id: str, inside: str | None) -> None:
+    """A maze and a kitchen show what is inside them; all are known to be drawable."""
+    env = gymnasium.make(env_id)
+    base = env.unwrapped
+    assert drawn_part(base) is (getattr(base, inside) if inside else base)
+    scenes = gymnasium_scenes(env)
+    assert scenes.obstacle is None
+    assert scenes.states is not None
+    env.reset(seed=1)
+    assert bool(scenes.random_state())
+
+
+def test_overriding_inside_a_maze_is_an_obstacle() -> None:
+    """What the maze shows is not what it simulates."""
+    env = gymnasium.make("PointMaze_UMaze-v3")
+    env.unwrapped.point_env.render = lambda: None  # type: ignore[attr-defined]  # it has one
+    assert "PointEnv overrides render()" in str(gymnasium_scenes(env).obstacle)
+
+
+@pytest.mark.parametrize("mode", [None, "rgb_array"])
+def test_goal_is_shown_and_nothing_is_changed(mode: str | None) -> None:
+    """In the moment the marker is at the goal; afterwards all is bit for bit as was."""
+    env = make("FetchPickAndPlace-v4", render_mode=mode)
+    base = env.unwrapped
+    moment = picture_moment(base)
+    assert moment is not None
+    site = mujoco.mj_name2id(base.model, int(mujoco.mjtObj.mjOBJ_SITE), "target0")
+    before, seen = everything(env), []
+    moment(lambda: seen.append(base.data.site_xpos[site].copy()))
+    np.testing.assert_allclose(seen[0], base.goal, atol=1e-6)
+    assert not np.allclose(base.data.site_xpos[site], base.goal)
+    for now, then in zip(everything(env), before, strict=True):
+        np.testing.assert_array_equal(now, then)
+    assert "render" not in vars(base.mujoco_renderer)
+    assert base.mujoco_renderer.viewer is None
+
+
+@pytest.mark.parametrize(
+    "env_id", ["HandReach-v3", "HandManipulateBlock_ContinuousTouchSensors-v1"]
+)
+def test_two_looks_see_the_same(env_id: str) -> None:
+    """The callbacks themselves are not idempotent."""
+    env = make(env_id)
+    moment = picture_moment(env.unwrapped)
+    assert moment is not None
+    seen: list[Any] = []
+    for _ in range(2):
+        moment(lambda: seen.append(everything(env)))
+    for first, second in zip(*seen, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_an_error_in_the_moment_leaves_all_as_it_was() -> None:
+    """A full disk, for example."""
+    env = make("HandReach-v3")
+    moment = picture_moment(env.unwrapped)
+    assert moment is not None
+    before = everything(env)
+
+    def fail() -> None:
+        raise OSError("full")
+
+    with pytest.raises(OSError, match="full"):
+        moment(fail)
+    for now, then in zip(everything(env), before, strict=True):
+        np.testing.assert_array_equal(now, then)
+    assert "render" not in vars(env.unwrapped.mujoco_renderer)
+
+
+def test_where_drawing_changes_nothing_there_is_no_moment() -> None:
+    """Nothing has to be put back."""
+    env = gymnasium.make("PointMaze_UMaze-v3")
+    assert picture_moment(drawn_part(env.unwrapped)) is None
+
+
+def test_a_render_that_is_not_known_is_not_called() -> None:
+    """What it does, nobody knows."""
+    from gymnasium_robotics.envs.fetch.reach import MujocoFetchReachEnv
+
+    class Robot(MujocoFetchReachEnv):  # type: ignore[misc]  # untyped
+        def render(self) -> Any:
+            raise AssertionError("called")
+
+    env = Robot()
+    assert picture_moment(env) is None
+    assert "Robot overrides render()" in str(gymnasium_scenes(env).obstacle)
