@@ -502,6 +502,7 @@ from pathlib import Path
 from mjrec.rendering.workers import DrawingWorkers
 pool = DrawingWorkers(2)
 frames = pool.frames(Path(os.environ["RIDE"]), [0] * 1000)
+next(frames)
 print("end")
 """
     done = run(["-W", "error", "-c", script], ride)

@@ -21,6 +21,7 @@ from ..simulation.given_states import GivenStates
 from ..simulation.mujoco_warnings import log_mujoco_warnings
 from ..simulation.recorded_scene import RecordedScene
 from ..simulation.renderer import SceneRenderer
+from .recorded_pictures import check_has_pictures
 from .views import PlainCamera, View
 
 __all__ = ["Drawing", "StatesDrawing", "TrajectoryDrawing", "open_drawing"]
@@ -65,6 +66,7 @@ class TrajectoryDrawing:
     def __init__(self, path: Path, view: View) -> None:
         self._reader = open_trajectory(path)
         try:
+            check_has_pictures(self._reader)
             scene = RecordedScene(self._reader)
             as_recorded = view.camera is None
             self._pictures = _Pictures(

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidArgument
 from ..formats.trajectory_file import open_trajectory
 from ..frames import Frame
-from ..rates import stride_for, to_rate
+from .recorded_pictures import check_has_pictures, chosen_frames
 from .views import View, plain_camera
 from .workers import DrawingWorkers
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..simulation.cameras import Camera
     from ..simulation.trajectories import Trajectory
 
-__all__ = ["chosen_frames", "render", "render_states"]
+__all__ = ["render", "render_states"]
 
 
 def render(
@@ -77,8 +77,7 @@ def render(
         GLError: no OpenGL backend works here.
         Error: a worker died at a picture, and again at the second try.
     """
-    path = Path(trajectory) if isinstance(trajectory, str | os.PathLike) else None
-    path = trajectory.path if path is None else path  # type: ignore[union-attr]
+    path = _path(trajectory)
     view = View(
         camera=None if camera is None else plain_camera(camera),
         height=height,
@@ -86,6 +85,7 @@ def render(
         quality=quality,
     )
     with open_trajectory(path) as reader:
+        check_has_pictures(reader)
         indices = chosen_frames(reader.frame_count, reader.header.facts, max_fps)
     pool = DrawingWorkers(workers)
     return _Pictures(pool, lambda: pool.frames(path, indices, view))
@@ -157,34 +157,14 @@ def render_states(
     return _Pictures(pool, begin, directory=directory)
 
 
-def chosen_frames(
-    count: int, facts: Mapping[str, Any], max_fps: float | Fraction | None
-) -> list[int]:
-    """Return the numbers of the recorded pictures that are no more than `max_fps`.
-
-    0, n, 2n ... with the smallest whole n that fits, and always the last.
-
-    Args:
-        count: how many the recording has.
-        facts: the trajectory's.
-        max_fps: pictures per second of the simulation; None is all there are.
-
-    Raises:
-        InvalidArgument: `max_fps` is no rate, or the recording does not know its own.
-    """
-    if max_fps is None:
-        return list(range(count))
-    wanted = to_rate(max_fps)
-    if facts.get("rate") is None:
+def _path(trajectory: Any) -> Path:
+    path = getattr(trajectory, "path", trajectory)
+    if not isinstance(path, str | os.PathLike):
         raise InvalidArgument(
-            "max_fps needs to know how many control steps a second has, and this "
-            "recording ended before that was written. Leave max_fps out."
+            "A trajectory is a path, or what mjrec.load_trajectory returned, got "
+            f"{trajectory!r}."
         )
-    recorded = Fraction(facts["rate"]) / int(facts.get("stride", 1))
-    chosen = list(range(0, count, stride_for(recorded, wanted)))
-    if count and chosen[-1] != count - 1:
-        chosen.append(count - 1)
-    return chosen
+    return Path(path)
 
 
 class _Pictures:

@@ -85,7 +85,8 @@ class WorkerProcess:
     def send(self, **order: Any) -> None:
         """Say something; one that has died is noticed by `receive`."""
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):
+        # ValueError: it was ended, and its pipes closed.
+        with contextlib.suppress(OSError, ValueError):
             self._process.stdin.write(json.dumps(order).encode() + b"\n")
 
     def receive(self) -> list[dict[str, Any]] | None:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InvalidArgument, NoPictures, UnreadableFile
+from ..errors import InvalidArgument, UnreadableFile
 from ..formats.trajectory import ModelChange
 from ..formats.trajectory_reader import TrajectoryReader
 from .baked_fields import is_kept_by_context
@@ -36,7 +36,6 @@ class RecordedScene:
         reader: of the trajectory; used as long as this object is.
 
     Raises:
-        NoPictures: the trajectory has no snapshots; the message says why.
         UnreadableFile: what it says of its scene cannot be, or its model is missing,
             damaged or of another MuJoCo.
 
@@ -52,13 +51,6 @@ class RecordedScene:
     def __init__(self, reader: TrajectoryReader) -> None:
         self._reader = reader
         facts = reader.header.facts
-        if facts.get("scene") is None or not reader.header.snapshot.fields:
-            reason = facts.get("refusal")
-            raise NoPictures(
-                f"{reader.path} holds states but no snapshots to draw pictures from"
-                f"{f': {reason}' if reason else ''}. Its states can be drawn another "
-                "way, with mjrec.render_states."
-            )
         try:
             self.view: SceneView = scene_view_from_facts(facts["scene"])
             self.previous_cameras = _positions(facts["scene"].get("previous_cameras"))

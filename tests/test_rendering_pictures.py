@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+import tempfile
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+import pytest
+from processes import children
+
+import mjrec
+from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
+from mjrec.formats.trajectory import TrajectoryHeader
+from mjrec.formats.trajectory_log import TrajectoryLogWriter
+from mjrec.rendering.recorded_pictures import chosen_frames
+from rides import HEIGHT, WIDTH, Ride, move, record, start
+
+SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS
+SIZE: dict[str, Any] = {"height": HEIGHT, "width": WIDTH}
+
+
+@pytest.fixture(scope="module")
+def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
+    return record(tmp_path_factory.mktemp("ride"))
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where temporary files go."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+def states_of(
+    model: mujoco.MjModel, data: mujoco.MjData, count: int
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return states, and what MuJoCo's own renderer shows of them."""
+    states = np.empty((count, mujoco.mj_stateSize(model, int(SPEC))))
+    shown = []
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+        for number, row in enumerate(states):
+            move(model, data, number)
+            mujoco.mj_getState(model, data, row, int(SPEC))
+            renderer.update_scene(data, "rider")
+            shown.append(renderer.render())
+    return states, shown
+
+
+# Recorded episodes
+
+
+def test_a_recording_is_drawn_again(ride: Ride) -> None:
+    """From its path or what was loaded of it, as it was seen."""
+    before = children()
+    assert np.array_equal(list(mjrec.render(str(ride.path))), ride.frames)
+    loaded = mjrec.load_trajectory(ride.path)
+    again = list(mjrec.render(loaded, workers=2))
+    assert np.array_equal(again, ride.frames)
+    assert children() == before
+
+
+def test_a_recording_is_drawn_another_way(ride: Ride) -> None:
+    """Camera, size, quality and rate."""
+    camera = mujoco.MjvCamera()
+    camera.lookat[:], camera.distance = (1, 0, 0.5), 6
+    members = {"lookat": [1, 0, 0.5], "distance": 6}
+    pictures = {
+        str(given): list(
+            mjrec.render(
+                ride.path,
+                camera=given,
+                width=40,
+                height=30,
+                quality="draft",
+                max_fps=4,
+            )
+        )
+        for given in (camera, members, "side")
+    }
+
+    first, second, side = pictures.values()
+    # Ten a second are recorded: 0, 3, 6, and the last.
+    assert [frame.shape for frame in first] == [(30, 40, 3)] * 4
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, side)
+
+
+def test_a_recording_that_is_left_early(ride: Ride) -> None:
+    """Closing, or dropping what was returned, ends the workers."""
+    before = children()
+    pictures: Any = mjrec.render(ride.path, workers=2)
+    next(pictures)
+    pictures.close()
+    assert list(pictures) == []
+    assert children() == before
+
+    pictures = mjrec.render(ride.path, workers=2)
+    next(pictures)
+    assert len(children() - before) == 2
+    del pictures
+    gc.collect()
+    assert children() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        ({"camera": "top"}, UnknownName, r"no camera 'top'.*side, rider"),
+        ({"camera": 1.5}, InvalidArgument, "camera is a name"),
+        ({"camera": {"distance": "far"}}, InvalidArgument, "distance is a number"),
+        ({"width": 0}, InvalidArgument, "width must be"),
+        ({"max_fps": 0}, InvalidArgument, "positive"),
+        ({"quality": "low"}, UnknownName, "no quality 'low'"),
+        ({"workers": 0}, InvalidArgument, "workers must be"),
+    ],
+)
+def test_arguments_are_checked_by_the_call(
+    ride: Ride, arguments: dict[str, Any], kind: type[Exception], message: str
+) -> None:
+    """Not by the first picture; and nothing is left running."""
+    before = children()
+    with pytest.raises(kind, match=message):
+        mjrec.render(ride.path, **arguments)
+    assert children() == before
+
+
+def test_what_is_no_recording(tmp_path: Path) -> None:
+    """One error each."""
+    with pytest.raises(UnreadableFile, match=r"lost\.h5"):
+        mjrec.render(tmp_path / "lost.h5")
+    path = tmp_path / "openaigym.trajectory.0.1.episode000000.log"
+    writer = TrajectoryLogWriter(path, TrajectoryHeader(facts={"scene": None}))
+    writer.step_row(0, 0.0, False, False)
+    writer.close()
+    with pytest.raises(NoPictures, match="no snapshots"):
+        mjrec.render(path)
+    with pytest.raises(InvalidArgument, match="trajectory is a path"):
+        mjrec.render(3)  # type: ignore[arg-type]  that is the test
+
+
+@pytest.mark.parametrize(
+    ("count", "max_fps", "chosen"),
+    [
+        (9, None, [0, 1, 2, 3, 4, 5, 6, 7, 8]),
+        (9, 10, [0, 1, 2, 3, 4, 5, 6, 7, 8]),
+        (9, 60, [0, 1, 2, 3, 4, 5, 6, 7, 8]),
+        (9, 9.99, [0, 2, 4, 6, 8]),
+        (8, 5, [0, 2, 4, 6, 7]),
+        (8, Fraction(1, 2), [0, 7]),
+        (1, 1, [0]),
+        (0, 1, []),
+    ],
+)
+def test_pictures_are_chosen_by_rate(
+    count: int, max_fps: Any, chosen: list[int]
+) -> None:
+    """Every n-th of those that were recorded, and the last."""
+    facts = {"rate": "20", "stride": 2}
+    assert chosen_frames(count, facts, max_fps) == chosen
+
+
+def test_a_rate_that_is_not_known() -> None:
+    """The process was killed before its second step."""
+    with pytest.raises(InvalidArgument, match="Leave max_fps out"):
+        chosen_frames(1, {}, 30)
+
+
+# Given states
+
+
+def test_states_are_drawn_as_mujoco_would(temporary: Path) -> None:
+    """After `mj_forward`, over an infinite plane, by one worker and by three."""
+    model, data = start()
+    states, shown = states_of(model, data, 7)
+    before = model.vis.global_.offwidth
+
+    for workers in (1, 3):
+        pictures = mjrec.render_states(
+            model, states, SPEC, camera="rider", workers=workers, **SIZE
+        )
+        assert np.array_equal(list(pictures), shown)
+    assert model.vis.global_.offwidth == before
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_state_leaves_nothing_behind() -> None:
+    """What a row leaves out is as in new data, whatever was drawn before."""
+    model, data = start()
+    mujoco.mj_forward(model, data)
+    spec = mujoco.mjtState.mjSTATE_QPOS
+    [at_start, *rest] = mjrec.render_states(
+        model, [[0.0], [5.0], [0.0]], spec, camera="side", **SIZE
+    )
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+        renderer.update_scene(data, "side")
+        assert np.array_equal(renderer.render(), at_start)
+    assert not np.array_equal(at_start, rest[0])
+
+
+def test_states_of_a_rollout_are_taken_run_by_run() -> None:
+    """All runs at once are refused with what to do."""
+    model, data = start()
+    initial = np.zeros((2, mujoco.mj_stateSize(model, int(SPEC))))
+    initial[1, 1] = 4
+    states, _ = mujoco.rollout.rollout(model, data, initial, nstep=3)
+
+    with pytest.raises(InvalidArgument, match=r"\(n, 3\).*\(2, 3, 3\).*rollout"):
+        mjrec.render_states(model, states, SPEC, **SIZE)
+    for run in states:
+        assert len(list(mjrec.render_states(model, run, SPEC, **SIZE))) == 3
+
+
+@pytest.mark.parametrize(
+    ("states", "spec", "message"),
+    [
+        (np.zeros((4, 5)), SPEC, r"\(n, 3\).*mj_stateSize.*\(4, 5\)"),
+        (np.zeros(3), SPEC, r"\(n, 3\).*\(3,\)"),
+        (np.array([["a", "b", "c"]]), SPEC, "numbers"),
+        (np.zeros((4, 3)), 1 << 30, "mjtState"),
+        (np.zeros((4, 3)), "full", "mjtState"),
+    ],
+)
+def test_states_that_are_none_of_the_models(
+    temporary: Path, states: Any, spec: Any, message: str
+) -> None:
+    """Before anything is started or written."""
+    model, _ = start()
+    with pytest.raises(InvalidArgument, match=message):
+        mjrec.render_states(model, states, spec, **SIZE)
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_view_of_states_that_cannot_be(temporary: Path) -> None:
+    """The call says so, and leaves no file."""
+    model, _ = start()
+    for arguments, message in (
+        ({"camera": "top"}, "no camera 'top'"),
+        ({"quality": "low"}, "no quality"),
+        ({"workers": 0}, "workers must be"),
+        ({"height": 0}, "height must be"),
+    ):
+        with pytest.raises(InvalidArgument, match=message):
+            mjrec.render_states(model, np.zeros((2, 3)), SPEC, **{**SIZE, **arguments})
+    assert list(temporary.iterdir()) == []
+
+
+def test_no_states_are_no_pictures(temporary: Path) -> None:
+    """As empty as what was given."""
+    model, _ = start()
+    assert list(mjrec.render_states(model, np.zeros((0, 3)), SPEC, **SIZE)) == []
+    assert list(temporary.iterdir()) == []
+
+
+def test_states_that_are_left_early_leave_no_files(temporary: Path) -> None:
+    """Nor do they at interpreter exit."""
+    model, _ = start()
+    pictures = mjrec.render_states(model, np.zeros((50, 3)), SPEC, **SIZE)
+    next(pictures)
+    assert len(list(temporary.iterdir())) == 1
+    del pictures
+    gc.collect()
+    assert list(temporary.iterdir()) == []
+
+    script = (
+        "import mujoco, mjrec, numpy\n"
+        "model = mujoco.MjModel.from_xml_string('<mujoco/>')\n"
+        "states = numpy.zeros((50, 1))\n"
+        "kept = mjrec.render_states(model, states, 1, height=8, width=8)\n"
+        "next(kept)\n"
+    )
+    subprocess.run(
+        [sys.executable, "-W", "error", "-c", script],
+        env={**os.environ, "TMPDIR": str(temporary)},
+        check=True,
+    )
+    assert list(temporary.iterdir()) == []
