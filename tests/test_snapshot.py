@@ -91,7 +91,10 @@ THINGS = """
     <body name="free" pos="1 0 .099"><freejoint/><geom size=".1"/></body>
     <body name="other" pos="1 1 1"><freejoint/><geom size=".1"/></body>
   </worldbody>
-  <equality><connect body1="free" body2="other" anchor="0 0 0"/></equality>
+  <equality>
+    <connect body1="free" body2="other" anchor="0 0 0"/>
+    <connect body1="hand" body2="other" anchor="0 0 0"/>
+  </equality>
   <actuator>
     <general name="m" joint="hinge" dyntype="filter" dynprm="1"/>
     <motor site="tip" gear="0 0 1 0 0 0"/>
@@ -107,6 +110,8 @@ def simulated(xml: str, steps: int = 5) -> Simulation:
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.7
     data.xfrc_applied[-1, :3] = (1, 2, 3)
+    # Other than in fresh data.
+    data.eq_active[1:] = False
     mujoco.mj_step(model, data, nstep=steps)
     return model, data
 

@@ -173,7 +173,9 @@ def _are_actuated(
     model: mujoco.MjModel, tendons: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
     by_tendon = model.actuator_trntype == _TENDON_TRANSMISSION
-    return np.isin(tendons, model.actuator_trnid[by_tendon, 0])
+    actuated = model.actuator_trnid[by_tendon, 0]
+    found: NDArray[np.bool_] = (tendons[:, np.newaxis] == actuated).any(axis=1)
+    return found
 
 
 def _has_gravity(model: mujoco.MjModel) -> bool:
