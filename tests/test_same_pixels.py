@@ -326,7 +326,7 @@ def test_composer(
 
 ENDLESS = """
 <mujoco>
-  <visual><quality shadowsize="256" offsamples="0"/></visual>
+  <visual><quality shadowsize="256" offsamples="0"/><map zfar="50"/></visual>
   <asset>
     <texture name="checks" type="2d" builtin="checker" rgb1=".2 .6 .3" rgb2=".8 .8 .7"
       width="32" height="32"/>
@@ -353,7 +353,7 @@ ENDLESS = """
     </spatial>
   </tendon>
   <actuator>
-    <motor joint="rail" gear="20000" ctrllimited="true" ctrlrange="-1 1"/>
+    <motor joint="rail" gear="400000" ctrllimited="true" ctrlrange="-1 1"/>
   </actuator>
 </mujoco>
 """
