@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import json
 import logging
@@ -39,9 +40,9 @@ def steps(env: Any, count: int, *, seed: int = 0) -> None:
             break
 
 
-def extensions(directory: Path) -> list[str]:
-    """Return what the names in a directory end in."""
-    return sorted("".join(p.suffixes[-2:]) for p in directory.iterdir())
+def monitored(env: Any, directory: Path, *positional: Any, **options: Any) -> Any:
+    """Return a monitor that takes a reset for the end of an episode."""
+    return mjrec.Monitor(env, directory, *positional, allow_early_reset=True, **options)
 
 
 def shown_by_env(env_id: str, count: int, **arguments: Any) -> list[Any]:
@@ -69,8 +70,8 @@ def pendulum() -> Iterator[Any]:
 
 
 def test_close_leaves_a_rendered_directory(pendulum: Any, tmp_path: Path) -> None:
-    """Video, hashes, metadata, trajectory, model: no log, nothing hidden, no promise."""
-    with mjrec.Monitor(pendulum, tmp_path, lambda e: True, workers=1) as env:
+    """Video, hashes, metadata, trajectory, model; no log and no promise."""
+    with monitored(pendulum, tmp_path, lambda e: True, workers=1) as env:
         steps(env, 3)
         steps(env, 2, seed=1)
     assert videos_in(tmp_path) == [0, 1]
@@ -126,10 +127,9 @@ def test_no_workers_leave_the_videos_pending(
     pendulum: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The manifest lists them, one line says how to make them, and that makes them."""
-    with mjrec.Monitor(pendulum, tmp_path, lambda e: e < 2, workers=0) as env:
+    with monitored(pendulum, tmp_path, lambda e: e < 2, workers=0) as env:
         for seed in range(3):
             steps(env, 2, seed=seed)
-            env.stats_recorder.done = True
     assert videos_in(tmp_path) == []
     pending = manifest_of(tmp_path)["mjrec"]["pending"]
     assert [entry["episode_id"] for entry in pending] == [0, 1]
@@ -142,7 +142,7 @@ def test_no_workers_leave_the_videos_pending(
 
 
 def leave_by_exception(env: Any) -> None:
-    with pytest.raises(ZeroDivisionError), env:
+    with contextlib.suppress(ZeroDivisionError), env:
         steps(env, 2)
         _ = 1 // 0
 
@@ -289,9 +289,8 @@ def test_deferred_by_force_needs_a_simulation(corridor: Any, tmp_path: Path) -> 
 
 def test_off_writes_trajectories_and_no_videos(pendulum: Any, tmp_path: Path) -> None:
     """Of every episode, in evaluation mode."""
-    with mjrec.Monitor(pendulum, tmp_path, render="off", mode="evaluation") as env:
+    with monitored(pendulum, tmp_path, render="off", mode="evaluation") as env:
         steps(env, 2)
-        env.stats_recorder.done = True
         steps(env, 2)
     assert len(list(tmp_path.glob("*.h5"))) == 2
     assert not list(tmp_path.glob("*video*"))
@@ -332,10 +331,9 @@ def test_which_trajectories_are_kept(
     options: dict[str, Any], kept: list[int], pendulum: Any, tmp_path: Path
 ) -> None:
     """The videos' own are removed once the videos are there, if they are not wanted."""
-    with mjrec.Monitor(pendulum, tmp_path, workers=1, **options) as env:
+    with monitored(pendulum, tmp_path, workers=1, **options) as env:
         for seed in range(3):
             steps(env, 1, seed=seed)
-            env.stats_recorder.done = True
     assert trajectories(tmp_path) == [f"episode{number:06d}" for number in kept]
     assert videos_in(tmp_path) == [0, 1]
 
@@ -432,7 +430,7 @@ def test_reset_before_any_step_replaces_the_trajectory(
 
 
 def test_video_recorder_tells_of_the_promise(pendulum: Any, tmp_path: Path) -> None:
-    """gym's attribute is there, with the path that the video will have."""
+    """Under the attribute that gym had, with the path that the video will have."""
     with mjrec.Monitor(pendulum, tmp_path, workers=1) as env:
         steps(env, 2)
         video = env.video_recorder
@@ -466,13 +464,9 @@ def test_recording_does_not_disturb(env_id: str, tmp_path: Path) -> None:
             for _ in range(5):
                 observation, reward, *_ = env.step(env.action_space.sample())
                 seen += [observation, reward, env.unwrapped.data.qacc_warmstart.copy()]
-            env.stats_recorder.done = True
         return [np.asarray(value).tobytes() for value in seen]
 
-    monitored = run(mjrec.Monitor(make(env_id), tmp_path, workers=0))
-    bare = make(env_id)
-    bare.stats_recorder = type("", (), {})()
-    assert run(bare) == monitored
+    assert run(make(env_id)) == run(monitored(make(env_id), tmp_path, workers=0))
 
 
 def test_same_pixels_as_the_environment_shows(tmp_path: Path) -> None:
@@ -496,7 +490,8 @@ def test_works_in_a_daemonic_process(tmp_path: Path) -> None:
         "import sys, functools, gymnasium, numpy as np, mjrec\n"
         "def make(n):\n"
         "    env = gymnasium.make('InvertedPendulum-v5', height=48, width=64)\n"
-        "    return mjrec.Monitor(env, sys.argv[1], resume=True, uid=str(n), workers=1)\n"
+        "    out = sys.argv[1]\n"
+        "    return mjrec.Monitor(env, out, resume=True, uid=str(n), workers=1)\n"
         "if __name__ == '__main__':\n"
         "    makers = [functools.partial(make, n) for n in range(2)]\n"
         "    envs = gymnasium.vector.AsyncVectorEnv(makers, context='spawn')\n"

@@ -41,7 +41,7 @@ CONFINED = {
     "imageio_ffmpeg": {"formats"},
     "h5py": {"formats"},
     "tyro": {"commands"},
-    "rich": {"commands"},
+    "rich": {"commands", "monitors"},
 }
 
 HEAVY = (
