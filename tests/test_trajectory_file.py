@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 import mjrec.formats.trajectory_file as trajectory_file
+import mjrec.formats.trajectory_hdf5 as trajectory_hdf5
 from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
 from mjrec.formats.monitor_directory import Infix, trajectory_prefix
 from mjrec.formats.trajectory import (
@@ -32,6 +33,7 @@ from mjrec.formats.trajectory import (
     TrajectoryHeader,
 )
 from mjrec.formats.trajectory_file import (
+    TrajectoryReader,
     find_trajectory,
     finish_trajectory,
     open_trajectory,
@@ -214,11 +216,22 @@ def test_plain_h5py_finds_every_array_by_its_name(log: Path) -> None:
         assert file.attrs["complete"]
 
 
-def test_old_hdf5_libraries_can_read_it(log: Path) -> None:
+def test_old_hdf5_libraries_can_read_it(
+    log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The format of HDF5 1.10, and no filter that is not built in."""
     write(log)
+    versions: list[tuple[str, str]] = []
+    write_steps = trajectory_hdf5._write_steps
+
+    def look(file: h5py.File, reader: TrajectoryReader) -> None:
+        versions.append(file.libver)
+        write_steps(file, reader)
+
+    monkeypatch.setattr(trajectory_hdf5, "_write_steps", look)
     path = finish_trajectory(log)
-    # Version 3 of the superblock is 1.10's; `latest` writes a newer one.
+    assert versions == [("v110", "v110")]
+    # The superblock's version: 3 is that of 1.10.
     assert path.read_bytes()[8] == 3
     with h5py.File(path) as file:
         for dataset in (file["states"], file["snapshots"], file["actions"]):

@@ -195,6 +195,23 @@ def test_model_changes_come_back(path: Path) -> None:
         assert first.fields[name].dtype == values.dtype.newbyteorder("<")
 
 
+def test_what_depends_on_something_else_comes_after_it(path: Path) -> None:
+    """Torn anywhere, no frame lacks its model or step, and the end lacks no row."""
+    writer = TrajectoryLogWriter(path, HEADER)
+    writer.add_facts({"complete": True})
+    put(writer.frame_row(0), frame_bytes(0))
+    put(writer.step_row(0, 0, False, False), step_bytes(0))
+    writer.add_model_change(ModelChange(step=0, fields={}))
+    writer.close()
+    data = path.read_bytes()
+    kinds, offset = [], 32
+    while offset < len(data):
+        kind, _, length = struct.unpack_from("<4sIQ", data, offset)
+        kinds.append(kind)
+        offset += 16 + -(-length // 8) * 8
+    assert kinds == [b"head", b"chng", b"step", b"fram", b"fact"]
+
+
 def test_a_large_model_change_is_not_kept_in_memory(path: Path) -> None:
     """A texture goes to the disk at once."""
     writer = write(path, 1)
