@@ -79,7 +79,7 @@ _BODIES = ("xpos", "xmat", "xipos", "ximat")
 # What a flag that is off by default needs besides.
 _FOR_FLAGS: dict[str, tuple[str, ...]] = {
     "mjVIS_JOINT": ("xanchor", "xaxis", "xmat"),
-    "mjVIS_ACTUATOR": ("ctrl", "act", "xanchor", "xaxis", "xmat"),
+    "mjVIS_ACTUATOR": ("ctrl", "xanchor", "xaxis", "xmat"),
     "mjVIS_ACTIVATION": ("act",),
     "mjVIS_CONSTRAINT": ("eq_active", "xpos", "xmat"),
     "mjVIS_INERTIA": ("xipos", "ximat"),
