@@ -142,6 +142,8 @@ def record_session(
             render=session.render,
             workers=session.workers,
             quality=session.quality,
+            # Without videos it is still the schedule that chooses what is kept.
+            trajectory_callable=schedule if session.render == OFF else None,
             env_id=named.env_id,
             **named.view,
         )

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sessions whose pictures are drawn later, by others, or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from recordings import manifest_of, videos_in
+
+from mjrec import sessions
+from mjrec.commands import main
+from mjrec.errors import GLError, InvalidArgument
+from mjrec.sessions import Session, record_session
+
+
+def session(directory: Path, **options: Any) -> Session:
+    defaults: dict[str, Any] = {
+        "environment": "InvertedPendulum-v5",
+        "seed": 0,
+        "max_steps": 2,
+        "height": 32,
+        "width": 32,
+    }
+    return Session(directory=directory, **{**defaults, **options})
+
+
+@pytest.fixture
+def no_probing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail where an OpenGL backend is looked for."""
+
+    def fail() -> None:
+        raise AssertionError("looked for OpenGL")
+
+    monkeypatch.setattr(sessions, "use_gl", fail)
+
+
+@pytest.fixture
+def no_gl(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no OpenGL backend be found."""
+
+    def fail() -> None:
+        raise GLError("Nothing renders here.")
+
+    monkeypatch.setattr(sessions, "use_gl", fail)
+
+
+@pytest.mark.usefixtures("no_probing")
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"workers": 0},
+        {"render": "deferred", "workers": 0},
+        {"render": "off"},
+    ],
+)
+def test_what_is_not_drawn_here_looks_for_no_gl(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    """The states are recorded, and the videos are promised, or not wanted."""
+    [episode] = record_session(session(tmp_path, **options))
+    pending = manifest_of(tmp_path)["mjrec"]["pending"]
+    if options.get("render") == "off":
+        assert (episode.video, pending) == (None, [])
+    else:
+        assert episode.video is not None
+        assert [entry["video"] for entry in pending] == [episode.video.name]
+    assert videos_in(tmp_path) == []
+    assert len(list(tmp_path.glob("*.trajectory.*"))) == 1
+
+
+@pytest.mark.usefixtures("no_gl")
+def test_without_gl_the_way_out_is_named(tmp_path: Path) -> None:
+    """Where the pictures could be drawn elsewhere; nothing is written."""
+    with pytest.raises(GLError, match="Nothing renders here") as raised:
+        list(record_session(session(tmp_path / "out")))
+    assert "--workers 0" in str(raised.value)
+    assert f"mjrec render {tmp_path / 'out'}" in str(raised.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("no_gl")
+def test_without_gl_live_is_what_it_is(tmp_path: Path) -> None:
+    """Somebody asked for it."""
+    with pytest.raises(GLError, match="Nothing renders here") as raised:
+        list(record_session(session(tmp_path / "out", render="live")))
+    assert "--workers 0" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"render": "later"}, {"workers": -1}, {"quality": "best"}, {"max_fps": 0}],
+)
+def test_options_are_checked_before_anything_is_made(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    """Not after an environment was."""
+    with pytest.raises(InvalidArgument):
+        list(record_session(session(tmp_path / "out", environment="X-v0", **options)))
+
+
+def test_an_iterator_that_is_left_waits_for_nothing(tmp_path: Path) -> None:
+    """What is not rendered by then stays pending."""
+    with contextlib.closing(
+        record_session(session(tmp_path, episodes=3, schedule="all", workers=1))
+    ) as run:
+        next(run)
+    pending = manifest_of(tmp_path)["mjrec"]["pending"]
+    assert [entry["episode_id"] for entry in pending] == [0]
+
+
+RECORD = ("record", "InvertedPendulum-v5", "--size", "32x32", "--max-steps", "9")
+
+
+def test_record_says_which_videos_are_pending(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And what makes them; also for programs."""
+    command = [*RECORD, "--seed", "0", "--workers", "0", "--out"]
+    assert main([*command, str(tmp_path / "a")]) == 0
+    assert f"000000.mp4  (pending: mjrec render {tmp_path / 'a'})" in (
+        capsys.readouterr().out
+    )
+    assert main([*command, str(tmp_path / "b"), "--json"]) == 0
+    [episode] = json.loads(capsys.readouterr().out)["episodes"]
+    assert episode["pending"] is True
+
+
+def test_record_renders_what_it_promises(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before it returns; and no more than 60 frames for a second by default."""
+    command = ["record", "Hopper-v5", *RECORD[2:], "--seed", "0", "--workers", "1"]
+    assert main([*command, "--quality", "draft", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "000000.mp4" in out
+    assert "pending" not in out
+    [metadata] = [json.loads(p.read_text()) for p in tmp_path.glob("*.meta.json")]
+    assert (metadata["stride"], metadata["fps"]) == (3, "125/3")
+    assert metadata["quality"] == "draft"
+
+
+def test_record_without_any_gl(tmp_path: Path) -> None:
+    """On a machine, or in a process, that has none."""
+    command = [*RECORD, "--seed", "0", "--workers", "0"]
+    run = subprocess.run(
+        [sys.executable, "-m", "mjrec", *command, "--out", str(tmp_path)],
+        env={**os.environ, "MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "pending: mjrec render" in run.stdout
