@@ -212,4 +212,5 @@ class EpisodeFinisher:
 
 
 def _has_model(episode: PendingEpisode | None) -> bool:
-    return episode is None or all(path.exists() for path in episode.model_files)
+    file = None if episode is None else episode.model_file
+    return file is None or file.exists()

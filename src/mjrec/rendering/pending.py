@@ -74,7 +74,7 @@ class PendingEpisode:
         video: what is to be rendered; None where nothing is.
         frame_count: how many frames the trajectory has.
         is_kept: the trajectory stays once the video is there.
-        model_files: what has to be there for rendering.
+        model_file: what has to be there for rendering, if it is known.
     """
 
     key: EpisodeKey
@@ -82,7 +82,7 @@ class PendingEpisode:
     video: Path | None
     frame_count: int
     is_kept: bool
-    model_files: tuple[Path, ...]
+    model_file: Path | None
 
     @property
     def is_log(self) -> bool:
@@ -134,7 +134,7 @@ def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
             video=video,
             frame_count=0 if video is None else reader.frame_count,
             is_kept=bool(facts.get("kept", True)),
-            model_files=_model_files(directory, facts),
+            model_file=_model_file(directory, facts),
         )
 
 
@@ -163,7 +163,8 @@ def _deferred_video(trajectory: Path, facts: Mapping[str, Any]) -> Path | None:
     return None if is_done(path) else path
 
 
-def _model_files(directory: Path, facts: Mapping[str, Any]) -> tuple[Path, ...]:
+def _model_file(directory: Path, facts: Mapping[str, Any]) -> Path | None:
+    """Return what comes first of a model; what it was made from may never come."""
     model = facts.get("model") or {}
-    names = (model.get("mjb"), model.get("xml"))
-    return tuple(directory / Path(name).name for name in names if isinstance(name, str))
+    name = model.get("mjb") or model.get("xml")
+    return directory / Path(name).name if isinstance(name, str) else None

@@ -93,8 +93,7 @@ class _Service:
     def run(self) -> None:
         """Return when everything is done."""
         with self._finisher as finisher:
-            while finisher or not self._inbox.is_complete:
-                self._take_in()
+            while self._take_in() or not self._inbox.is_complete:
                 if not finisher:
                     self._wait_for_work()
                 elif finisher.is_ready() or self._inbox.is_complete:
@@ -118,13 +117,15 @@ class _Service:
             self._finisher.dismiss_workers()
             self._inbox.wait(None)
 
-    def _take_in(self) -> None:
+    def _take_in(self) -> bool:
+        """Take what was said, and return whether there is something to do."""
         for name in self._inbox.names():
             key = EpisodeKey.of(name)
             if key is not None and self._finisher.add(key):
                 self._names[key] = name
             else:
                 self._answers.say(done=name, name=name, failure=None)
+        return bool(self._finisher)
 
     def _look_up(self, progress: Progress) -> None:
         """Listen and report, in the midst of work."""

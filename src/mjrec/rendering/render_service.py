@@ -70,6 +70,8 @@ class RenderService:
         self._server: _Server | None = None
         # A dictionary for its order.
         self._waiting: dict[str, None] = {}
+        # What came after an interrupted wait had said that there was no more.
+        self._late: list[str] = []
         self._progress = Progress()
         self._stopped = False
         self._death: str | None = None
@@ -94,14 +96,10 @@ class RenderService:
         self._waiting[name] = None
         if self._stopped or self._death is not None:
             return
-        try:
-            if self._server is None:
-                self._server = _Server(self._directory, self._workers)
-            self._server.say(name)
-        except OSError as error:
-            self._note_death(f"it could not be started: {error}")
-            return
-        self._listen(self._server)
+        if self._server is not None and self._server.all_said:
+            self._late.append(name)
+        else:
+            self._say(name)
 
     def wait(self, on_progress: Callable[[Progress], object] = lambda _: None) -> None:
         """Return when all that was taken over is done, or the server has died.
@@ -114,9 +112,8 @@ class RenderService:
         """
         if self._was_forked() or self._stopped:
             return
-        server = self._server
-        if server is not None:
-            server.say(ALL_SAID)
+        while (server := self._server) is not None:
+            server.say_all_said()
             while not server.has_ended():
                 on_progress(self._progress)
                 server.wait_for_news(_SECONDS_TO_LISTEN)
@@ -124,6 +121,8 @@ class RenderService:
             on_progress(self._progress)
             server.stop()
             self._server = None
+            while self._late and self._death is None:
+                self._say(self._late.pop(0))
         if self._waiting:
             self._fail_rest()
 
@@ -133,6 +132,16 @@ class RenderService:
         if self._server is not None and not self._was_forked():
             self._server.stop()
             self._server = None
+
+    def _say(self, name: str) -> None:
+        try:
+            if self._server is None:
+                self._server = _Server(self._directory, self._workers)
+            self._server.say(name)
+        except OSError as error:
+            self._note_death(f"it could not be started: {error}")
+            return
+        self._listen(self._server)
 
     def _check_process(self) -> None:
         if self._was_forked():
@@ -147,7 +156,7 @@ class RenderService:
     def _listen(self, server: _Server) -> None:
         for message in server.messages():
             self._take(message)
-        if server.has_ended() and self._waiting:
+        if server.has_ended() and len(self._waiting) > len(self._late):
             self._note_death(server.obituary())
 
     def _take(self, message: Mapping[str, Any]) -> None:
@@ -186,6 +195,9 @@ class RenderService:
 class _Server:
     """The render server, from outside.
 
+    Attributes:
+        all_said: nothing more is said to it.
+
     Raises:
         OSError: it could not be started.
     """
@@ -195,21 +207,13 @@ class _Server:
         self._unsaid = b""
         self._unread = b""
         self._ended = False
-        self._process = subprocess.Popen(
-            [
-                *python_command(_MODULE),
-                str(directory),
-                "--workers",
-                "auto" if workers is None else str(workers),
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._stderr or subprocess.DEVNULL,
-            bufsize=0,
-            env=environment_of_child(os.environ),
-            # Ctrl-C in a terminal is the simulation's to handle.
-            start_new_session=True,
-        )
+        self.all_said = False
+        try:
+            self._process = _start(directory, workers, self._stderr)
+        except BaseException:
+            if self._stderr is not None:
+                self._stderr.close()
+            raise
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._to: IO[bytes] = self._process.stdin
@@ -221,6 +225,12 @@ class _Server:
         """Send a line, now or, where the pipe is full, with a later one."""
         self._unsaid += f"{line}\n".encode()
         self._send()
+
+    def say_all_said(self) -> None:
+        """Say, once, that nothing more is said."""
+        if not self.all_said:
+            self.all_said = True
+            self.say(ALL_SAID)
 
     def messages(self) -> Iterator[Mapping[str, Any]]:
         """Yield what it has said since; never waits."""
@@ -299,6 +309,26 @@ class _Server:
         size = self._stderr.seek(0, os.SEEK_END)
         self._stderr.seek(max(0, size - _END_OF_STDERR))
         return self._stderr.read().decode(errors="replace").strip()
+
+
+def _start(
+    directory: Path, workers: int | None, stderr: IO[bytes] | None
+) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [
+            *python_command(_MODULE),
+            str(directory),
+            "--workers",
+            "auto" if workers is None else str(workers),
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=stderr or subprocess.DEVNULL,
+        bufsize=0,
+        env=environment_of_child(os.environ),
+        # Ctrl-C in a terminal is the simulation's to handle.
+        start_new_session=True,
+    )
 
 
 def _scratch_file() -> IO[bytes] | None:
