@@ -5,7 +5,7 @@
 members bear MuJoCo's names: `file["snapshots"]["geom_xpos"]` is an array, and the
 shuffle filter, which goes by whole rows there, puts the same byte of one row after the
 other side by side, so that what does not change costs nothing. (Of what was measured
-that was the smallest form and the fastest to write: docs/decisions.md.)
+that was the smallest form and the fastest to write; `docs/format.md` has numbers.)
 """
 
 from __future__ import annotations

@@ -283,7 +283,7 @@ class _Rows:
 
 
 def _fill(descriptor: int, offset: int, out: NDArray[np.uint8]) -> None:
-    left = memoryview(out).cast("B")
+    left = out.data.cast("B")
     while left:
         count = os.preadv(descriptor, [left], offset)
         if count == 0:
