@@ -137,8 +137,10 @@ def _out_for(
         raise InvalidArgument(
             f"{out} is one file, and several episodes were asked for: choose one."
         )
-    key = EpisodeKey.of(out.name)
-    if key is not None and out.with_suffix(".mp4").name == key.video_name:
+    # By whatever ending: the metadata would have the original's name.
+    name = out.with_suffix(".mp4").name
+    key = EpisodeKey.of(name)
+    if key is not None and name == key.video_name:
         raise InvalidArgument(
             f"{out} is the name of a recorded video, which shows what its recording "
             "saw. Choose another name."

@@ -1,0 +1,365 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec render`: pending videos are made, and recorded episodes shown another way."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from recordings import frames_of
+
+from mjrec import Monitor, clear_monitor_files, iter_episodes
+from mjrec.commands import main
+from mjrec.formats.monitor_directory import Infix
+from mjrec.rendering import again, crew
+from mjrec.rendering.pending import EpisodeKey, claim
+from mjrec.rendering.views import View
+from trajectories_by_hand import (
+    INFIX,
+    Painter,
+    write_finished,
+    write_log,
+    write_pending_manifest,
+)
+
+VIDEO = "openaigym.video.0.7.video000000"
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def mjrec(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run the command; returns the exit status and what it printed."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        status = main(["render", *(str(argument) for argument in arguments)])
+        return status, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
+    """Draw without processes and without OpenGL."""
+    painter = Painter()
+    monkeypatch.setattr(crew, "DrawingWorkers", lambda count: painter)
+
+    class InWith:
+        def __init__(self, count: int) -> None: ...
+        def __enter__(self) -> Painter:
+            return painter
+
+        def __exit__(self, *error: object) -> None: ...
+
+    monkeypatch.setattr(again, "DrawingWorkers", InWith)
+    return painter
+
+
+def content_of(directory: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in directory.iterdir()}
+
+
+def test_pending_videos_are_rendered(
+    tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """Each is told when it is there, and where they are at the end."""
+    write_finished(tmp_path, 0)
+    write_log(tmp_path, 1)
+    write_pending_manifest(tmp_path, 0, 1)
+    status, out, err = mjrec(tmp_path)
+    assert (status, err) == (0, "")
+    assert out.splitlines() == [
+        "openaigym.video.0.7.video000000.mp4: 5 frames",
+        "openaigym.video.0.7.video000001.mp4: 5 frames",
+        "2 videos rendered, in",
+        f"  {tmp_path}",
+    ]
+
+
+@pytest.mark.parametrize("option", [[], ["--pending"]])
+def test_nothing_to_render_is_said(
+    option: list[str], tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """It is no failure."""
+    write_finished(tmp_path, video=None)
+    assert mjrec(tmp_path, *option) == (0, f"Nothing is pending in {tmp_path}.\n", "")
+
+
+def test_a_directory_without_recordings_is_an_error(tmp_path: Path, mjrec: Run) -> None:
+    """One message, which says what to do."""
+    status, _, err = mjrec(tmp_path)
+    assert status == 1
+    assert "holds no recordings" in err
+    assert "mjrec record" in err
+    status, _, err = mjrec(tmp_path / "missing")
+    assert status == 1
+    assert "There is no directory or file" in err
+
+
+def test_what_fails_is_listed_with_its_reason(
+    tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """The others are rendered; the exit status tells."""
+    for episode_id in (0, 1):
+        write_finished(tmp_path, episode_id).write_bytes(b"torn")
+    write_finished(tmp_path, 2)
+    write_finished(tmp_path, 3, frames=False)
+    status, out, _ = mjrec(tmp_path)
+    assert status == 1
+    assert "1 video rendered" in out
+    assert "3 videos could not be rendered:" in out
+    assert "nothing that pictures can be made of" in out
+
+
+def test_one_episode_can_be_finished(
+    tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """By its number or by its file; a second time there is nothing pending."""
+    trajectories = [write_finished(tmp_path, k) for k in range(3)]
+    assert mjrec(tmp_path, "--episode", 1)[0] == 0
+    assert mjrec(trajectories[2])[0] == 0
+    assert [path.name[-10:] for path in sorted(tmp_path.glob("*.mp4"))] == [
+        "000001.mp4",
+        "000002.mp4",
+    ]
+    status, _, err = mjrec(tmp_path, "--episode", 1)
+    assert status == 1
+    assert "--camera" in err
+
+
+def test_an_episode_that_is_not_there(tmp_path: Path, mjrec: Run) -> None:
+    """The message says which there are."""
+    write_finished(tmp_path, 3)
+    status, _, err = mjrec(tmp_path, "--episode", 4)
+    assert status == 1
+    assert "It has those of 3." in err
+
+
+def test_what_another_process_renders_is_left_to_it(
+    tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """And said."""
+    write_finished(tmp_path)
+    lock = claim(tmp_path, EpisodeKey(INFIX, 0))
+    assert lock is not None
+    status, out, _ = mjrec(tmp_path)
+    lock.release()
+    assert status == 0
+    assert "1 video left to another process" in out
+
+
+def test_another_view_is_a_new_file_beside_the_original(
+    tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """Nothing that is there changes, and readers do not take it for the original."""
+    write_finished(tmp_path)
+    write_pending_manifest(tmp_path, 0)
+    mjrec(tmp_path)
+    before = content_of(tmp_path)
+    status, out, _ = mjrec(
+        *(tmp_path, "--episode", 0, "--camera", "top view", "--size", "64x32"),
+        *("--quality", "draft", "--max-fps", 10, "--fps", 29.97),
+    )
+    name = f"{VIDEO}.top%20view.64x32.draft.max10fps.29%2E97fps"
+    assert status == 0
+    assert f"{name}.mp4: 3 frames" in out
+    after = content_of(tmp_path)
+    assert {key: after[key] for key in before} == before
+    assert set(after) - set(before) == {
+        f"{name}.{end}" for end in ("mp4", "framehash", "meta.json")
+    }
+    assert painter.asked[-1][1:] == (
+        [0, 2, 4],
+        View(camera="top view", height=32, width=64, quality="draft"),
+    )
+    clear_monitor_files(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_readers_still_find_the_original(
+    tmp_path: Path, mjrec: Run, corridor: Any, play: Callable[..., None]
+) -> None:
+    """A file with another camera's name is no episode's video."""
+    with Monitor(corridor, tmp_path, lambda _: True) as monitor:
+        play(monitor, 1)
+    [video] = tmp_path.glob("*.mp4")
+    video.with_suffix(".side.mp4").write_bytes(b"")
+    video.with_suffix(".side.meta.json").write_text("{}")
+    [episode] = iter_episodes(tmp_path)
+    assert episode.video == video
+
+
+def test_all_episodes_can_be_shown_another_way(
+    tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """Where no number is given; also of several monitors."""
+    for infix in (INFIX, Infix(1, "7")):
+        write_finished(tmp_path, 0, infix=infix)
+    status, out, _ = mjrec(tmp_path, "--camera", 0)
+    assert status == 0
+    assert "openaigym.video.0.7.video000000.0.mp4: 5 frames" in out
+    assert "openaigym.video.1.7.video000000.0.mp4: 5 frames" in out
+
+
+@pytest.mark.parametrize("name", ["trajectory.0.7.episode000000.h5", "copy.h5"])
+def test_out_names_the_file(
+    name: str, tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """As recorded if nothing else is said, whatever the trajectory is called."""
+    trajectory = write_finished(tmp_path)
+    trajectory = trajectory.rename(tmp_path / name)
+    out = tmp_path / "elsewhere" / "mine.mp4"
+    out.parent.mkdir()
+    status, printed, _ = mjrec(trajectory, "--out", out)
+    assert status == 0
+    assert str(out.parent) in printed
+    assert len(frames_of(out)) == 5
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        ["elsewhere", name]
+    )
+
+
+def test_a_videos_name_stands_for_its_episode(
+    tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """One copies what one sees."""
+    write_finished(tmp_path)
+    mjrec(tmp_path)
+    assert mjrec(tmp_path / f"{VIDEO}.mp4", "--camera", "side")[0] == 0
+    assert (tmp_path / f"{VIDEO}.side.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--pending", "--camera", "side"], "--pending"),
+        (["--size", "64"], "WIDTHxHEIGHT"),
+        (["--size", "0x64"], "width"),
+        (["--max-fps", "0"], "fps"),
+        (["--fps", "-1"], "fps"),
+        (["--workers", "0"], "workers"),
+        (["--out", f"{VIDEO}.mp4"], "name of a recorded video"),
+        (["--out", f"{VIDEO}.mkv"], "name of a recorded video"),
+        (["--out", "x.txt", "--episode", "0"], "ends in"),
+        (["--out", "/no/such/directory/x.mp4", "--episode", "0"], "does not exist"),
+    ],
+)
+def test_what_cannot_be_is_one_clear_error(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    mjrec: Run,
+    painter: Painter,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    write_finished(tmp_path)
+    before = content_of(tmp_path)
+    status, out, err = mjrec(tmp_path, *arguments)
+    assert status == 1
+    assert message in out + err
+    assert content_of(tmp_path) == before
+
+
+def test_one_file_for_several_episodes_is_an_error(
+    tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """One would replace the other."""
+    for episode_id in (0, 1):
+        write_finished(tmp_path, episode_id)
+    status, _, err = mjrec(tmp_path, "--out", tmp_path / "x.mp4")
+    assert status == 1
+    assert "several episodes" in err
+
+
+def test_json_is_one_object(tmp_path: Path, mjrec: Run, painter: Painter) -> None:
+    """With what was rendered and what was not, and nothing else."""
+    write_finished(tmp_path, 0)
+    write_finished(tmp_path, 1, frames=False)
+    status, out, _ = mjrec(tmp_path, "--json")
+    assert status == 1
+    report = json.loads(out)
+    assert report["directory"] == str(tmp_path)
+    assert report["videos"] == [{"name": f"{VIDEO}.mp4", "frame_count": 5}]
+    assert list(report["failures"]) == ["openaigym.video.0.7.video000001.mp4"]
+    assert (report["elsewhere"], report["interrupted"]) == ([], False)
+
+
+def test_ctrl_c_keeps_what_is_done(
+    tmp_path: Path, mjrec: Run, painter: Painter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The exit status is the shells', and nothing half-done stays."""
+    for episode_id in (0, 1):
+        write_finished(tmp_path, episode_id)
+    draw = painter.frames
+
+    def interrupted(trajectory: Path, *rest: Any) -> Any:
+        if "000001" in trajectory.name:
+            raise KeyboardInterrupt
+        return draw(trajectory, *rest)
+
+    monkeypatch.setattr(painter, "frames", interrupted)
+    status, out, _ = mjrec(tmp_path)
+    assert status == 130
+    assert "Interrupted." in out
+    assert (tmp_path / f"{VIDEO}.mp4").exists()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path: Path) -> None:
+    """With workers and OpenGL; two commands at once share the work."""
+    env = gymnasium.make(
+        "InvertedPendulum-v5", width=40, height=32, max_episode_steps=3
+    )
+    directory = tmp_path / "run"
+    with Monitor(env, directory, lambda _: True, workers=0, quality="draft") as monitor:
+        for _ in range(3):
+            monitor.reset(seed=0)
+            for _ in range(3):
+                monitor.step(env.action_space.sample())
+    reader, terminal = pty.openpty()
+    command = [sys.executable, "-m", "mjrec", "render", str(directory)]
+    environ = {**os.environ, "COLUMNS": "100", "TERM": "xterm"}
+    with (
+        subprocess.Popen(
+            command, stdout=terminal, stderr=terminal, env=environ
+        ) as first,
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as second,
+    ):
+        os.close(terminal)
+        shown = _read_all(reader)
+        other, _ = second.communicate()
+    assert (first.returncode, second.returncode) == (0, 0)
+    assert "/12 frames" in shown
+    videos = sorted(directory.glob("*.mp4"))
+    assert [len(frames_of(video)) for video in videos] == [4, 4, 4]
+    # Each by one of the two.
+    rendered = [line for line in (shown + other).splitlines() if ".mp4: 4 fra" in line]
+    assert len(rendered) == 3
+    [manifest] = directory.glob("*.manifest.json")
+    content = json.loads(manifest.read_text())
+    assert len(content["videos"]) == 3
+    assert content["mjrec"]["pending"] == []
+    assert not list(directory.glob(".*"))
+
+
+def _read_all(descriptor: int) -> str:
+    said = b""
+    while True:
+        try:
+            block = os.read(descriptor, 1 << 16)
+        except OSError:
+            # Linux's way to say that nobody writes any more.
+            block = b""
+        if not block:
+            os.close(descriptor)
+            return said.decode()
+        said += block
