@@ -51,7 +51,7 @@ def chosen_frames(
             "max_fps needs to know how many control steps a second has, and this "
             "recording ended before that was written. Leave max_fps out."
         )
-    recorded = Fraction(facts["rate"]) / int(facts.get("stride", 1))
+    recorded = Fraction(facts["rate"]) / int(facts.get("stride") or 1)
     chosen = list(range(0, count, stride_for(recorded, wanted)))
     if count and chosen[-1] != count - 1:
         chosen.append(count - 1)

@@ -41,6 +41,7 @@ class WorkerProcess:
     def __init__(self, ring: FrameRing, environ: Mapping[str, str]) -> None:
         self._rest = b""
         self._stderr = b""
+        self._has_ended = False
         try:
             self._process = subprocess.Popen(
                 [*python_command("mjrec.rendering.worker"), str(ring.descriptor)],
@@ -95,6 +96,7 @@ class WorkerProcess:
         if data is None:
             return []
         if not data:
+            self._has_ended = True
             return None
         *lines, self._rest = (self._rest + data).split(b"\n")
         return [json.loads(line) for line in lines]
@@ -113,8 +115,8 @@ class WorkerProcess:
     def last_words(self) -> str:
         """Return what became of it, and the end of what it printed."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            # One that has closed its pipe takes no time to end.
-            self._process.wait(_SECONDS_TO_DIE)
+            # One that has closed its pipe takes no time to end; others live.
+            self._process.wait(_SECONDS_TO_DIE if self._has_ended else 0)
         self.listen()
         said = self._stderr.decode(errors="replace").strip() or "(nothing)"
         return f"{self._what_became()}. The end of what it said: {said}"
