@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from recordings import frames_in, metadata_of
+from recordings import frames_in, metadata_of, videos_in
 
 from mjrec import load_results
 from mjrec.commands import main
@@ -391,7 +391,7 @@ def _start(tmp_path: Path, **streams: Any) -> subprocess.Popen[bytes]:
 
 
 def test_ctrl_c_keeps_everything_so_far(tmp_path: Path) -> None:
-    """Status 130; episodes, manifest and videos are whole, and nothing is pending."""
+    """Status 130; episodes and manifest are whole, and videos can be made of them."""
     process = _start(tmp_path, stdout=subprocess.PIPE)
     assert process.stdout is not None
     assert b"episode 0" in process.stdout.readline()
@@ -402,6 +402,9 @@ def test_ctrl_c_keeps_everything_so_far(tmp_path: Path) -> None:
     results = results_of(tmp_path)
     assert results["episode_lengths"]
     assert set(results["episode_lengths"]) == {20}
+    if not videos_in(tmp_path):
+        assert f"pending: mjrec render {tmp_path}".encode() in out
+    assert main(["render", str(tmp_path), "--workers", "1"]) == 0
     assert len(frames_in(tmp_path, 0)) == 21
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
