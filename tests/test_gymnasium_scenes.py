@@ -269,17 +269,23 @@ def test_camera_number_of_the_renderer_counts_in_its_moment() -> None:
 
 
 def test_another_renderer_has_another_camera() -> None:
-    """An environment that makes both anew is shown as if it were new."""
+    """An environment that makes both anew is shown as if it were new, at once."""
     env = make("HalfCheetah-v5")
     env.reset(seed=1)
     scene = scene_of(env)
+    view = scene()
     scene.at_picture(lambda: None)
-    first = pose(scene().camera)
+    first = pose(view.camera)
     for _ in range(20):
         env.step(env.action_space.sample())
     base = env.unwrapped
-    base.mujoco_renderer = MujocoRenderer(base.model, base.data, None, 64, 48)
-    assert pose(scene().camera) != first
+    base.mujoco_renderer = MujocoRenderer(
+        base.model, base.data, {"azimuth": 11.0}, 64, 48, visual_options={0: True}
+    )
+    scene.at_picture(lambda: None)
+    assert view.camera.azimuth == 11
+    assert view.camera.lookat.tolist() != first[3]
+    assert view.option.flags[0] == 1
 
 
 def add_marker(viewer: Any) -> None:

@@ -63,6 +63,10 @@ class ViewerScene:
             _own_side(simulated, "height") if height is None else height,
             _own_side(simulated, "width") if width is None else width,
         )
+        own = FREE_CAMERA if camera is None else camera
+        # The same objects for good, because they are watched.
+        self._camera = resolve_camera(simulated.model, own)
+        self._option = viewer_option()
         self._start()
 
     def __call__(self) -> SceneView:
@@ -93,14 +97,17 @@ class ViewerScene:
         return None if viewer is None else _addition(viewer, self._new_flags)
 
     def _start(self) -> None:
-        simulated = self._simulated
-        self._model = simulated.model
-        self._renderer: Any = getattr(simulated, "mujoco_renderer", None)
-        own = FREE_CAMERA if self._asked is None else self._asked
-        self._camera = resolve_camera(self._model, own)
-        self._option = viewer_option(getattr(self._renderer, "_vopt", None))
+        self._model = self._simulated.model
+        self._renderer: Any = getattr(self._simulated, "mujoco_renderer", None)
         self._new_flags = new_scene_flags(self._model)
         self._is_settled = False
+        self._camera_id: int | None = None
+        flags = getattr(self._renderer, "_vopt", None)
+        copy_members(viewer_option(flags), self._option)
+        if self._asked is not None:
+            # Another model may have the name elsewhere.
+            camera = resolve_camera(self._model, self._asked)
+            copy_members(camera, self._camera)
 
     def _update(self) -> None:
         renderer = getattr(self._simulated, "mujoco_renderer", None)
@@ -116,13 +123,18 @@ class ViewerScene:
             place_free_camera(self._model, self._camera)
 
     def _update_own_camera(self, viewer: Any) -> None:
+        renderer = self._renderer
         if viewer is not None:
             copy_members(viewer.cam, self._camera)
         elif not self._is_settled:
-            config = self._renderer.default_cam_config
+            config = renderer.default_cam_config
             data = self._simulated.data
             place_viewer_camera(self._model, data, config, self._camera)
-        select_camera(self._camera, self._renderer.camera_id)
+        elif renderer.camera_id == self._camera_id:
+            # The usual case, at every step.
+            return
+        self._camera_id = renderer.camera_id
+        select_camera(self._camera, self._camera_id)
 
     def _viewer(self) -> Any:
         # Other modes' viewers have cameras of their own.
