@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -82,24 +83,20 @@ def record_and_finish(name: str, steps: int) -> dict[str, float]:
     """
     with tempfile.TemporaryDirectory() as directory:
         if name.startswith(_DM_CONTROL):
-            _record_dm_control(name.removeprefix(_DM_CONTROL), steps, directory)
+            env = _recorded_dm_control(name, steps, directory)
         else:
-            _record_gymnasium(name, steps, directory)
+            env = _recorded_gymnasium(name, steps, directory)
         [log] = Path(directory).glob("openaigym.trajectory.*.log")
-        log_bytes = log.stat().st_size
+        sizes = {"log": log.stat().st_size}
         start = time.perf_counter()
         finished = finish_trajectory(log)
         seconds = time.perf_counter() - start
-        models = Path(directory).glob("openaigym.model.*")
-        return {
-            "log": log_bytes,
-            "finished": finished.stat().st_size,
-            "seconds": seconds,
-            **{
-                f"model, {_ending(path.name)}": path.stat().st_size
-                for path in sorted(models)
-            },
-        }
+        sizes["finished"] = finished.stat().st_size
+        # Which waits until the model is stored.
+        env.close()
+        for path in sorted(Path(directory).glob("openaigym.model.*")):
+            sizes[f"model, {_ending(path.name)}"] = path.stat().st_size
+        return {**sizes, "seconds": seconds}
 
 
 def _ending(name: str) -> str:
@@ -107,35 +104,34 @@ def _ending(name: str) -> str:
     return "." + name.split(".", 3)[3]
 
 
-def _record_gymnasium(env_id: str, steps: int, directory: str) -> None:
+def _recorded_gymnasium(env_id: str, steps: int, directory: str) -> Any:
+    """Return a monitor whose episode is over."""
     make = {**UNENDING.get(env_id, {}), "max_episode_steps": steps}
-    setup = Setup(
-        env_id=env_id,
-        recorder=MONITOR,
-        make=make,
-        options={"workers": 0},
-        waits=False,
-    )
-    env = setup.open(directory)
+    env = Setup(
+        env_id=env_id, recorder=MONITOR, make=make, options={"workers": 0}
+    ).open(directory)
     env.reset(seed=0)
     for action in random_actions(env, steps):
         env.step(action)
-    setup.close(env)
+    return env
 
 
-def _record_dm_control(name: str, steps: int, directory: str) -> None:
+def _recorded_dm_control(env_id: str, steps: int, directory: str) -> Any:
+    """Return a monitor whose episode is over."""
     # Here, because it may not be installed.
     from dm_control import suite
 
-    domain, _, task = name.partition("-")
+    domain, _, task = env_id.removeprefix(_DM_CONTROL).partition("-")
     env = suite.load(domain, task, task_kwargs={"random": 0})
     low, high = env.action_spec().minimum, env.action_spec().maximum
     random = np.random.default_rng(0)
-    monitor = mjrec.Monitor(env, directory, workers=0, env_id=_DM_CONTROL + name)
+    monitor = mjrec.Monitor(env, directory, workers=0, env_id=env_id)
     monitor.reset()
     for _ in range(steps):
         monitor.step(random.uniform(low, high))
-    monitor.close(wait=False)
+    # Whether it was over or not.
+    monitor.reset()
+    return monitor
 
 
 def _is_there(name: str) -> bool:

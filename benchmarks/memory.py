@@ -22,6 +22,7 @@ TITLE = "Memory: peak of the simulation's process in one episode of HalfCheetah-
 
 _MEGABYTE = 1e6
 _PEAK = re.compile(r"^VmHWM:\s+(\d+) kB$", re.MULTILINE)
+_BARE, _PENDING, _DRAWN = "bare", "workers=0", "workers=1"
 _LITTLE = at_most(64)
 # Pages come and go with what the allocator happens to do.
 _NO_GROWTH = at_most(4)
@@ -38,7 +39,8 @@ class Settings:
         size: height and width of the pictures.
         drawn_size: of those that workers draw. What they draw is not in the process
             that is measured, so it need not be large.
-        has_peer: whether RecordVideo is measured too, with the shorter episode.
+        recorders: who is measured, the bare environment among them; RecordVideo with
+            the shorter episode only.
     """
 
     rounds: int = 3
@@ -46,7 +48,7 @@ class Settings:
     long: int = 10_000
     size: tuple[int, int] = (480, 480)
     drawn_size: tuple[int, int] = (64, 64)
-    has_peer: bool = True
+    recorders: tuple[str, ...] = (_BARE, _PENDING, _DRAWN, RECORD_VIDEO)
 
 
 FULL = Settings()
@@ -89,20 +91,23 @@ def _peak_memory() -> float:
     return int(match[1]) * 1024 / _MEGABYTE
 
 
-_BARE, _PENDING, _DRAWN = "bare", "workers=0", "workers=1"
 _Peaks = dict[tuple[str, int], tuple[float, ...]]
 
 
 def _setups(settings: Settings) -> Iterator[tuple[tuple[str, int], Setup]]:
     for steps in (settings.short, settings.long):
         full, small = _make(steps, settings.size), _make(steps, settings.drawn_size)
-        # Small ones at the lower quality, or ten thousand take half an hour.
-        drawn = {"workers": 1, "quality": "draft"}
-        yield (_BARE, steps), _setup(BARE, full)
-        yield (_PENDING, steps), _setup(MONITOR, full, workers=0)
-        yield (_DRAWN, steps), _setup(MONITOR, small, **drawn)
-        if steps == settings.short and settings.has_peer and has_moviepy():
-            yield (RECORD_VIDEO, steps), _setup(RECORD_VIDEO, full)
+        setups = {
+            _BARE: _setup(BARE, full),
+            _PENDING: _setup(MONITOR, full, workers=0),
+            # At the lower quality, or ten thousand take half an hour.
+            _DRAWN: _setup(MONITOR, small, workers=1, quality="draft"),
+        }
+        if steps == settings.short and has_moviepy():
+            setups[RECORD_VIDEO] = _setup(RECORD_VIDEO, full)
+        for name in settings.recorders:
+            if name in setups:
+                yield (name, steps), setups[name]
 
 
 def _setup(recorder: str, make: dict[str, Any], **options: Any) -> Setup:
@@ -137,7 +142,9 @@ def _note(name: str, settings: Settings) -> str:
 
 def _growths(peaks: _Peaks, settings: Settings) -> Iterator[Result]:
     """Yield what the longer episode takes more than the shorter one."""
-    for name in (_BARE, _PENDING, _DRAWN):
+    for name in settings.recorders:
+        if (name, settings.long) not in peaks:
+            continue
         yield Result(
             subject=f"{settings.short} to {settings.long} frames",
             variant=f"{name}, growth",

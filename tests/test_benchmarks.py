@@ -155,7 +155,7 @@ def test_time_to_video_compares_with_record_video() -> None:
 def test_memory_compares_processes_of_equal_episodes() -> None:
     """And the longer episode with the shorter one."""
     settings = memory.Settings(
-        rounds=1, short=2, long=4, size=TINY, drawn_size=TINY, has_peer=False
+        rounds=1, short=2, long=4, size=TINY, recorders=("bare", "workers=0")
     )
     results = memory.measure(settings, silently)
     assert {r.subject for r in results} == {"2 frames", "4 frames", "2 to 4 frames"}
