@@ -90,14 +90,7 @@ def test_recorded_by_gymnasium_too(tmp_path: Path) -> None:
         (lambda env: PassesOn(Overlay(env)), "Overlay"),
         (OverlayBelow, "Overlay"),
         (wrappers.RenderCollection, "gymnasium.wrappers.rendering.RenderCollection"),
-        (
-            lambda env: wrappers.AddWhiteNoise(env, 0.1),
-            "gymnasium.wrappers.rendering.AddWhiteNoise",
-        ),
-        (
-            lambda env: wrappers.ObstructView(env, 0.1, 4),
-            "gymnasium.wrappers.rendering.ObstructView",
-        ),
+        (lambda env: wrappers.HumanRendering(env), "HumanRendering"),
     ],
 )
 def test_wrappers_that_draw_are_named(wrap: Any, name: str) -> None:
