@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+import time
 
 # Before anything imports mujoco, which reads it once.
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -105,8 +106,14 @@ def play() -> Callable[..., None]:
 
 
 def kill_children(name: str) -> int:
-    """Kill this process's children of that name, and return how many there were."""
-    named = [p for p in children() if name in Path(f"/proc/{p}/comm").read_text()]
+    """Kill this process's children of that name, and return how many there were.
+
+    One that was started just now has its parent's name for a moment.
+    """
+    deadline = time.monotonic() + 10
+    named: list[int] = []
+    while not named and time.monotonic() < deadline:
+        named = [p for p in children() if name in Path(f"/proc/{p}/comm").read_text()]
     for pid in named:
         os.kill(pid, signal.SIGKILL)
     return len(named)

@@ -15,13 +15,6 @@ from typing import Any
 import gymnasium
 import pytest
 from recordings import frames_of
-
-from mjrec import Monitor, clear_monitor_files, iter_episodes
-from mjrec.commands import main
-from mjrec.formats.monitor_directory import Infix
-from mjrec.rendering import again, crew
-from mjrec.rendering.pending import EpisodeKey, claim
-from mjrec.rendering.views import View
 from trajectories_by_hand import (
     INFIX,
     Painter,
@@ -29,6 +22,13 @@ from trajectories_by_hand import (
     write_log,
     write_pending_manifest,
 )
+
+from mjrec import Monitor, clear_monitor_files, iter_episodes
+from mjrec.commands import main
+from mjrec.formats.monitor_directory import Infix
+from mjrec.rendering import again, crew
+from mjrec.rendering.pending import EpisodeKey, claim
+from mjrec.rendering.views import View
 
 VIDEO = "openaigym.video.0.7.video000000"
 Run = Callable[..., tuple[int, str, str]]

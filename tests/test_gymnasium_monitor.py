@@ -548,7 +548,7 @@ import sys
 sys.path.insert(0, {tests!r})
 import conftest, gymnasium, mjrec
 env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=32, height=32)
-env = mjrec.Monitor(env, {directory!r})
+env = mjrec.Monitor(env, {directory!r}, render="live")
 env.reset(seed=0)
 for _ in range(3):
     env.step(env.action_space.sample())
@@ -562,7 +562,7 @@ for _ in range(3):
     ids=["end", "exit", "exception"],
 )
 def test_leaving_the_interpreter_closes(tmp_path: Path, how: str, status: int) -> None:
-    """Without close(): video, statistics and manifest are there, without noise."""
+    """Without close(): a live video, statistics and manifest, without noise."""
     script = LEAVING.format(
         tests=str(Path(__file__).parent), directory=str(tmp_path), how=how
     )

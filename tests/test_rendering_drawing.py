@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from rides import FRAMES, HEIGHT, WIDTH, Ride, move, record, start
 
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
 from mjrec.formats.trajectory import Array, RowLayout, TrajectoryHeader
@@ -18,7 +19,6 @@ from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.rendering.drawing import TrajectoryDrawing
 from mjrec.rendering.views import View
 from mjrec.simulation.renderer import SceneRenderer
-from rides import FRAMES, HEIGHT, WIDTH, Ride, move, record, start
 
 
 @pytest.fixture(scope="module")

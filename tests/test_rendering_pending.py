@@ -9,6 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from trajectories_by_hand import (
+    INFIX,
+    Painter,
+    write_finished,
+    write_log,
+    write_pending_manifest,
+)
 
 from mjrec import GLError, load_results
 from mjrec.formats.locks import Lock
@@ -20,13 +27,6 @@ from mjrec.rendering.outcomes import Outcome
 from mjrec.rendering.pending import EpisodeKey, claim, look_at, recorded_episodes
 from mjrec.rendering.progress import Progress
 from mjrec.rendering.rendered_manifests import is_done, reconcile, update_manifest
-from trajectories_by_hand import (
-    INFIX,
-    Painter,
-    write_finished,
-    write_log,
-    write_pending_manifest,
-)
 
 KEY = EpisodeKey(INFIX, 0)
 VIDEO = "openaigym.video.0.7.video000000"

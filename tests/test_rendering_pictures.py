@@ -15,13 +15,13 @@ import mujoco.rollout
 import numpy as np
 import pytest
 from processes import children
+from rides import HEIGHT, WIDTH, Ride, move, record, start
 
 import mjrec
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
 from mjrec.formats.trajectory import TrajectoryHeader
 from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.rendering.recorded_pictures import chosen_frames
-from rides import HEIGHT, WIDTH, Ride, move, record, start
 
 SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS
 SIZE: dict[str, Any] = {"height": HEIGHT, "width": WIDTH}

@@ -19,11 +19,11 @@ import gymnasium
 import pytest
 from processes import children
 from recordings import frames_of
+from trajectories_by_hand import write_log
 
 from mjrec import Error, InvalidArgument, Monitor
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.render_service import Progress, RenderService
-from trajectories_by_hand import write_log
 
 # A program around a service, with the directory at argv[1].
 PROGRAM = """

@@ -12,11 +12,11 @@ from typing import Any
 import av
 import pytest
 from recordings import frames_of
+from trajectories_by_hand import Painter, grey, write_finished, write_log
 
 from mjrec import InvalidFrame, Monitor, NoPictures, UnreadableFile
 from mjrec.rendering.videos import metadata_path, render_video, video_path
 from mjrec.rendering.views import View
-from trajectories_by_hand import Painter, grey, write_finished, write_log
 
 STEM = "openaigym.video.0.7.video000000"
 

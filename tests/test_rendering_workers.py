@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from interruption import ctrl_c_soon
 from processes import children
+from rides import FRAMES, HEIGHT, WIDTH, Ride, record
 
 import mjrec
 from mjrec.errors import (
@@ -34,7 +35,6 @@ from mjrec.rendering.carried_errors import carried, unpacked
 from mjrec.rendering.child_python import environment_of_child
 from mjrec.rendering.views import View
 from mjrec.rendering.workers import DrawingWorkers
-from rides import FRAMES, HEIGHT, WIDTH, Ride, record
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from robots import robots_that_reset
 
 from mjrec.environments.gymnasium_scenes import gymnasium_scenes
 from mjrec.environments.robotics_scenes import drawn_part, picture_moment
-from robots import robots_that_reset
 
 pytest.importorskip("gymnasium_robotics")
 

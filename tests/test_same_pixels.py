@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from recordings import frames_in, metadata_of
+from robots import robotics_ids, robots_that_reset
 
 import mjrec
 from mjrec.environments.from_name import environment_from_name
@@ -27,7 +28,6 @@ from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.workers import DrawingWorkers
 from mjrec.simulation.cameras import raw_data, raw_model
 from mjrec.simulation.inside import simulation_in
-from robots import robotics_ids, robots_that_reset
 
 ALL = os.environ.get("MJREC_TEST_ALL") == "1"
 HEIGHT, WIDTH = 48, 64

@@ -123,9 +123,8 @@ def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:
     assert read.terminated.tolist() == [False, False, True]
     assert not read.truncated.any()
     assert read.frame_steps.tolist() == [0, 1, 2, 3]
-    assert read.header.snapshot.unpack(read.snapshots)["geom_xpos"][:, 0, 0].tolist() == [
-        0, 1, 2, 3
-    ]  # fmt: skip
+    positions = read.header.snapshot.unpack(read.snapshots)["geom_xpos"]
+    assert positions[:, 0, 0].tolist() == [0, 1, 2, 3]
     facts = read.header.facts
     assert (facts["rate"], facts["timestep"], facts["stride"]) == ("50", "1/50", 1)
     assert facts["complete"] is True

@@ -217,10 +217,15 @@ class RenderError(Error):
     def __init__(self, directory: Path, failures: Mapping[str, str]) -> None:
         self.directory = directory
         self.failures = dict(failures)
-        reasons = "; ".join(f"{name}: {why}" for name, why in self.failures.items())
+        by_reason: dict[str, list[str]] = {}
+        for name, why in self.failures.items():
+            by_reason.setdefault(why, []).append(name)
+        reasons = "; ".join(
+            f"{', '.join(names)}: {why}" for why, names in by_reason.items()
+        )
         super().__init__(
             f"{len(self.failures)} of the videos in {directory} could not be rendered: "
-            f"{reasons}. Their states are kept; to try again: mjrec render {directory}"
+            f"{reasons} Their states are kept; to try again: mjrec render {directory}"
         )
 
 

@@ -112,10 +112,11 @@ def _mjcf(name: MjcfName, options: EnvironmentOptions) -> NamedEnvironment:
 def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnvironment:
     try:
         from . import dm_control_environments as module
-        from .dm_control_scenes import dm_control_scenes
     except Exception as error:
         raise dm_control_failure(str(name), error) from error
     environment = module.make_dm_control(name.domain, name.task, options)
+    from .dm_control_scenes import dm_control_scenes
+
     return NamedEnvironment(
         environment=environment,
         env_id=str(name),
