@@ -221,6 +221,20 @@ def test_observations_where_they_are_asked_for(tmp_path: Path) -> None:
     assert read.observations.tolist() == [[0, 0], [1, 1], [2, 2]]
 
 
+def test_dictionaries_say_what_they_were_made_from(tmp_path: Path) -> None:
+    """The names and shapes of their arrays, in order."""
+    states, path = Counter(), tmp_path / "t.log"
+    first = {"goal": np.zeros(2), "speed": 1.0}
+    trajectory = recorder(path, states, observation=first)
+    play(trajectory, states, 1, observe=lambda _: {"goal": np.ones(2), "speed": 2.0})
+    trajectory.end({})
+    read = content(path)
+    assert read.observations is not None
+    assert read.observations.tolist() == [[0, 0, 1], [1, 1, 2]]
+    parts = read.header.facts["observation_parts"]
+    assert parts == [["goal", [2]], ["speed", []]]
+
+
 def test_odd_action_is_noted_and_nothing_stops(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

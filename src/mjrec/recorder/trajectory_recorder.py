@@ -232,7 +232,7 @@ class TrajectoryRecorder:
         self._log = log = TrajectoryLogWriter(
             self.path,
             TrajectoryHeader(
-                facts=self._facts,
+                facts={**self._facts, **self._parts()},
                 state=start.state,
                 snapshot=start.snapshot,
                 action=_array_of(self._action),
@@ -253,6 +253,17 @@ class TrajectoryRecorder:
             log.frame_row(0)[:] = self._first_snapshot
             self._last_frame = 0
             self.frame_count = 1
+
+    def _parts(self) -> dict[str, Any]:
+        """Return what dictionaries were made into one vector from."""
+        arrays = {"action": self._action, "observation": self._observation}
+        return {
+            f"{name}_parts": [
+                [part, list(shape)] for part, shape in array.parts.items()
+            ]
+            for name, array in arrays.items()
+            if array is not None and array.parts is not None
+        }
 
     def _note_irregular(self, what: str) -> None:
         if what not in self._irregular:
