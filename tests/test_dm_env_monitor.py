@@ -239,3 +239,35 @@ def test_seed_is_what_the_user_said(cheetah: Any, tmp_path: Path) -> None:
         for _ in range(5):
             env.step(zeros(env))
     assert journal_of(tmp_path)[0]["seed"] == 11
+
+
+def test_trajectory_names_the_task_and_its_random_state(
+    cheetah: Any, tmp_path: Path
+) -> None:
+    """What it takes to run the episode again, where the user has named the task."""
+    before = cheetah.task.random.get_state()[1].tolist()
+    with mjrec.Monitor(
+        cheetah, tmp_path, workers=0, env_id="dm_control/cheetah-run"
+    ) as env:
+        env.reset()
+        env.step(zeros(env))
+    [path] = tmp_path.glob("*.h5")
+    trajectory = mjrec.load_trajectory(path)
+    assert trajectory.environment["framework"] == "dm_control"
+    assert trajectory.environment["id"] == "dm_control/cheetah-run"
+    assert trajectory.facts["random_state"]["state"]["key"] == before
+
+
+def test_observations_are_one_vector(cheetah: Any, tmp_path: Path) -> None:
+    """The arrays of the dictionary one behind the other, and their names."""
+    with mjrec.Monitor(cheetah, tmp_path, workers=0, observations=True) as env:
+        first = env.reset().observation
+        env.step(zeros(env))
+    [path] = tmp_path.glob("*.h5")
+    trajectory = mjrec.load_trajectory(path)
+    assert trajectory.observations is not None
+    np.testing.assert_array_equal(
+        trajectory.observations[0], np.concatenate(list(first.values()))
+    )
+    names = [name for name, _ in trajectory.facts["observation_parts"]]
+    assert names == list(first)

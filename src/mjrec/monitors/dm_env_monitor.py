@@ -64,7 +64,7 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
             directory,
             env_id=env_id or _env_id(env),
             pictures=_pictures(env, **view),
-            scenes=_scenes(env, **view),
+            scenes=_scenes(env, env_id=env_id, **view),
             options=options,
             close_environment=operator.methodcaller("close"),
         )
@@ -146,16 +146,14 @@ def _pictures(
     return NoPictureSource(_NO_PHYSICS)
 
 
-def _scenes(
-    env: dm_env.Environment, *, camera: Any, height: int | None, width: int | None
-) -> Scenes:
+def _scenes(env: dm_env.Environment, **known: Any) -> Scenes:
     if getattr(env, "physics", None) is None:
         return Scenes(
             states=None, obstacle=None, environment=None, random_state=lambda: None
         )
     from ..environments.dm_control_scenes import dm_control_scenes
 
-    return dm_control_scenes(env, camera=camera, height=height, width=width)
+    return dm_control_scenes(env, **known)
 
 
 def _env_id(env: dm_env.Environment) -> str:
