@@ -6,8 +6,9 @@ from __future__ import annotations
 import functools
 import statistics
 import tempfile
+import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from .children import call
@@ -78,18 +79,21 @@ def measure(settings: Settings, say: Say) -> list[Result]:
 
 
 def run_episodes(setup: dict[str, Any], steps: int) -> dict[str, float]:
-    """Return steps per second and how long closing took, in seconds.
+    """Return steps per second, and per second of this thread's CPU time.
 
-    What is done once, in the first reset, does not count.
+    What is done once, in the first reset, does not count, and neither does closing,
+    whose seconds are given too.
     """
     environment = Setup(**setup)
     with tempfile.TemporaryDirectory() as directory:
         env = environment.open(directory)
         actions = random_actions(env, steps)
         env.reset(seed=0)
+        start = time.thread_time()
         seconds = seconds_to_step(env, actions)
+        busy = time.thread_time() - start
         closing = environment.close(env)
-    return {"rate": steps / seconds, "closing": closing}
+    return {"rate": steps / seconds, "cpu_rate": steps / busy, "closing": closing}
 
 
 def _measure_environment(env_id: str, settings: Settings, say: Say) -> list[Result]:
@@ -109,7 +113,7 @@ def _measure_environment(env_id: str, settings: Settings, say: Say) -> list[Resu
         rounds=settings.rounds,
         say=say,
     )
-    bare = Reference(_BARE, _rates(samples[env_id, _BARE]))
+    bare = samples[env_id, _BARE]
     return [
         _result(env_id, name, samples.get((env_id, name), []), bare)
         for name in _VARIANTS
@@ -121,16 +125,24 @@ def _steps(name: str, settings: Settings) -> int:
 
 
 def _result(
-    env_id: str, name: str, samples: list[dict[str, float]], bare: Reference
+    env_id: str,
+    name: str,
+    samples: list[dict[str, float]],
+    bare: list[dict[str, float]],
 ) -> Result:
-    return Result(
+    result = Result(
         subject=env_id,
         variant=name,
         unit="steps/s",
         samples=_rates(samples),
-        reference=None if name == _BARE else bare,
+    )
+    if name == _BARE:
+        return result
+    return replace(
+        result,
+        reference=Reference(_BARE, _rates(bare)),
         promise=_promise(env_id, name),
-        note=_note(name, samples),
+        note=_note(name, samples, bare),
     )
 
 
@@ -140,14 +152,20 @@ def _promise(env_id: str, name: str) -> Promise | None:
     return _CAPTURED_PROMISES.get(env_id) if name == _CAPTURED else None
 
 
-def _note(name: str, samples: list[dict[str, float]]) -> str:
+def _note(
+    name: str, samples: list[dict[str, float]], bare: list[dict[str, float]]
+) -> str:
     if not samples:
         return "moviepy is not installed"
-    if name in (_BARE, _COUNTED):
-        return ""
-    closing = statistics.median(sample["closing"] for sample in samples)
-    waits = _VARIANTS[name].get("waits", True)
-    return f"close() {closing:.2f} s" if waits else "not waited for the videos"
+    by_cpu = _median(samples, "cpu_rate") / _median(bare, "cpu_rate")
+    closing = f"close() {_median(samples, 'closing'):.2f} s"
+    if not _VARIANTS[name].get("waits", True):
+        closing += ", not waiting"
+    return f"by CPU time {by_cpu:.3g}; {closing}"
+
+
+def _median(samples: list[dict[str, float]], key: str) -> float:
+    return statistics.median(sample[key] for sample in samples)
 
 
 def _rates(samples: list[dict[str, float]]) -> tuple[float, ...]:
