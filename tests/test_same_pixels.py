@@ -248,9 +248,8 @@ def record_dm(
         monitor.reset()
         frames = [picture()]
         for _ in range(STEPS):
-            low = np.clip(spec.minimum, -1, 1)
-            action = random.uniform(low, np.clip(spec.maximum, -1, 1), spec.shape)
-            monitor.step(action)
+            limits = (np.clip(limit, -1, 1) for limit in (spec.minimum, spec.maximum))
+            monitor.step(random.uniform(*limits, spec.shape))
             frames.append(picture())
         live.append(frames)
     monitor.close()
@@ -286,10 +285,10 @@ def test_suite(
 
 
 def composer_environments() -> dict[str, Callable[[], Any]]:
+    """Return what makes each; no soccer, whose rewards are one for each player."""
     if not has_dm_control:
         return {}
     from dm_control import manipulation
-    from dm_control.locomotion import soccer
     from dm_control.locomotion.examples import basic_cmu_2019 as cmu
     from dm_control.locomotion.examples import basic_rodent_2020 as rodent
 
@@ -305,7 +304,6 @@ def composer_environments() -> dict[str, Callable[[], Any]]:
         "rodent_escape_bowl": lambda: rodent.rodent_escape_bowl(state()),
         "rodent_run_gaps": lambda: rodent.rodent_run_gaps(state()),
         "rodent_maze_forage": lambda: rodent.rodent_maze_forage(state()),
-        "soccer": lambda: soccer.load(2, random_state=state()),
         **{task: lambda task=task: manipulation.load(task, seed=2) for task in tasks},
     }
 
