@@ -9,12 +9,12 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from mjrec.formats.locks import Lock, is_locked, try_lock
+from mjrec.formats.locks import Lock, is_locked, try_lock, wait_for_lock
 
 # Holds the lock at argv[1], says so, and waits for its input to end. With a second
 # argument it also starts a process that outlives it.
@@ -213,3 +213,38 @@ def test_one_at_a_time_has_a_lock(
     ]
     assert [counter.wait() for counter in counters] == [0, 0, 0]
     assert number.read_text() == "900"
+
+
+@pytest.mark.parametrize("get", [try_lock, wait_for_lock])
+@pytest.mark.parametrize("put", [os.symlink, os.link])
+def test_no_other_file_is_taken_for_a_lock(
+    put: Callable[[Path, Path], None],
+    get: Callable[[Path, str], Lock | None],
+    path: Path,
+    tmp_path: Path,
+) -> None:
+    """Neither by following a link nor by another name of it: its content stays."""
+    victim = tmp_path / "victim"
+    victim.write_text("valuable")
+    put(victim, path)
+    with pytest.raises(OSError, match="no lock is"):
+        get(path, "me")
+    assert victim.read_text() == "valuable"
+    assert not is_locked(path)
+
+
+def test_no_file_is_made_through_a_link(path: Path, tmp_path: Path) -> None:
+    """A link to nothing is refused as well."""
+    path.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match="no lock is"):
+        try_lock(path, "me")
+    assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_what_is_no_file_is_no_lock(make: Callable[[Path], None], path: Path) -> None:
+    """Nobody waits for a pipe, and nobody can hold one."""
+    make(path)
+    with pytest.raises(OSError, match="no lock is"):
+        try_lock(path, "me")
+    assert not is_locked(path)

@@ -8,13 +8,19 @@ a dead monitor left. Process numbers come round again, in containers all the tim
 A monitor's lock is a name that is given once. The others (who renders a video, who
 uses a CPU, who rewrites a manifest) go from hand to hand, and what a dead process left
 is taken over.
+
+A directory may come from anybody. A link, a pipe or a file with a second name that
+stands where a lock belongs is nobody's lock: it is never followed, written or waited
+for. Whoever wants that lock gets an error that says so.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
+import stat
 import time
 import weakref
 from pathlib import Path
@@ -25,6 +31,11 @@ __all__ = ["Lock", "is_locked", "try_lock", "wait_for_lock"]
 # Whoever asks `is_locked` holds a lock for a moment, which is no reason to give up.
 _MOMENTS = 5
 _MOMENT = 0.002
+
+# Not blocking, should somebody have put a pipe there.
+_CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
+# Of a link, a directory, and a socket or a device without a driver.
+_OF_OTHER_THINGS = (errno.ELOOP, errno.EISDIR, errno.ENXIO)
 
 # A forked child shares the lock, which would outlive a killed parent in it.
 _held: weakref.WeakSet[Lock] = weakref.WeakSet()
@@ -99,7 +110,7 @@ def try_lock(path: Path, content: str) -> Lock | None:
         content: what others may read about its holder.
 
     Raises:
-        OSError: it cannot be made or opened.
+        OSError: it cannot be made or opened, or something else stands there.
     """
     for _ in range(_MOMENTS):
         with contextlib.suppress(BlockingIOError):
@@ -112,13 +123,16 @@ def wait_for_lock(path: Path, content: str) -> Lock:
     """Return a lock at `path`, as soon as nobody else holds it.
 
     It is `try_lock` with patience, for what is never held for long.
+
+    Raises:
+        OSError: as `try_lock`.
     """
     return _taken(path, content, fcntl.LOCK_EX)
 
 
 def _taken(path: Path, content: str, operation: int) -> Lock:
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
+        descriptor = _opened(path)
         try:
             fcntl.flock(descriptor, operation)
             # Its holder may have removed it between the two lines above, and somebody
@@ -133,18 +147,52 @@ def _taken(path: Path, content: str, operation: int) -> Lock:
         os.close(descriptor)
 
 
+def _opened(path: Path) -> int:
+    """Return a descriptor of the lock file at `path`, made where it is missing."""
+    try:
+        descriptor = os.open(path, os.O_CREAT | os.O_RDWR | _CAREFULLY, 0o644)
+    except OSError as error:
+        if error.errno in _OF_OTHER_THINGS:
+            raise _no_lock(path) from error
+        raise
+    if not _can_be_lock(descriptor):
+        os.close(descriptor)
+        raise _no_lock(path)
+    return descriptor
+
+
+def _can_be_lock(descriptor: int) -> bool:
+    facts = os.fstat(descriptor)
+    # One that has just been removed has no name at all.
+    return stat.S_ISREG(facts.st_mode) and facts.st_nlink <= 1
+
+
+def _no_lock(path: Path) -> OSError:
+    return OSError(
+        errno.EINVAL,
+        f"{path.name} is a link or no regular file, which no lock is. Remove it",
+    )
+
+
 def is_locked(path: Path) -> bool:
     """Tell whether a living process holds the lock file at `path`.
+
+    Nobody holds what is a link or no regular file.
 
     Raises:
         OSError: the file is there and cannot be opened.
     """
     try:
-        # Not blocking, should somebody have put a pipe there.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        descriptor = os.open(path, os.O_RDONLY | _CAREFULLY)
     except FileNotFoundError:
         return False
+    except OSError as error:
+        if error.errno in _OF_OTHER_THINGS:
+            return False
+        raise
     try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            return False
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
@@ -155,7 +203,7 @@ def is_locked(path: Path) -> bool:
 
 def _is_at(descriptor: int, path: Path) -> bool:
     try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
+        return os.path.samestat(os.fstat(descriptor), path.lstat())
     except FileNotFoundError:
         return False
 
