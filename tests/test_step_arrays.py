@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjrec.formats.trajectory import Array
-from mjrec.recorder.step_arrays import step_array
+from mjrec.recorder.step_arrays import action_array, step_array
 
 
 def values(array: Any) -> Any:
@@ -63,6 +63,26 @@ def test_nothing_like_an_array(example: Any) -> None:
     assert step_array(example) is None
 
 
+def test_dictionary_in_another_order_is_the_same() -> None:
+    """Arrays go by their names."""
+    array = step_array({"b": np.ones(2), "a": 3})
+    assert array is not None
+    assert array.set({"a": 5, "b": np.full(2, 2.0)})
+    assert values(array).tolist() == [2, 2, 5]
+
+
+def test_actions_may_begin_with_whole_numbers() -> None:
+    """A single one is a choice and stays an integer; several are float64."""
+    array = action_array([0, 0])
+    assert array is not None
+    assert array.set([0.5, -0.9])
+    assert values(array).tolist() == [0.5, -0.9]
+    choice = action_array(1)
+    assert choice is not None
+    assert choice.kind == Array("<i8", ())
+    assert not choice.set(0.5)
+
+
 @pytest.mark.parametrize("odd", [np.zeros(3), None, "x", [[1, 2]], {"a": 1}])
 def test_odd_one_is_held_as_zeros(odd: Any) -> None:
     """An environment may take it all the same."""
@@ -71,6 +91,15 @@ def test_odd_one_is_held_as_zeros(odd: Any) -> None:
     assert array.set(np.ones(2))
     assert not array.set(odd)
     assert values(array).tolist() == [0, 0]
+
+
+def test_float_where_integers_are_is_odd() -> None:
+    """It would lose what is behind its point."""
+    array = step_array(np.array([1, 2]))
+    assert array is not None
+    assert not array.set(np.array([0.5, 1.0]))
+    assert not array.set([0.5, 1.0])
+    assert array.set(np.array([3, 4], np.int8))
 
 
 def test_odd_dictionary_is_held_as_zeros() -> None:

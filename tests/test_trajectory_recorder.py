@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjrec.errors import PicturesDiffer
+from mjrec.errors import FileNotWritten, PicturesDiffer
 from mjrec.formats.trajectory import (
     Array,
     RowLayout,
@@ -30,7 +30,7 @@ class Counter:
     def __init__(self) -> None:
         self.step = 0
         self.changes: dict[int, Mapping[str, Any]] = {}
-        self.hidden_from = 10**6
+        self.hidden_from = self.gone_from = 10**6
 
     start = EpisodeStart(
         state=(StateComponent("time", 0, 1), StateComponent("qpos", 1, 2)),
@@ -47,8 +47,13 @@ class Counter:
     def begin_episode(self) -> EpisodeStart:
         return self.start
 
-    def capture_state(self, out: Any) -> None:
-        out.view(np.float64)[:] = [self.time(), self.step, -self.step]
+    def capture_state(self) -> memoryview:
+        if self.step >= self.gone_from:
+            raise PicturesDiffer("it is another simulation")
+        return np.array([self.time(), self.step, -self.step]).view(np.uint8).data
+
+    def changed_fields(self) -> Mapping[str, Any] | None:
+        return self.changes.get(self.step)
 
     def capture_snapshot(self, out: Any) -> Mapping[str, Any] | None:
         if self.step >= self.hidden_from:
@@ -94,13 +99,8 @@ def play(
     for step in range(1, steps + 1):
         recorder.before_step(np.full(2, step, np.float32))
         states.step = step
-        recorder.step(
-            step / 2,
-            terminated=done and step == steps,
-            truncated=False,
-            observation=observe(step),
-            is_last=done and step == steps,
-        )
+        last = done and step == steps
+        recorder.step(step / 2, last, False, observe(step), last, True)
 
 
 def content(path: Path) -> TrajectoryContent:
@@ -200,7 +200,7 @@ def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> N
     path = tmp_path / "t.log"
     trajectory = recorder(path, None)
     trajectory.before_step(1)
-    trajectory.step(1.0, terminated=True, truncated=False, is_last=True)
+    trajectory.step(1.0, True, False, None, True, True)
     trajectory.end({})
     read = content(path)
     assert read.states.shape == (2, 0)
@@ -244,7 +244,7 @@ def test_odd_action_is_noted_and_nothing_stops(
     play(trajectory, states, 1, done=False)
     for _ in range(2):
         trajectory.before_step(np.zeros(5))
-        trajectory.step(0.0, terminated=False, truncated=False, is_last=False)
+        trajectory.step(0.0, False, False, None, False, True)
     trajectory.end({})
     read = content(path)
     assert read.actions is not None
@@ -258,9 +258,7 @@ def test_state_after_an_environments_own_reset_is_not_a_number(tmp_path: Path) -
     states, path = Counter(), tmp_path / "t.log"
     trajectory = recorder(path, states)
     trajectory.before_step(np.zeros(2))
-    trajectory.step(
-        0.0, terminated=True, truncated=False, is_last=True, has_picture=False
-    )
+    trajectory.step(0.0, True, False, None, True, False)
     trajectory.end({})
     read = content(path)
     assert np.isnan(read.states[1]).all()
@@ -276,8 +274,72 @@ def test_frames_stop_where_they_would_differ(tmp_path: Path) -> None:
         play(trajectory, states, 2, done=False)
     trajectory.stop_frames("a marker is in the way")
     trajectory.before_step(np.zeros(2))
-    trajectory.step(0.0, terminated=True, truncated=False, is_last=True)
+    trajectory.step(0.0, True, False, None, True, True)
     trajectory.end({})
     read = content(path)
     assert (len(read.rewards), read.frame_steps.tolist()) == (3, [0, 1])
     assert read.header.facts["broken_reason"] == "a marker is in the way"
+
+
+def test_what_changes_is_noted_without_frames_too(tmp_path: Path) -> None:
+    """After the frames have stopped the model of a step is still known."""
+    states, path = Counter(), tmp_path / "t.log"
+    trajectory = recorder(path, states)
+    play(trajectory, states, 1, done=False)
+    trajectory.stop_frames("a marker is in the way")
+    states.changes[2] = {"site_rgba": np.zeros((1, 4), np.float32)}
+    trajectory.before_step(np.zeros(2))
+    states.step = 2
+    trajectory.step(0.0, True, False, None, True, True)
+    trajectory.end({})
+    changes = [(c.step, list(c.fields)) for c in content(path).model_changes]
+    assert changes == [(0, ["geom_rgba"]), (2, ["site_rgba"])]
+
+
+def test_step_without_a_state_is_a_step_all_the_same(tmp_path: Path) -> None:
+    """Its state is not a number; rewards and actions go on, and it is told once."""
+    states, path = Counter(), tmp_path / "t.log"
+    states.gone_from = 2
+    trajectory = recorder(path, states)
+    with pytest.raises(PicturesDiffer):
+        play(trajectory, states, 2, done=False)
+    trajectory.stop_frames("it is another simulation")
+    trajectory.before_step(np.full(2, 3.0))
+    trajectory.step(1.5, True, False, None, True, True)
+    trajectory.end({})
+    read = content(path)
+    assert np.isnan(read.states).all(axis=1).tolist() == [False, False, True, True]
+    assert read.rewards.tolist() == [0.5, 1, 1.5]
+    assert read.actions is not None
+    assert read.actions[-1].tolist() == [3, 3]
+
+
+def test_what_is_said_first_of_the_end_counts(tmp_path: Path) -> None:
+    """Also where it could not be written then, and is again with other facts."""
+    directory = tmp_path / "d"
+    directory.mkdir()
+    states, path = Counter(), directory / "t.log"
+    trajectory = recorder(path, states)
+    play(trajectory, states, 2)
+    directory.rename(tmp_path / "elsewhere")
+    with pytest.raises(FileNotWritten):
+        trajectory.end({"complete": True})
+    (tmp_path / "elsewhere").rename(directory)
+    trajectory.end({"complete": False, "reason": "reset"})
+    facts = content(path).header.facts
+    assert facts["complete"] is True
+    assert "reason" not in facts
+
+
+def test_nothing_is_recorded_after_a_stop(tmp_path: Path) -> None:
+    """What there was stays, with the reason."""
+    states, path = Counter(), tmp_path / "t.log"
+    trajectory = recorder(path, states)
+    play(trajectory, states, 1, done=False)
+    trajectory.stop("the disk is full")
+    play(trajectory, states, 2, done=False)
+    trajectory.take_frame()
+    trajectory.end({"complete": False})
+    read = content(path)
+    assert (len(read.rewards), read.frame_steps.tolist()) == (1, [0, 1])
+    assert read.header.facts["broken_reason"] == "the disk is full"

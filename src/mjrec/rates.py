@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import numbers
 from fractions import Fraction
@@ -48,6 +49,8 @@ def to_rate(fps: float | Fraction) -> Fraction:
     return rate
 
 
+# The same few timesteps come at the beginning of every episode.
+@functools.lru_cache(maxsize=256)
 def rate_from_timestep(timestep: float) -> Fraction:
     """Return the rate of one frame every `timestep` seconds.
 

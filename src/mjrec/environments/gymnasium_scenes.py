@@ -157,6 +157,7 @@ def _states(simulated: Any, view: dict[str, Any]) -> EpisodeStates:
         at_picture=_at_picture(simulated, scene),
         authored=lambda: _authored(simulated),
         obstacle=None if own_view else scene.obstacle,
+        is_unmoved=None if picture_moment(simulated) else scene.is_unmoved,
     )
 
 

@@ -89,6 +89,23 @@ class ViewerScene:
         self._is_settled = True
         capture()
 
+    def is_unmoved(self) -> bool:
+        """Tell, in a moment, that nothing is other than at the picture before.
+
+        As far as that is sure without a closer look: there is no viewer that anybody
+        could have touched, and the camera does not follow fields of the model.
+        """
+        renderer = self._renderer
+        return (
+            self._is_settled
+            and renderer is not None
+            and self._asked != FREE_CAMERA
+            and not renderer._viewers
+            and renderer.camera_id == self._camera_id
+            and self._simulated.mujoco_renderer is renderer
+            and self._simulated.model is self._model is renderer.model
+        )
+
     def obstacle(self) -> str | None:
         """Return why the viewer's picture of this moment would show something else."""
         renderer, viewer = self._renderer, self._viewer()

@@ -101,11 +101,12 @@ class JournalWriter:
             file.close()
 
     def _write(self, file: io.FileIO, line: bytes) -> None:
-        size = os.fstat(file.fileno()).st_size
         # Unbuffered: the line is with the operating system when `write` returns.
-        if file.write(line) != len(line):
+        written = file.write(line)
+        if written != len(line):
             # Half a line would damage the one after it.
-            os.ftruncate(file.fileno(), size)
+            size = os.fstat(file.fileno()).st_size
+            os.ftruncate(file.fileno(), size - (written or 0))
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
 
 

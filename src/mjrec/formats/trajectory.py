@@ -8,6 +8,7 @@ changes. `docs/format.md` is the specification of both.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -41,7 +42,7 @@ class Array:
     dtype: str
     shape: tuple[int, ...]
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """The bytes of one."""
         return int(np.dtype(self.dtype).itemsize * np.prod(self.shape, dtype=int))
@@ -78,7 +79,7 @@ class RowLayout:
             offset += array.size
         return cls(tuple(fields))
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """The bytes of a row."""
         return sum(field.array.size for field in self.fields)

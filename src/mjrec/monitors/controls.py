@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from ..environments.scenes import Scenes
 from ..errors import RenderError
+from ..formats.trajectory_file import finish_trajectory as finish_log
 from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
 from ..recorder.exit_guard import ExitGuard
@@ -167,6 +168,7 @@ class MonitorControls:
             ),
             options=options,
             rendering=_rendering(options.workers) if choice.mode == DEFERRED else None,
+            finish_log=finish_log,
         )
         self._guard = ExitGuard(
             self,

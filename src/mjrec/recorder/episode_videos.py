@@ -74,8 +74,10 @@ class EpisodeVideos:
                 waiting.append(entry)
             elif _says_broken(metadata):
                 self._broken.append(metadata.name)
-            else:
+            elif video.exists():
                 self._finished.append((video.name, metadata.name))
+            else:
+                waiting.append(entry)
         self._deferred = waiting
 
 

@@ -120,6 +120,8 @@ class Recorder:
         options: what was asked for.
         rendering: makes what renders, for the directory; None where nothing is to be
             rendered now.
+        finish_log: gives the log of an ended episode its final form, where nothing
+            renders.
     """
 
     def __init__(
@@ -129,7 +131,9 @@ class Recorder:
         subject: Subject,
         options: RecorderOptions,
         rendering: Callable[[Path], Rendering] | None = None,
+        finish_log: Callable[[Path], object],
     ) -> None:
+        self._finish_log = finish_log
         self._schedule = to_schedule(options.video_callable)
         self._choice = subject.rendering
         if self._choice.mode == OFF:
@@ -308,17 +312,13 @@ class Recorder:
         try:
             if self._trajectory is not None:
                 self._record_states(
-                    reward,
-                    terminated=bool(terminated),
-                    truncated=bool(truncated),
-                    observation=observation,
-                    is_last=done,
-                    has_picture=picture,
+                    self._trajectory,
+                    (reward, terminated, truncated, observation, done, picture),
                 )
-            if isinstance(self.video_recorder, VideoRecorder):
-                self._take_picture(self.video_recorder, missing=not picture)
+            if self._live_video is not None:
+                self._take_picture(self._live_video, missing=not picture)
                 if done and picture:
-                    self.video_recorder.capture_last()
+                    self._live_video.capture_last()
         finally:
             if done:
                 self._end_episode(
@@ -342,8 +342,7 @@ class Recorder:
         """
         if self.closed:
             return
-        self._take_last_picture()
-        self._end_episode(complete=False, reason="close")
+        self._end_by_close()
         if self._states is not None:
             self._states.finish()
         if self._rendering is not None:
@@ -366,13 +365,18 @@ class Recorder:
         if self._rendering is not None:
             self._rendering.stop()
         try:
-            self._take_last_picture()
-            self._end_episode(complete=False, reason="close")
+            self._end_by_close()
         except Exception:
             self._let_go()
             raise
         self._let_go()
         logger.info("Finished writing results. They are in %s.", self.directory)
+
+    def _end_by_close(self) -> None:
+        try:
+            self._take_last_picture()
+        finally:
+            self._end_episode(complete=False, reason="close")
 
     def failures(self) -> Mapping[str, str]:
         """Return why videos could not be rendered, by their names."""
@@ -402,6 +406,11 @@ class Recorder:
                 f"{os.getpid()}, forked from it. Two processes cannot write the same "
                 "files: make the monitor inside the process that uses it."
             )
+
+    @property
+    def _live_video(self) -> VideoRecorder | None:
+        video = self.video_recorder
+        return video if isinstance(video, VideoRecorder) else None
 
     def _is_unbegun(self) -> bool:
         """Whether the running episode has had its reset only."""
@@ -553,15 +562,14 @@ class Recorder:
             or self._schedule is not disable_videos
         )
 
-    def _record_states(self, reward: float, **rest: Any) -> None:
-        trajectory = self._trajectory
-        assert trajectory is not None
+    def _record_states(self, trajectory: TrajectoryRecorder, step: Any) -> None:
+        """Record a step, given as the arguments of `TrajectoryRecorder.step`."""
         try:
-            trajectory.step(reward, **rest)
+            trajectory.step(*step)
         except PicturesDiffer as error:
             self._stop_frames(trajectory, error)
         except FileNotWritten as error:
-            self._trajectory = None
+            trajectory.stop(str(error))
             self._break_deferred(str(error))
             raise
 
@@ -599,8 +607,8 @@ class Recorder:
                 self._trajectory.take_frame()
             except PicturesDiffer as error:
                 self._stop_frames(self._trajectory, error)
-        if isinstance(self.video_recorder, VideoRecorder):
-            self.video_recorder.capture_last()
+        if self._live_video is not None:
+            self._live_video.capture_last()
 
     def _journal_episode(self, *, terminated: bool, truncated: bool) -> None:
         stats = self.stats_recorder
@@ -629,8 +637,8 @@ class Recorder:
         try:
             self._end_trajectory(complete=complete, **facts)
         finally:
-            if isinstance(self.video_recorder, VideoRecorder):
-                self._end_live_video(self.video_recorder, complete=complete, **facts)
+            if self._live_video is not None:
+                self._end_live_video(self._live_video, complete=complete, **facts)
 
     def _end_trajectory(self, *, complete: bool, **facts: Any) -> None:
         trajectory = self._trajectory
@@ -658,16 +666,22 @@ class Recorder:
             self._unfinished.append(trajectory.path)
 
     def _finish_trajectories(self) -> None:
-        """Give the trajectories that nobody has finished their final form."""
-        if not self._unfinished:
-            return
-        # Not at the top: h5py is loaded only where there is something to write.
-        from ..formats.trajectory_file import finish_trajectory
+        """Give the trajectories that nobody has finished their final form.
 
-        while self._unfinished:
-            if self._unfinished[0].exists():
-                finish_trajectory(self._unfinished[0])
-            self._unfinished.pop(0)
+        Raises:
+            Error: of the first that could not be; the others are finished all the same.
+        """
+        failed: list[Error] = []
+        for _ in range(len(self._unfinished)):
+            log = self._unfinished.pop(0)
+            try:
+                if log.exists():
+                    self._finish_log(log)
+            except Error as error:
+                failed.append(error)
+                self._unfinished.append(log)
+        if failed:
+            raise failed[0]
 
     def _end_live_video(
         self, recorder: VideoRecorder, *, complete: bool, **facts: Any

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..formats.trajectory import Array
 
-__all__ = ["StepArray", "step_array"]
+__all__ = ["StepArray", "action_array", "step_array"]
 
 # What every value of a kind fits into exactly: people give float32 to an environment
 # in one step and float64 in the next.
@@ -37,6 +37,10 @@ class StepArray:
         self.kind = Array(dtype.str, shape)
         self.parts = parts
         self._values: NDArray[Any] = np.zeros(shape, dtype)
+        # What goes in without a loss: integers into floats, and not the other way.
+        self._kinds = "fiub" if dtype.kind == "f" else "iub"
+        if dtype.kind == "u":
+            self._kinds = "u"
         self.bytes: NDArray[np.uint8] = self._values.reshape(-1).view(np.uint8)
 
     @property
@@ -49,13 +53,36 @@ class StepArray:
 
         An environment may take what a file cannot hold; recording does not stop it.
         """
+        # The usual case, at every step.
+        if (
+            type(value) is np.ndarray
+            and self.parts is None
+            and value.dtype.kind in self._kinds
+        ):
+            if value.shape != self._values.shape:
+                self._values[...] = 0
+                return False
+            self._values[...] = value
+            return True
+        return self._set_other(value)
+
+    def _set_other(self, value: Any) -> bool:
         try:
-            array = np.asarray(value if self.parts is None else _joined(value))
-            fits = array.shape == self.kind.shape and array.dtype.kind in "fiub"
-        except (AttributeError, TypeError, ValueError):
+            array = np.asarray(value if self.parts is None else self._joined(value))
+            fits = array.shape == self.kind.shape and array.dtype.kind in self._kinds
+        except (AttributeError, KeyError, TypeError, ValueError):
             fits = False
-        np.copyto(self._values, array if fits else 0, casting="unsafe")
+        self._values[...] = array if fits else 0
         return fits
+
+    def _joined(self, value: Mapping[str, Any]) -> NDArray[np.float64]:
+        assert self.parts is not None
+        if value.keys() != self.parts.keys():
+            raise KeyError(*value.keys() ^ self.parts.keys())
+        arrays = [np.asarray(value[name], np.float64) for name in self.parts]
+        if [array.shape for array in arrays] != list(self.parts.values()):
+            raise ValueError("an array has another shape than before")
+        return np.concatenate([array.reshape(-1) for array in arrays])
 
 
 def step_array(example: Any) -> StepArray | None:
@@ -78,14 +105,27 @@ def step_array(example: Any) -> StepArray | None:
     return StepArray(_WIDEST.get(dtype.kind, dtype), array.shape)
 
 
+def action_array(example: Any) -> StepArray | None:
+    """Return memory for actions like `example`; None where it is nothing like an array.
+
+    As `step_array`, but for arrays of integers, which become float64: whoever begins
+    with `[0, 0]` may go on with `[0.5, 0.1]`. A single integer is a choice and stays.
+    """
+    if isinstance(example, list | tuple | np.ndarray):
+        array = step_array(example)
+        if array is not None and array.kind.dtype == "<i8" and array.kind.shape:
+            return StepArray(np.dtype("<f8"), array.kind.shape)
+        return array
+    return step_array(example)
+
+
 def _of_mapping(example: Mapping[str, Any]) -> StepArray | None:
-    arrays = {str(name): np.asarray(value) for name, value in example.items()}
-    if not arrays or any(array.dtype.kind not in "fiub" for array in arrays.values()):
+    arrays = {name: np.asarray(value) for name, value in example.items()}
+    names_are_text = all(isinstance(name, str) for name in arrays)
+    if not arrays or not names_are_text:
+        return None
+    if any(array.dtype.kind not in "fiub" for array in arrays.values()):
         return None
     shapes = {name: array.shape for name, array in arrays.items()}
-    return StepArray(np.dtype("<f8"), _joined(example).shape, shapes)
-
-
-def _joined(value: Mapping[str, Any]) -> NDArray[np.float64]:
-    arrays = [np.asarray(part, np.float64).reshape(-1) for part in value.values()]
-    return np.concatenate(arrays)
+    size = sum(array.size for array in arrays.values())
+    return StepArray(np.dtype("<f8"), (size,), shapes)

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import PicturesDiffer
 from ..formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
 from ..formats.trajectory_log import RowBlocks, TrajectoryLogWriter
 from ..rates import rate_from_timestep, stride_for
 from ..simulation.state_source import EpisodeStart, StateSource
-from .step_arrays import StepArray, step_array
+from .step_arrays import StepArray, action_array, step_array
 
 __all__ = ["Pace", "TrajectoryRecorder"]
 
@@ -89,11 +90,16 @@ class TrajectoryRecorder:
         self._last_frame = -1
         self._log: TrajectoryLogWriter | None = None
         self._ended = False
+        self._is_told = False
+        self._is_stopped = False
+        # What a row holds behind its state; and a state where there is none.
+        self._behind_state: tuple[memoryview, ...] = ()
+        self._no_state = np.full(self._state_bytes // 8, np.nan).tobytes()
         self._irregular: set[str] = set()
         self._action: StepArray | None = None
         self._observation = None if observation is None else step_array(observation)
         # What belongs to step 0 waits here until there is a log.
-        self._first_state = np.empty(self._state_bytes, np.uint8)
+        self._first_state = self._no_state
         self._first_snapshot = np.empty(self._start.snapshot.size, np.uint8)
         self._first_observation = _bytes_of(self._observation, observation)
         self._first_change: Mapping[str, NDArray[Any]] | None = None
@@ -102,8 +108,10 @@ class TrajectoryRecorder:
 
     def before_step(self, action: Any) -> None:
         """Note the action of the coming step, which the environment may overwrite."""
+        if self._is_stopped:
+            return
         if self._log is None:
-            self._action = step_array(action)
+            self._action = action_array(action)
             self._begin_log()
         if self._action is not None and not self._action.set(action):
             self._note_irregular("actions")
@@ -120,17 +128,24 @@ class TrajectoryRecorder:
         self._takes_frames = False
         self.note(broken_reason=reason)
 
+    def stop(self, reason: str) -> None:
+        """Record nothing more of the episode, and say why; what was recorded stays."""
+        self._is_stopped = True
+        self.note(broken_reason=reason)
+
     def step(
         self,
         reward: float,
-        *,
         terminated: bool,
         truncated: bool,
-        observation: Any = None,
+        observation: Any,
         is_last: bool,
-        has_picture: bool = True,
+        has_picture: bool,
     ) -> None:
         """Record what the environment is like after a step.
+
+        Whatever goes wrong, the step is in the log: without a state, where there is
+        none to be had.
 
         Args:
             reward: of the step.
@@ -142,38 +157,34 @@ class TrajectoryRecorder:
                 state is the next episode's.
 
         Raises:
-            FileNotWritten: the disk is full.
+            FileNotWritten: the disk is full; all is kept, and another call tries again.
             PicturesDiffer: no picture of this moment can be made from its state.
         """
+        if self._is_stopped:
+            return
         log = self._log
         assert log is not None, "before_step was not called"
-        self.steps += 1
-        if self.steps == 1:
-            self._settle_pace(log)
         if self._observation is not None and not self._observation.set(observation):
             self._note_irregular("observations")
-        row = log.step_row(self.steps, reward, terminated, truncated)
+        number = self.steps + 1
+        row = log.step_row(number, reward, terminated, truncated)
+        self.steps = number
+        state: Any = self._no_state
         try:
-            self._fill(row, has_state=has_picture)
-        except BaseException:
-            # Ctrl-C, say: what is half in it is some earlier row.
-            log.withdraw_row()
+            if has_picture and self._states is not None:
+                state = self._states.capture_state()
+        except PicturesDiffer:
+            # It is another simulation from here on.
+            self._states = None
             raise
-        if has_picture and (is_last or self.steps % self._stride == 0):
+        finally:
+            # Whatever was raised: a row that is half of an earlier one, or missing,
+            # would be the end of the log.
+            row.data[:] = b"".join((state, *self._behind_state))
+        if number == 1:
+            self._settle_pace(log)
+        if has_picture and (is_last or number % self._stride == 0):
             self.take_frame()
-
-    def _fill(self, row: NDArray[np.uint8], *, has_state: bool) -> None:
-        size = self._state_bytes
-        if has_state and self._states is not None:
-            self._states.capture_state(row[:size])
-        else:
-            row[:size].view(np.float64)[...] = np.nan
-        if self._action is not None:
-            end = size + self._action.size
-            row[size:end] = self._action.bytes
-            size = end
-        if self._observation is not None:
-            row[size:] = self._observation.bytes
 
     def take_frame(self) -> None:
         """Take the snapshot of this moment, unless there is one of it already.
@@ -181,24 +192,30 @@ class TrajectoryRecorder:
         Raises:
             PicturesDiffer: no picture of this moment can be made from its state.
         """
-        if not self._takes_frames or self._last_frame == self.steps:
+        log, states, number = self._log, self._states, self.steps
+        if log is None or states is None or self._last_frame == number:
             return
-        log = self._log
-        if log is None or self._states is None:
+        if self._is_stopped:
             return
-        row = log.frame_row(self.steps)
-        try:
-            changed = self._states.capture_snapshot(row)
-        except BaseException:
-            log.withdraw_row()
-            raise
-        self._last_frame = self.steps
-        self.frame_count += 1
+        if not self._takes_frames:
+            self._last_frame = number
+            changed = states.changed_fields()
+        else:
+            row = log.frame_row(number)
+            try:
+                changed = states.capture_snapshot(row)
+            except BaseException:
+                log.withdraw_row()
+                raise
+            self._last_frame = number
+            self.frame_count += 1
         if changed:
-            log.add_model_change(ModelChange(step=self.steps, fields=changed))
+            log.add_model_change(ModelChange(step=number, fields=changed))
 
     def end(self, facts: Mapping[str, Any]) -> None:
         """Write what is known of the episode's end, and close the log. Idempotent.
+
+        What the first call says counts, also where it could not be written.
 
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
@@ -210,7 +227,9 @@ class TrajectoryRecorder:
         assert self._log is not None
         if self.steps == 0:
             self._settle_pace(self._log)
-        self._log.add_facts(facts)
+        if not self._is_told:
+            self._log.add_facts(facts)
+            self._is_told = True
         self._log.close()
         self._ended = True
 
@@ -223,7 +242,7 @@ class TrajectoryRecorder:
     def _take_first(self) -> None:
         if self._states is None:
             return
-        self._states.capture_state(self._first_state)
+        self._first_state = bytes(self._states.capture_state())
         if self._takes_frames:
             self._first_change = self._states.capture_snapshot(self._first_snapshot)
 
@@ -244,11 +263,11 @@ class TrajectoryRecorder:
         for fields in (start.model_fields, self._first_change):
             if fields:
                 log.add_model_change(ModelChange(step=0, fields=fields))
+        arrays = [array for array in (self._action, self._observation) if array]
+        self._behind_state = tuple(array.bytes.data for array in arrays)
+        no_action = bytes(0 if self._action is None else self._action.size)
         row = log.step_row(0, 0.0, False, False)
-        row[:] = 0
-        row[: self._state_bytes] = self._first_state
-        if self._observation is not None:
-            row[-self._observation.size :] = self._first_observation
+        row.data[:] = b"".join((self._first_state, no_action, self._first_observation))
         if self._takes_frames:
             log.frame_row(0)[:] = self._first_snapshot
             self._last_frame = 0
@@ -298,11 +317,11 @@ def _array_of(array: StepArray | None) -> Array | None:
     return None if array is None else array.kind
 
 
-def _bytes_of(array: StepArray | None, value: Any) -> NDArray[np.uint8]:
+def _bytes_of(array: StepArray | None, value: Any) -> bytes:
     if array is None:
-        return np.empty(0, np.uint8)
+        return b""
     array.set(value)
-    return array.bytes.copy()
+    return array.bytes.tobytes()
 
 
 def _difference(start: float | None, end: float | None) -> float | None:

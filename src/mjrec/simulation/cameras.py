@@ -20,6 +20,7 @@ __all__ = [
     "Camera",
     "camera_from_members",
     "camera_names",
+    "check_camera",
     "raw_data",
     "raw_model",
     "resolve_camera",
@@ -110,11 +111,16 @@ def camera_from_members(
             known = [known for known in dir(camera) if not known.startswith("_")]
             raise UnknownName("member of mujoco.MjvCamera", name, known)
         setattr(camera, name, value)
-    _check_camera(model, camera)
+    check_camera(model, camera)
     return camera
 
 
-def _check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
+def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
+    """Check that what a camera follows, or is fixed to, is in the model.
+
+    Raises:
+        InvalidArgument: it is not, or there is no such kind of camera.
+    """
     kind, count = int(camera.type), 0
     if kind == int(mujoco.mjtCamera.mjCAMERA_FREE):
         return

@@ -171,15 +171,23 @@ def _set(struct: object, name: str, value: NDArray[Any], *, field: str) -> None:
         holder = getattr(holder, part)
     present = getattr(holder, last)
     value = np.asarray(value)
-    if np.shape(present) != value.shape or value.dtype.kind not in "iufb":
+    # What is not a number would pass for any index.
+    is_whole = np.asarray(present).dtype.kind in "iub"
+    kinds = "iub" if is_whole else "iufb"
+    if np.shape(present) != value.shape or value.dtype.kind not in kinds:
         raise InvalidArgument(
-            f"The model field {field} is numbers of the shape {np.shape(present)} "
-            f"here, and the recorded one is {value.dtype} of the shape {value.shape}: "
+            f"The model field {field} is {'whole ' * is_whole}numbers of the shape "
+            f"{np.shape(present)} here, and the recorded one is {value.dtype} of the shape {value.shape}: "
             "it belongs to another model."
         )
     if name in _INDICES:
         _check_index(struct, name, value)
     if isinstance(present, np.ndarray):
         present[...] = value
-    else:
+        return
+    try:
         setattr(holder, last, type(present)(value.item()))
+    except (TypeError, OverflowError) as error:
+        raise InvalidArgument(
+            f"The model field {field} cannot be {value.item()}."
+        ) from error

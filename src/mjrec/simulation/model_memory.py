@@ -23,21 +23,38 @@ from .struct_memory import Members, Memory, Place, array_address, find_places
 
 __all__ = ["ModelMemory"]
 
-# Too long to compare at every step, and changed by nobody without saying so: what they
-# hold has to be uploaded to the graphics card, or belongs to a mesh.
-_HEAVY_NAMES = (
-    *("tex_data", "hfield_data"),
-    *("mesh_vert", "mesh_normal", "mesh_texcoord", "mesh_graph"),
-    *("mesh_face", "mesh_facenormal", "mesh_facetexcoord"),
-    *("mesh_polynormal", "mesh_polyvertadr", "mesh_polyvertnum", "mesh_polyvert"),
-    *("mesh_polymapadr", "mesh_polymapnum", "mesh_polymap"),
-    *("skin_vert", "skin_texcoord", "skin_face"),
-    *("skin_bonevertid", "skin_bonevertweight"),
-    *("bvh_depth", "bvh_child", "bvh_nodeid", "bvh_aabb"),
-    *("oct_depth", "oct_child", "oct_aabb", "oct_coeff"),
+# What MuJoCo's visualiser reads of a model whenever it makes a scene (traced in 3.17
+# and 4.0). These are compared at every captured step, the others at every reset.
+_SHOWN = frozenset(
+    (
+        *("geom_size", "geom_rgba", "geom_matid", "geom_group", "geom_type"),
+        *("geom_dataid", "geom_rbound", "geom_bodyid", "geom_castshadow"),
+        *("body_weldid", "mesh_graphadr", "mesh_texcoordadr"),
+        *("site_size", "site_rgba", "site_matid", "site_group", "site_type"),
+        *("site_bodyid", "site_dataid"),
+        *("mat_rgba", "mat_emission", "mat_specular", "mat_shininess"),
+        *("mat_reflectance", "mat_metallic", "mat_roughness"),
+        *("mat_texid", "mat_texrepeat", "mat_texuniform"),
+        *("light_active", "light_type", "light_texid", "light_castshadow"),
+        *("light_bulbradius", "light_intensity", "light_range", "light_attenuation"),
+        *("light_cutoff", "light_exponent", "light_softness"),
+        *("light_ambient", "light_diffuse", "light_specular"),
+        *("cam_fovy", "cam_ipd", "cam_projection", "cam_sensorsize"),
+        *("cam_intrinsic", "cam_resolution", "cam_output"),
+        *("tendon_rgba", "tendon_width", "tendon_matid", "tendon_group"),
+        *("tendon_num", "tendon_range", "tendon_limited", "tendon_lengthspring"),
+        *("tendon_stiffness", "tendon_stiffnesspoly", "tendon_damping"),
+        *("tendon_dampingpoly", "tendon_frictionloss", "tendon_plasticadr"),
+        *("actuator_trntype", "actuator_trnid", "actuator_cranklength"),
+        *("skin_rgba", "skin_matid", "skin_group", "skin_inflate"),
+        *("skin_bonebindpos", "skin_bonebindquat", "skin_bonebodyid"),
+        *("flex_rgba", "flex_matid", "flex_group", "flex_radius", "flex_flatskin"),
+        *("sensor_type", "sensor_adr", "sensor_objid", "sensor_objtype"),
+        "sensor_intprm",
+    )
 )
-# A short one is compared with the rest, whatever it is.
-_HEAVY_BYTES = 4096
+# Between two that are shown so much of what is not is compared with them.
+_LONGEST_GAP = 512
 
 # Where the structs are looked for: they lie between the sizes, at the beginning of
 # `mjModel`, and the pointers to its arrays.
@@ -48,7 +65,8 @@ _LONGEST_HEAD = 16384
 class ModelMemory:
     """Remembers a model, and tells which of its fields have changed since.
 
-    Any field counts, also those that no picture depends on. The model is kept alive.
+    Any field counts at a reset; in between those that pictures depend on do, but for
+    what is long and has to be uploaded to the graphics card. The model is kept alive.
 
     Args:
         model: the model, which is only read.
@@ -58,8 +76,8 @@ class ModelMemory:
         self.model = model
         self._address = model._address
         pieces = [*_array_pieces(model), _struct_piece(model)]
-        self._light = [piece for piece in pieces if not piece.heavy]
-        self._heavy = [piece for piece in pieces if piece.heavy]
+        self._light = [piece for piece in pieces if piece.is_watched]
+        self._heavy = [piece for piece in pieces if not piece.is_watched]
         # Pairs for the comparison at every captured step.
         self._compared = [(piece.seen, piece.raw) for piece in self._light]
 
@@ -77,19 +95,24 @@ class ModelMemory:
         names = [name for piece in pieces for name in piece.look_from_stored()]
         return read_fields(self.model, names)
 
+    def is_unchanged(self) -> bool:
+        """Tell whether all that is watched is as it was when last looked at."""
+        # A loop, because a generator for `all` takes as long again.
+        for seen, raw in self._compared:  # noqa: SIM110
+            if seen != raw:
+                return False
+        return True
+
     def changed(self) -> dict[str, NDArray[Any]] | None:
-        """Return the light fields that are other than when last looked at.
+        """Return the watched fields that are other than when last looked at.
 
         Returns:
             Copies by their names; None, in a microsecond, where all are the same.
         """
-        for seen, raw in self._compared:
-            if seen != raw:
-                return self._looked_at(self._light)
-        return None
+        return None if self.is_unchanged() else self._looked_at(self._light)
 
     def anything_changed(self) -> dict[str, NDArray[Any]] | None:
-        """Return what `changed` does, of all fields: textures and meshes as well."""
+        """Return what `changed` does, of all fields: textures, meshes, masses ..."""
         return self._looked_at([*self._light, *self._heavy])
 
     def _looked_at(self, pieces: Iterable[_Piece]) -> dict[str, NDArray[Any]] | None:
@@ -102,20 +125,22 @@ class _Piece:
 
     Args:
         memory: a `Memory`, or the `Members` that stand in for one.
-        heavy: long, and a single array; one copy is kept of it until it changes.
+        is_watched: compared at every captured step; of others one copy is kept until
+            they change.
     """
 
-    def __init__(self, memory: Memory | Members, *, heavy: bool = False) -> None:
-        self.heavy = heavy
+    def __init__(self, memory: Memory | Members, *, is_watched: bool = True) -> None:
+        self.is_watched = is_watched
         self.raw = memory.raw
         self._memory = memory
         self._stored = memory.copy()
-        self.seen = self._stored if heavy else memory.copy()
+        self.seen = memory.copy() if is_watched else self._stored
 
     def look_from_stored(self) -> list[str]:
         """Return the names of what is other than when this was made."""
         if self._stored == self.raw:
-            self._see(self._stored)
+            if self.seen != self._stored:
+                self._see(self._stored)
             return []
         self._see(self._memory.copy())
         return self._memory.differing(self._stored)
@@ -129,29 +154,43 @@ class _Piece:
         return names
 
     def _see(self, present: bytearray) -> None:
-        if self.heavy:
-            self.seen = present
-        else:
+        if self.is_watched:
             # In place: `ModelMemory` holds it.
             self.seen[:] = present
+        else:
+            self.seen = present
 
 
 def _array_pieces(model: mujoco.MjModel) -> Iterator[_Piece]:
     """Yield pieces of memory that together hold all arrays."""
     arrays = _arrays_by_address(model)
-    together = _lie_together(model, arrays)
-    run: list[tuple[str, NDArray[Any]]] = []
+    if not _lie_together(model, arrays):
+        for name, array in arrays:
+            yield _Piece(_memory_of([(name, array)]), is_watched=name in _SHOWN)
+        return
+    watched: list[tuple[str, NDArray[Any]]] = []
+    unwatched: list[tuple[str, NDArray[Any]]] = []
     for name, array in arrays:
-        heavy = name in _HEAVY_NAMES and array.nbytes > _HEAVY_BYTES
-        if run and (heavy or not together):
-            yield _Piece(_memory_of(run))
-            run = []
-        if heavy:
-            yield _Piece(_memory_of([(name, array)]), heavy=True)
+        if name not in _SHOWN:
+            unwatched.append((name, array))
+            continue
+        if watched and sum(each.nbytes for _, each in unwatched) <= _LONGEST_GAP:
+            watched += unwatched
         else:
-            run.append((name, array))
-    if run:
-        yield _Piece(_memory_of(run))
+            yield from _pieces(watched, unwatched)
+            watched = []
+        watched.append((name, array))
+        unwatched = []
+    yield from _pieces(watched, unwatched)
+
+
+def _pieces(
+    watched: list[tuple[str, NDArray[Any]]], unwatched: list[tuple[str, NDArray[Any]]]
+) -> Iterator[_Piece]:
+    if watched:
+        yield _Piece(_memory_of(watched))
+    if unwatched:
+        yield _Piece(_memory_of(unwatched), is_watched=False)
 
 
 def _arrays_by_address(model: mujoco.MjModel) -> list[tuple[str, NDArray[Any]]]:

@@ -99,6 +99,8 @@ class PictureStates:
     Attributes:
         layout: of the snapshots.
         view: as given.
+        source: of the snapshots themselves.
+        stand_alone: no picture has an influence on the next.
     """
 
     def __init__(
@@ -116,8 +118,9 @@ class PictureStates:
         self._model = model
         self._data = data
         self._kept = kept
+        self.stand_alone = kept is None
         self._checked = checked
-        self._source = SnapshotSource(model, data, self.layout)
+        self.source = SnapshotSource(model, data, self.layout)
         self._watched = ViewMemory(view)
         self._facts = view.facts()
         # Moved as pictures move it; the environment's own stays where it is.
@@ -174,12 +177,12 @@ class PictureStates:
         if reason is not None or self.is_sound(changed_fields):
             return reason
         row = np.empty(self.layout.size, np.uint8)
-        self._source.take(row)
+        self.source.take(row)
         return self._difference(row, changed_fields)
 
     def take(self, out: NDArray[np.uint8]) -> dict[str, NDArray[Any]] | None:
         """Write a snapshot into `out`, and return what of the view has changed."""
-        self._source.take(out)
+        self.source.take(out)
         changed = self._watched.changed()
         if changed is not None:
             self._has_moved = True

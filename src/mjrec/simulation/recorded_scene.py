@@ -16,6 +16,7 @@ from ..errors import InvalidArgument, UnreadableFile
 from ..formats.trajectory import ModelChange
 from ..formats.trajectory_reader import TrajectoryReader
 from .baked_fields import is_kept_by_context
+from .cameras import check_camera
 from .model_fields import apply_fields
 from .model_store import load_model
 from .scene_view import SceneView, scene_view_from_facts
@@ -54,7 +55,8 @@ class RecordedScene:
         try:
             self.view: SceneView = scene_view_from_facts(facts["scene"])
             self.previous_cameras = _positions(facts["scene"].get("previous_cameras"))
-        except (InvalidArgument, AttributeError) as error:
+        # Not all that NumPy and the bindings refuse is looked for.
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
             raise UnreadableFile(reader.path, f"of its scene: {error}") from error
         if not isinstance(facts.get("model"), dict):
             raise UnreadableFile(reader.path, "it does not say which model it is of")
@@ -81,6 +83,7 @@ class RecordedScene:
         """
         try:
             changed = self._change_model(int(self._reader.frame_steps[index]))
+            check_camera(self.model, self.view.camera)
             restore_snapshot(self._values_of(index), self.model, self.data)
         except InvalidArgument as error:
             raise UnreadableFile(self._reader.path, error) from error

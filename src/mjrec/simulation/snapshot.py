@@ -31,6 +31,7 @@ __all__ = [
 # Not an array of `MjData`: the colours that tendons have in the picture. They are
 # restored into the model's array of this name.
 _TENDON_RGBA = "tendon_rgba"
+_COLOUR = "<f4"
 
 # Arrays of `MjData` in the order in which it has them: type, the size of the model that
 # is their length, and the numbers in a row.
@@ -73,6 +74,10 @@ _ALWAYS = (
     *("light_xpos", "light_xdir", "subtree_com", "flexvert_xpos"),
     *("ten_wrapadr", "ten_wrapnum", "ten_length", "wrap_obj", "wrap_xpos"),
 )
+# Of these, some are indices of others and of geoms.
+_PATHS = ("ten_wrapadr", "ten_wrapnum", "wrap_obj")
+# In the place of a geom.
+_PULLEY = -2
 _FOR_SKINS = ("xpos", "xquat")
 _BODIES = ("xpos", "xmat", "xipos", "ximat")
 
@@ -124,7 +129,7 @@ def snapshot_layout(
         names.update(_for_option(option))
     arrays = [(name, _array(model, name)) for name in _ARRAYS if name in names]
     if has_limited_tendons(model):
-        arrays.append((_TENDON_RGBA, Array("<f4", (model.ntendon, 4))))
+        arrays.append((_TENDON_RGBA, Array(_COLOUR, (model.ntendon, 4))))
     return RowLayout.packed((name, array) for name, array in arrays if array.size)
 
 
@@ -162,19 +167,45 @@ def restore_snapshot(
         data: its data.
 
     Raises:
-        InvalidArgument: an array is not there, or has another shape.
+        InvalidArgument: an array is not there, is of another kind, or leads to where
+            the model has nothing, which MuJoCo would not notice.
     """
     for name, value in values.items():
         target = model if name == _TENDON_RGBA else data
-        known = name == _TENDON_RGBA or name in _ARRAYS
-        present = getattr(target, name, None) if known else None
-        if present is None or present.shape != value.shape:
+        dtype = _COLOUR if name == _TENDON_RGBA else _ARRAYS.get(name, ("",))[0]
+        present = getattr(target, name, None) if dtype else None
+        if (
+            present is None
+            or present.shape != value.shape
+            or value.dtype != np.dtype(dtype)
+        ):
             shape = None if present is None else present.shape
             raise InvalidArgument(
-                f"The snapshot's {name} has the shape {value.shape}, and here it is "
-                f"{shape}: it belongs to another model or version of MuJoCo."
+                f"The snapshot's {name} is {value.dtype} of the shape {value.shape}, "
+                f"and here it is {dtype or None} of the shape {shape}: it belongs to "
+                "another model or version of MuJoCo."
             )
         present[...] = value
+    if not values.keys().isdisjoint(_PATHS):
+        _check_paths(model, data)
+
+
+def _check_paths(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Check what the visualiser follows, unseen, along a tendon."""
+    first, count = data.ten_wrapadr.astype(np.int64), data.ten_wrapnum
+    points, wrapped = 2 * model.nwrap, data.wrap_obj
+    ends = first + count
+    if ((count < 0) | (first < 0) | (ends > points))[count != 0].any():
+        raise InvalidArgument(
+            f"The snapshot's tendons run over points up to {ends.max()}, and this "
+            f"model has {points}."
+        )
+    if wrapped.size and (wrapped.min() < _PULLEY or wrapped.max() >= model.ngeom):
+        raise InvalidArgument(
+            f"The snapshot's wrap_obj holds geoms from {_PULLEY} (a pulley) and -1 (a "
+            f"site) to {model.ngeom - 1} in this model, and there are some from "
+            f"{wrapped.min()} to {wrapped.max()}."
+        )
 
 
 class SnapshotSource:

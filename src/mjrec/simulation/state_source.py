@@ -52,11 +52,10 @@ class StateSource(Protocol):
     def begin_episode(self) -> EpisodeStart:
         """Return what is there now, just after a reset."""
 
-    def capture_state(self, out: NDArray[np.uint8]) -> None:
-        """Write the state of this moment into `out`.
+    def capture_state(self) -> memoryview:
+        """Return the state of this moment, as bytes.
 
-        Args:
-            out: `(8 * the numbers of a state,)`, contiguous.
+        They stay until the next call, which overwrites them.
         """
 
     def capture_snapshot(
@@ -71,6 +70,9 @@ class StateSource(Protocol):
             Model and view fields that are other than at the capture before (or at the
             beginning of the episode); None, which is usual, where all are the same.
         """
+
+    def changed_fields(self) -> Mapping[str, NDArray[Any]] | None:
+        """Return what `capture_snapshot` returns, without a snapshot."""
 
     def model_changed(self) -> None:
         """Note that anything in the model may be another; the next capture looks."""
