@@ -107,6 +107,9 @@ def test_all_fields_have_names(model: mujoco.MjModel) -> None:
         ("geom_type", np.array([7]), "what the model consists of"),
         ("geom_matid", np.array([2]), "indices from -1 to 1"),
         ("geom_matid", np.array([-2]), "indices from -1 to 1"),
+        ("geom_matid", np.array([np.nan]), "whole numbers"),
+        ("vis.quality.shadowsize", np.array(np.nan), "whole numbers"),
+        ("vis.quality.shadowsize", np.array(2**40), "cannot be 1099511627776"),
     ],
 )
 def test_what_cannot_be_set_is_refused(

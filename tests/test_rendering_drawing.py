@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import random
 from collections.abc import Iterator
@@ -226,6 +227,31 @@ def test_facts_that_cannot_be(tmp_path: Path, facts: dict[str, Any]) -> None:
     ride = record(tmp_path, facts=facts)
     with pytest.raises(UnreadableFile, match="Cannot read"):
         TrajectoryDrawing(ride.path, View())
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"type": 1, "trackbodyid": 10**6},
+        {"type": 2, "fixedcamid": -7},
+        {"type": 77},
+        {"type": 2**40},
+        {"type": float("nan")},
+    ],
+)
+def test_a_recorded_camera_that_the_model_lacks(
+    ride: Ride, tmp_path: Path, members: dict[str, Any]
+) -> None:
+    """Also that is told of the file, and no worker falls over it."""
+    scene = scene_of(ride)
+    scene["camera"] = {**scene["camera"], **members}
+    path = record(tmp_path, facts={"scene": scene}).path
+
+    with (
+        pytest.raises(UnreadableFile, match="camera"),
+        contextlib.closing(TrajectoryDrawing(path, View())) as drawing,
+    ):
+        drawing.draw(0)
 
 
 def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:

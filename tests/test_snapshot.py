@@ -176,6 +176,38 @@ def test_a_restored_snapshot_gives_the_same_scene(xml: str) -> None:
     assert differences_of(*simulated(xml)) == []
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("ten_wrapadr", 10**8, "run over points"),
+        ("ten_wrapadr", -1, "run over points"),
+        ("ten_wrapadr", 2**31 - 1, "run over points"),
+        ("ten_wrapnum", 10**8, "run over points"),
+        ("ten_wrapnum", -5, "run over points"),
+        ("wrap_obj", 10**8, "holds geoms"),
+        ("wrap_obj", -3, "holds geoms"),
+    ],
+)
+def test_a_tendon_that_leads_nowhere_is_refused(
+    name: str, value: int, words: str
+) -> None:
+    """A file may be hostile, and MuJoCo would read foreign memory."""
+    model, data = simulated(TENDONS)
+    values = row_of(model, data, None)
+    values[name] = np.full_like(values[name], value)
+    with pytest.raises(InvalidArgument, match=words):
+        restore_snapshot(values, model, data)
+
+
+def test_numbers_of_another_kind_are_refused() -> None:
+    """What is not a number would become some index."""
+    model, data = simulated(TENDONS)
+    values = row_of(model, data, None)
+    values["ten_wrapadr"] = np.full(model.ntendon, np.nan)
+    with pytest.raises(InvalidArgument, match="ten_wrapadr is float64"):
+        restore_snapshot(values, model, data)
+
+
 def test_a_skin_is_restored() -> None:
     """Skins follow positions and orientations of bodies, which nothing else does."""
     model = mujoco.MjModel.from_xml_path(str(ASSETS / "showcase.xml"))

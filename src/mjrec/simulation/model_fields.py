@@ -171,10 +171,13 @@ def _set(struct: object, name: str, value: NDArray[Any], *, field: str) -> None:
         holder = getattr(holder, part)
     present = getattr(holder, last)
     value = np.asarray(value)
-    # What is not a number would pass for any index.
     is_whole = np.asarray(present).dtype.kind in "iub"
-    kinds = "iub" if is_whole else "iufb"
-    if np.shape(present) != value.shape or value.dtype.kind not in kinds:
+    if (
+        np.shape(present) != value.shape
+        or value.dtype.kind not in "iufb"
+        # NaN would pass for any index.
+        or (is_whole and not (np.floor(value) == value).all())
+    ):
         raise InvalidArgument(
             f"The model field {field} is {'whole ' * is_whole}numbers of the shape "
             f"{np.shape(present)} here, and the recorded one is {value.dtype} of the shape {value.shape}: "
