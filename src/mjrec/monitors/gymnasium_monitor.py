@@ -94,15 +94,16 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         Raises:
             ResetNeeded: before the first reset, or after the end of an episode.
         """
-        if self._recorder.closed:
+        recorder = self._recorder
+        if recorder.closed:
             return self.env.step(action)
-        if self._recorder.done and self._next_step_autoreset:
+        if self._next_step_autoreset and recorder.done:
             return self._reset_by_step(action)
-        self._recorder.before_step(action)
+        recorder.before_step(action)
         result = self.env.step(action)
         observation, reward, terminated, truncated, _ = result
         resets_itself = self._same_step_autoreset and bool(terminated or truncated)
-        self._recorder.step(
+        recorder.step(
             reward,
             terminated=terminated,
             truncated=truncated,

@@ -175,6 +175,8 @@ class Recorder:
         self._unfinished: list[Path] = []
         self._said: set[str] = set()
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
+        # The same, where it is drawn live.
+        self._live_video: VideoRecorder | None = None
         self.closed = False
 
     @property
@@ -231,7 +233,8 @@ class Recorder:
             ResetNotAllowed: in mid-episode, unless early resets are allowed.
             Error: in a process forked from the one that made the recorder.
         """
-        self._check_process()
+        if os.getpid() != self._pid:
+            self._refuse_process()
         self.stats_recorder.before_reset()
         if not self._is_unbegun():
             self._take_last_picture()
@@ -278,7 +281,8 @@ class Recorder:
             ResetNeeded: before the first reset, or after the end of an episode.
             Error: in a process forked from the one that made the recorder.
         """
-        self._check_process()
+        if os.getpid() != self._pid:
+            self._refuse_process()
         self.stats_recorder.before_step()
         if self._trajectory is not None:
             self._trajectory.before_step(action)
@@ -399,18 +403,12 @@ class Recorder:
                 self.directory,
             )
 
-    def _check_process(self) -> None:
-        if os.getpid() != self._pid:
-            raise Error(
-                f"This monitor belongs to process {self._pid}, and this is "
-                f"{os.getpid()}, forked from it. Two processes cannot write the same "
-                "files: make the monitor inside the process that uses it."
-            )
-
-    @property
-    def _live_video(self) -> VideoRecorder | None:
-        video = self.video_recorder
-        return video if isinstance(video, VideoRecorder) else None
+    def _refuse_process(self) -> None:
+        raise Error(
+            f"This monitor belongs to process {self._pid}, and this is {os.getpid()}, "
+            "forked from it. Two processes cannot write the same files: make the "
+            "monitor inside the process that uses it."
+        )
 
     def _is_unbegun(self) -> bool:
         """Whether the running episode has had its reset only."""
@@ -424,8 +422,7 @@ class Recorder:
         if self._states is not None and (keeps or deferred):
             start = self._states.begin_episode()
             deferred = deferred and self._can_be_deferred(start)
-        self._trajectory = None
-        self.video_recorder = None
+        self._trajectory = self._live_video = self.video_recorder = None
         if keeps or deferred:
             self._trajectory = self._new_trajectory(
                 episode_id,
@@ -456,6 +453,7 @@ class Recorder:
             facts=self._subject.pictures.facts,
         )
         if recorder.enabled:
+            self._live_video = recorder
             self._subject.pictures.begin_episode()
         recorder.capture_frame()
 

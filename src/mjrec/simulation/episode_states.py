@@ -78,6 +78,7 @@ class EpisodeStates:
         self._pictures: PictureStates | None = None
         self._refusal: str | None = None
         self._look_at_everything = False
+        self._quick: _QuickCapture | None = None
         # As `simulation` gave them last; they may be dm_control's wrappers.
         self._seen: tuple[Any, Any] = (None, None)
 
@@ -104,6 +105,9 @@ class EpisodeStates:
         pictures = self._episode_pictures(stored, fields)
         self._refusal = self._reason_against(pictures, fields)
         refused = self._refusal is not None
+        self._quick = None
+        if self._is_unmoved is not None and pictures.stand_alone and not refused:
+            self._quick = _QuickCapture(self._is_unmoved, stored.memory, pictures)
         return EpisodeStart(
             state=stored.components,
             snapshot=RowLayout() if refused else pictures.layout,
@@ -139,6 +143,11 @@ class EpisodeStates:
             PicturesDiffer: the picture of this moment cannot be made from a snapshot,
                 which was possible when the episode began.
         """
+        quick = self._quick
+        if quick is not None and not self._look_at_everything and quick.is_same():
+            # The usual case, in half the time of the others.
+            quick.take(out)
+            return None
         model, data = self._simulation()
         if model is not self._seen[0] or data is not self._seen[1]:
             self._go_over_to(model, data)
@@ -147,16 +156,6 @@ class EpisodeStates:
             raise _not_begun()
         if self._refusal is not None:
             raise _differs(self._refusal)
-        if (
-            self._is_unmoved is not None
-            and pictures.stand_alone
-            and not self._look_at_everything
-            and self._is_unmoved()
-            and stored.memory.is_unchanged()
-        ):
-            # The usual case, in half the time of the others.
-            pictures.source.take(out)
-            return None
         if self._obstacle is not None and (reason := self._obstacle()) is not None:
             raise _differs(reason)
         if self._at_picture is None:
@@ -189,7 +188,7 @@ class EpisodeStates:
         """Let go of model and data; idempotent. What waits is still stored."""
         if self._store is not None:
             self._store.leave()
-        self._stored = self._pictures = None
+        self._stored = self._pictures = self._quick = None
         self._seen = (None, None)
 
     def _stored_model(
@@ -257,6 +256,7 @@ class EpisodeStates:
         if not stored.memory.is_of(raw_model(model)):
             raise _differs("the environment has gone over to another model")
         stored.follow(raw_data(data))
+        self._quick = None
         self._pictures = stored.pictures(pictures.view)
         self._seen = (model, data)
 
@@ -310,6 +310,28 @@ class _StoredModel:
         if self._kept is None and moves_cameras(self._model, view):
             self._kept = KeptCameras(self._model)
         return self._kept
+
+
+class _QuickCapture:
+    """Takes snapshots of an episode for as long as only its state changes.
+
+    Attributes:
+        take: writes a snapshot.
+    """
+
+    def __init__(
+        self,
+        is_unmoved: Callable[[], bool],
+        memory: ModelMemory,
+        pictures: PictureStates,
+    ) -> None:
+        self._is_unmoved = is_unmoved
+        self._memory = memory
+        self.take = pictures.source.take
+
+    def is_same(self) -> bool:
+        """Tell whether view and model are as they were at the capture before."""
+        return self._is_unmoved() and self._memory.is_unchanged()
 
 
 def _called_in(around: Callable[[Callable[[], None]], None], do: Callable[[], T]) -> T:
