@@ -27,7 +27,9 @@ from mjrec import Monitor, clear_monitor_files, iter_episodes
 from mjrec.commands import main
 from mjrec.formats.monitor_directory import Infix
 from mjrec.rendering import again, crew
+from mjrec.rendering.again import Variant
 from mjrec.rendering.pending import EpisodeKey, claim
+from mjrec.rendering.progress import Progress
 from mjrec.rendering.views import View
 
 VIDEO = "openaigym.video.0.7.video000000"
@@ -181,6 +183,36 @@ def test_another_view_is_a_new_file_beside_the_original(
     )
     clear_monitor_files(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_every_variant_has_a_name_of_its_own() -> None:
+    """Also where a camera is called as a quality, a size or a rate would be."""
+    cameras: list[str | int] = ["side", 0]
+    cameras += ["draft", "full", "64x32", "x32", "max10fps", "10fps", "camera-draft"]
+    variants = [
+        *(Variant(view=View(camera=camera)) for camera in cameras),
+        *(Variant(view=View(quality=quality)) for quality in ("draft", "full")),
+        Variant(view=View(width=64, height=32)),
+        Variant(view=View(height=32)),
+        Variant(max_fps=10),
+        Variant(fps=10),
+    ]
+    path = Path("openaigym.trajectory.0.7.episode000000.h5")
+    names = {variant.name_for(path) for variant in variants}
+    assert len(names) == len(variants)
+    assert f"{VIDEO}.camera-draft.mp4" in names
+    assert f"{VIDEO}.side.mp4" in names
+
+
+def test_progress_ends_with_all_that_was_chosen(
+    tmp_path: Path, painter: Painter
+) -> None:
+    """Also where frames are left out, and where a video fails."""
+    paths = [write_finished(tmp_path, 0), write_finished(tmp_path, 1, frames=False)]
+    seen: list[Progress] = []
+    variant = Variant(max_fps=10)
+    list(again.render_again(paths, variant, workers=1, on_progress=seen.append))
+    assert seen[-1] == Progress(videos_done=2, videos=2, frames_done=3, frames=3)
 
 
 def test_readers_still_find_the_original(

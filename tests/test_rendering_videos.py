@@ -196,7 +196,10 @@ def test_no_frames_is_an_error_with_its_reason(
 
 @pytest.mark.parametrize(
     "name",
-    ["../x.mp4", "/x.mp4", "x.mp4", f"{STEM}.meta.json", STEM[:-1] + "1.mp4", 5, None],
+    [
+        *("../x.mp4", "/x.mp4", "x.mp4", f"{STEM}.meta.json", STEM[:-1] + "1.mp4"),
+        *(f"{STEM}.side.mp4", 5, None),
+    ],
 )
 def test_a_trajectory_writes_no_video_but_its_own(name: Any, tmp_path: Path) -> None:
     """What a file says it is to be called may come from anybody."""

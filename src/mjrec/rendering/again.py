@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 import urllib.parse
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -10,16 +12,22 @@ from fractions import Fraction
 from pathlib import Path
 
 from ..errors import Error, InvalidArgument
-from ..formats.trajectory_file import open_trajectory
 from ..rates import to_rate
 from .outcomes import Outcome
 from .pending import EpisodeKey
 from .progress import Progress
+from .recorded_facts import open_for_rendering
+from .recorded_pictures import chosen_frames
 from .videos import render_video
 from .views import View
 from .workers import DrawingWorkers
 
 __all__ = ["Variant", "render_again"]
+
+logger = logging.getLogger(__name__)
+
+# Names of cameras that would be taken for another part of a file's name.
+_AMBIGUOUS = re.compile(r"full|draft|\d*x\d*|.*fps|camera-.*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,14 +56,15 @@ class Variant:
         """Return the name of the video that shows an episode this way.
 
         It is the original's with what is other before its extension, such as
-        `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. Readers of a
+        `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. A camera whose
+        name could be another of these parts is there as `camera-draft`. Readers of a
         directory never take it for the original, and those who clear the directory
         remove it too.
         """
         view = self.view
         size = "x".join(str(side or "") for side in (view.width, view.height))
         parts = (
-            "" if view.camera is None else _as_name(str(view.camera)),
+            "" if view.camera is None else _camera_name(str(view.camera)),
             "" if size == "x" else size,
             view.quality or "",
             "" if self.max_fps is None else f"max{_rate_name(self.max_fps)}fps",
@@ -93,33 +102,52 @@ def render_again(
     """
     paths = list(trajectories)
     outs = [_out_for(path, variant, out, alone=len(paths) == 1) for path in paths]
-    now = Progress(videos=len(paths), frames=sum(map(_frame_count, paths)))
+    counts = [_frame_count(path, variant) for path in paths]
+    now = Progress(videos=len(paths), frames=sum(counts))
 
-    def count(**more: int) -> None:
+    def count_frame() -> None:
         nonlocal now
-        now = replace(now, **{name: getattr(now, name) + more[name] for name in more})
+        now = replace(now, frames_done=now.frames_done + 1)
         on_progress(now)
 
     with DrawingWorkers(workers) as crew:
-        for trajectory, video in zip(paths, outs, strict=True):
-            outcome = Outcome(name=video.name, directory=video.parent)
-            try:
-                file = render_video(
-                    trajectory,
-                    workers=crew,
-                    view=variant.view,
-                    max_fps=variant.max_fps,
-                    fps=variant.fps,
-                    out=video,
-                    on_frame=lambda: count(frames_done=1),
-                )
-            except (Error, OSError) as error:
-                outcome = replace(outcome, failure=str(error))
-            else:
-                frame_count = 0 if file is None else file.frame_count
-                outcome = replace(outcome, is_video=True, frame_count=frame_count)
-            count(videos_done=1)
+        for place, (trajectory, video) in enumerate(zip(paths, outs, strict=True), 1):
+            outcome = _render(
+                trajectory, variant, video, workers=crew, on_frame=count_frame
+            )
+            # Also the frames that were not drawn: nobody waits for them any more.
+            now = replace(now, videos_done=place, frames_done=sum(counts[:place]))
+            on_progress(now)
             yield outcome
+
+
+def _render(
+    trajectory: Path,
+    variant: Variant,
+    video: Path,
+    *,
+    workers: DrawingWorkers,
+    on_frame: Callable[[], object],
+) -> Outcome:
+    """Render one, and return what became of it."""
+    outcome = Outcome(name=video.name, directory=video.parent)
+    try:
+        file = render_video(
+            trajectory,
+            workers=workers,
+            view=variant.view,
+            max_fps=variant.max_fps,
+            fps=variant.fps,
+            out=video,
+            on_frame=on_frame,
+        )
+    except (Error, OSError) as error:
+        return replace(outcome, failure=str(error))
+    except Exception as error:
+        logger.exception("%s cannot be rendered.", trajectory.name)
+        return replace(outcome, failure=f"{type(error).__name__}: {error}")
+    frame_count = 0 if file is None else file.frame_count
+    return replace(outcome, is_video=True, frame_count=frame_count)
 
 
 def _out_for(
@@ -148,10 +176,12 @@ def _out_for(
     return out
 
 
-def _frame_count(trajectory: Path) -> int:
+def _frame_count(trajectory: Path, variant: Variant) -> int:
     try:
-        with open_trajectory(trajectory) as reader:
-            return reader.frame_count
+        with open_for_rendering(trajectory) as reader:
+            facts = reader.header.facts
+            chosen = chosen_frames(reader.frame_count, facts, variant.max_fps)
+            return len(chosen.indices)
     except Error:
         # It is told when its turn comes.
         return 0
@@ -159,6 +189,11 @@ def _frame_count(trajectory: Path) -> int:
 
 def _rate_name(rate: float | Fraction) -> str:
     return _as_name(f"{float(rate):g}")
+
+
+def _camera_name(camera: str) -> str:
+    name = _as_name(camera)
+    return f"camera-{name}" if _AMBIGUOUS.fullmatch(name) else name
 
 
 def _as_name(text: str) -> str:

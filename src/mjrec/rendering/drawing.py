@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InvalidArgument
-from ..formats.trajectory_file import open_trajectory
 from ..frames import Frame
 from ..simulation.cameras import Camera, camera_from_members
 from ..simulation.given_states import GivenStates
 from ..simulation.mujoco_warnings import log_mujoco_warnings
 from ..simulation.recorded_scene import RecordedScene
 from ..simulation.renderer import SceneRenderer
+from .recorded_facts import open_for_rendering
 from .recorded_pictures import check_has_pictures
 from .views import PlainCamera, View
 
@@ -64,7 +64,7 @@ class TrajectoryDrawing:
     """
 
     def __init__(self, path: Path, view: View) -> None:
-        self._reader = open_trajectory(path)
+        self._reader = open_for_rendering(path)
         try:
             check_has_pictures(self._reader)
             scene = RecordedScene(self._reader)
@@ -241,9 +241,8 @@ def _camera(model: Any, camera: PlainCamera) -> Camera:
     return camera
 
 
-def _recorded_quality(facts: Mapping[str, Any]) -> str:
-    video = facts.get("video")
-    return video.get("quality", "full") if isinstance(video, dict) else "full"
+def _recorded_quality(facts: Mapping[str, Any]) -> Any:
+    return (facts.get("video") or {}).get("quality", "full")
 
 
 def _or(value: Any, otherwise: Any) -> Any:

@@ -110,7 +110,7 @@ class EpisodeFinisher:
         """Add an episode, and return whether there is anything to do about it."""
         try:
             episode = look_at(self._directory, key)
-        except Error:
+        except (Error, OSError):
             # The same again when its turn comes, which is when it is told.
             episode = None
         else:

@@ -27,7 +27,8 @@ from ..formats.monitor_directory import (
     video_lock_name,
     video_prefix,
 )
-from ..formats.trajectory_file import find_trajectory, open_trajectory
+from ..formats.trajectory_file import find_trajectory
+from .recorded_facts import open_for_rendering
 from .rendered_manifests import is_done
 from .videos import video_path
 
@@ -110,7 +111,9 @@ def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
     does not say how it ended, and somebody holds the monitor's lock.
 
     Raises:
-        UnreadableFile: its trajectory is damaged, or of a newer format.
+        UnreadableFile: its trajectory is damaged, or of a newer format, or says what
+            cannot be.
+        OSError: its monitor's lock cannot be looked at.
     """
     trajectory = find_trajectory(directory, key.infix, key.episode_id)
     if trajectory is None:
@@ -119,7 +122,7 @@ def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
     if not is_log and is_done(directory / key.video_name):
         # Most of a directory is done, and need not be opened.
         return None
-    with open_trajectory(trajectory) as reader:
+    with open_for_rendering(trajectory) as reader:
         facts = reader.header.facts
         if is_log and "complete" not in facts and _is_open(directory, key.infix):
             return None
@@ -133,7 +136,7 @@ def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
             trajectory=trajectory.with_suffix(".log") if is_log else trajectory,
             video=video,
             frame_count=0 if video is None else reader.frame_count,
-            is_kept=bool(facts.get("kept", True)),
+            is_kept=facts.get("kept", True),
             model_file=_model_file(directory, facts),
         )
 
@@ -167,4 +170,4 @@ def _model_file(directory: Path, facts: Mapping[str, Any]) -> Path | None:
     """Return what comes first of a model; what it was made from may never come."""
     model = facts.get("model") or {}
     name = model.get("mjb") or model.get("xml")
-    return directory / Path(name).name if isinstance(name, str) else None
+    return None if name is None else directory / name

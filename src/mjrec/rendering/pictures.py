@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import ArrayLike
 
 from ..errors import InvalidArgument
-from ..formats.trajectory_file import open_trajectory
 from ..frames import Frame
+from .recorded_facts import open_for_rendering
 from .recorded_pictures import check_has_pictures, chosen_frames
 from .views import View, plain_camera
 from .workers import DrawingWorkers
@@ -84,11 +84,11 @@ def render(
         width=width,
         quality=quality,
     )
-    with open_trajectory(path) as reader:
+    with open_for_rendering(path) as reader:
         check_has_pictures(reader)
-        indices = chosen_frames(reader.frame_count, reader.header.facts, max_fps)
+        chosen = chosen_frames(reader.frame_count, reader.header.facts, max_fps)
     pool = DrawingWorkers(workers)
-    return _Pictures(pool, lambda: pool.frames(path, indices, view))
+    return _Pictures(pool, lambda: pool.frames(path, chosen.indices, view))
 
 
 def render_states(

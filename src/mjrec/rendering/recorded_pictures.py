@@ -5,13 +5,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import InvalidArgument, NoPictures
 from ..formats.trajectory_reader import TrajectoryReader
 from ..rates import stride_for, to_rate
 
-__all__ = ["check_has_pictures", "chosen_frames"]
+__all__ = ["ChosenFrames", "check_has_pictures", "chosen_frames", "recorded_rate"]
+
+
+class ChosenFrames(NamedTuple):
+    """Some of a trajectory's pictures.
+
+    Attributes:
+        indices: their numbers.
+        every: the usual number of pictures from one to the next.
+    """
+
+    indices: list[int]
+    every: int
 
 
 def check_has_pictures(reader: TrajectoryReader) -> None:
@@ -30,29 +42,47 @@ def check_has_pictures(reader: TrajectoryReader) -> None:
 
 def chosen_frames(
     count: int, facts: Mapping[str, Any], max_fps: float | Fraction | None
-) -> list[int]:
-    """Return the numbers of the recorded pictures that are no more than `max_fps`.
+) -> ChosenFrames:
+    """Return which of the recorded pictures are no more than `max_fps`.
 
     0, n, 2n ... with the smallest whole n that fits, and always the last.
 
     Args:
         count: how many the recording has.
-        facts: the trajectory's.
+        facts: the trajectory's, checked.
         max_fps: pictures per second of the simulation; None is all there are.
 
     Raises:
         InvalidArgument: `max_fps` is no rate, or the recording does not know its own.
     """
+    every = _every(count, facts, max_fps)
+    last = [count - 1] if count else []
+    return ChosenFrames([*range(0, count - 1, every), *last], every)
+
+
+def _every(
+    count: int, facts: Mapping[str, Any], max_fps: float | Fraction | None
+) -> int:
     if max_fps is None:
-        return list(range(count))
-    wanted = to_rate(max_fps)
-    if facts.get("rate") is None:
+        return 1
+    wanted, recorded = to_rate(max_fps), recorded_rate(facts)
+    if recorded is not None:
+        return stride_for(recorded, wanted)
+    # An episode that ended before its second step has one picture, at any rate.
+    if count > 1:
         raise InvalidArgument(
             "max_fps needs to know how many control steps a second has, and this "
             "recording ended before that was written. Leave max_fps out."
         )
-    recorded = Fraction(facts["rate"]) / int(facts.get("stride") or 1)
-    chosen = list(range(0, count, stride_for(recorded, wanted)))
-    if count and chosen[-1] != count - 1:
-        chosen.append(count - 1)
-    return chosen
+    return 1
+
+
+def recorded_rate(facts: Mapping[str, Any]) -> Fraction | None:
+    """Return how many pictures a second of the simulation has; None if unknown.
+
+    Args:
+        facts: the trajectory's, checked.
+    """
+    if facts.get("rate") is None:
+        return None
+    return Fraction(facts["rate"]) / int(facts.get("stride", 1))

@@ -7,8 +7,7 @@ of workers. The metadata comes last: where it is, the video is there and whole.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,15 @@ from typing import Any
 from .. import json_text
 from ..atomic_files import write_text
 from ..errors import NoPictures, UnreadableFile
-from ..formats.monitor_directory import episode_of, infix_of
-from ..formats.trajectory_file import TrajectoryReader, open_trajectory
+from ..formats.monitor_directory import Infix, episode_of, infix_of, video_prefix
+from ..formats.trajectory_reader import TrajectoryReader
 from ..formats.video_metadata import StepRuns, file_facts, timing_facts
 from ..formats.video_writer import VideoFile, VideoWriter
 from ..frames import Frame
-from ..rates import stride_for, to_rate
+from ..rates import to_rate
 from ..recorder.versions import versions
+from .recorded_facts import open_for_rendering
+from .recorded_pictures import ChosenFrames, chosen_frames, recorded_rate
 from .views import View, plain_camera
 from .workers import DrawingWorkers
 
@@ -68,7 +69,7 @@ def render_video(
         Error: its frames cannot be drawn or encoded.
     """
     view = view or View()
-    with open_trajectory(trajectory) as reader:
+    with open_for_rendering(trajectory) as reader:
         facts = reader.header.facts
         out = video_path(trajectory, facts) if out is None else out
         broken = _what_broke(facts)
@@ -79,19 +80,22 @@ def render_video(
                 )
                 return None
             raise NoPictures(_why_no_pictures(trajectory, facts))
-        chosen = _choose_frames(reader, max_fps=max_fps, fps=fps)
+        chosen = chosen_frames(reader.frame_count, facts, max_fps)
+        stride = facts.get("stride", 1) * chosen.every
+        steps = reader.frame_steps[chosen.indices].tolist()
         episode = _episode_facts(reader)
+    rate = _usual_fps(facts, chosen) if fps is None else to_rate(fps)
     frames = workers.frames(trajectory, chosen.indices, view)
-    file = _write_video(out, frames, fps=chosen.fps, on_frame=on_frame)
+    file = _write_video(out, frames, fps=rate, on_frame=on_frame)
     _write_metadata(
         out,
         {
             **episode,
             **timing_facts(
-                StepRuns(chosen.steps, stride=chosen.stride),
+                StepRuns(steps, stride=stride),
                 fps=file.fps,
                 timestep=_fraction(facts.get("timestep")),
-                stride=chosen.stride,
+                stride=stride,
             ),
             **file_facts(file),
             **_picture_facts(facts, view),
@@ -109,16 +113,14 @@ def video_path(trajectory: Path, facts: Mapping[str, Any]) -> Path:
         UnreadableFile: the trajectory names none, or one that is not its own.
     """
     name = (facts.get("video") or {}).get("name")
-    if isinstance(name, str) and (
-        Path(name).suffix == ".mp4"
-        and infix_of(name) is not None
-        and infix_of(name) == infix_of(trajectory.name)
-        and episode_of(name) == episode_of(trajectory.name)
-    ):
-        return trajectory.with_name(name)
+    infix = Infix.parse(infix_of(trajectory.name) or "")
+    number = episode_of(trajectory.name)
+    own = infix and number is not None and f"{video_prefix(infix, number)}.mp4"
+    if own and name == own:
+        return trajectory.with_name(own)
     raise UnreadableFile(
         trajectory,
-        f"the video that it names, {name!r}, is not that of its own episode",
+        f"the video that it names, {name!r:.200}, is not that of its own episode",
     )
 
 
@@ -127,53 +129,11 @@ def metadata_path(video: Path) -> Path:
     return video.with_suffix(".meta.json")
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Choice:
-    """Which frames of a trajectory are drawn, and how fast they are played.
-
-    Attributes:
-        indices: their numbers among the trajectory's frames.
-        steps: the steps that they were taken after.
-        stride: the usual number of steps from one to the next.
-        fps: of the file.
-    """
-
-    indices: Sequence[int]
-    steps: Sequence[int]
-    stride: int
-    fps: Fraction
-
-
-def _choose_frames(
-    reader: TrajectoryReader,
-    *,
-    max_fps: float | Fraction | None,
-    fps: float | Fraction | None,
-) -> _Choice:
-    facts = reader.header.facts
-    stride = int(facts.get("stride") or 1)
-    rate = _fraction(facts.get("rate"))
-    every = 1 if rate is None else stride_for(rate / stride, max_fps)
-    last = reader.frame_count - 1
-    indices = [*range(0, last, every), last]
-    steps = reader.frame_steps
-    usual = _usual_fps(facts, rate, stride) / every
-    return _Choice(
-        indices=indices,
-        steps=[int(steps[index]) for index in indices],
-        stride=stride * every,
-        fps=usual if fps is None else to_rate(fps),
-    )
-
-
-def _usual_fps(
-    facts: Mapping[str, Any], rate: Fraction | None, stride: int
-) -> Fraction:
-    """Return the rate of a file of all frames."""
+def _usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:
+    """Return the rate at which a second of the file is as long as when recorded."""
     asked = (facts.get("video") or {}).get("fps")
-    if asked is not None:
-        return Fraction(asked)
-    return _RATE_OF_ONE_FRAME if rate is None else rate / stride
+    rate = recorded_rate(facts) if asked is None else Fraction(asked)
+    return (_RATE_OF_ONE_FRAME if rate is None else rate) / chosen.every
 
 
 def _write_video(

@@ -295,14 +295,16 @@ class DrawingWorkers:
         job.waiting.extendleft(reversed(owed))
 
     def _give_up_on_silent(self, job: _Job, position: int) -> None:
-        seat = next(seat for seat in self._seats if position in seat.owes)
-        assert seat.process is not None
+        late = (
+            f"A worker gave no picture {job.indices[position]} of {job} within "
+            f"{_PATIENCE_S:.0f} seconds"
+        )
+        seat = next((seat for seat in self._seats if position in seat.owes), None)
+        if seat is None or seat.process is None:
+            raise Error(f"{late}: none was free for it.")
         last_words = seat.process.last_words()
         self._dismiss(seat)
-        raise Error(
-            f"A worker gave no picture {job.indices[position]} of {job} within "
-            f"{_PATIENCE_S:.0f} seconds, and was ended: {last_words}"
-        )
+        raise Error(f"{late}, and was ended: {last_words}")
 
     def _give_up(self) -> None:
         """Want nothing more of the job there is."""

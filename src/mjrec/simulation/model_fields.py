@@ -180,8 +180,8 @@ def _set(struct: object, name: str, value: NDArray[Any], *, field: str) -> None:
     ):
         raise InvalidArgument(
             f"The model field {field} is {'whole ' * is_whole}numbers of the shape "
-            f"{np.shape(present)} here, and the recorded one is {value.dtype} of the shape {value.shape}: "
-            "it belongs to another model."
+            f"{np.shape(present)} here, and the recorded one is {value.dtype} of the "
+            f"shape {value.shape}: it belongs to another model."
         )
     if name in _INDICES:
         _check_index(struct, name, value)

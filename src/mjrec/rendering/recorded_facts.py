@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories as rendering takes them: with facts that are what they should be.
+
+A trajectory may come from anybody. What is relied on is checked here, once, so that
+everything behind it finds a rate where there should be one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from ..errors import InvalidArgument
+from ..formats.json_fields import (
+    boolean,
+    field,
+    integer,
+    mapping,
+    optional,
+    text,
+    unreadable,
+)
+from ..formats.trajectory_file import TrajectoryReader, open_trajectory
+from ..frames import QUALITIES
+from ..rates import to_rate
+
+__all__ = ["open_for_rendering"]
+
+# Not all that `Fraction` takes: 1e20000000 keeps it busy for a minute.
+_RATE = re.compile(r"\d{1,12}(/\d{1,12})?", re.ASCII)
+# What the user has asked for is written as it was given: 29.97, or a fraction that a
+# float exactly is.
+_ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/\d{1,40})?", re.ASCII)
+_BASE_NAME = re.compile(r"[\w.-]{1,200}", re.ASCII)
+_RECORDINGS = ("deferred", "live")
+_MOST_STEPS_A_FRAME = 10**12
+
+
+def open_for_rendering(path: Path) -> TrajectoryReader:
+    """Open a trajectory, as `open_trajectory` does, and check its facts.
+
+    Afterwards `rate`, `timestep`, `scene`, `model` and `video` are there as they
+    should be, or None, or missing; `stride` and `kept` as they should be, or missing.
+
+    Raises:
+        UnreadableFile: of `open_trajectory`; or a fact is of a kind that it cannot be.
+    """
+    reader = open_trajectory(path)
+    try:
+        with unreadable(path):
+            _check(reader.header.facts)
+    except BaseException:
+        reader.close()
+        raise
+    return reader
+
+
+def _check(facts: Mapping[str, Any]) -> None:
+    for key in ("rate", "timestep"):
+        field(facts, key, optional(_rate), default=None)
+    field(facts, "stride", _stride, default=1)
+    field(facts, "kept", boolean, default=True)
+    for key in ("refusal", "broken_reason", "reason"):
+        field(facts, key, optional(text), default=None)
+    field(facts, "scene", optional(mapping), default=None)
+    field(facts, "model", optional(_model), default=None)
+    field(facts, "video", optional(_video), default=None)
+
+
+def _model(value: Any) -> Mapping[str, Any]:
+    model = mapping(value)
+    for key in ("mjb", "xml"):
+        field(model, key, optional(_base_name), default=None)
+    return model
+
+
+def _video(value: Any) -> Mapping[str, Any]:
+    video = mapping(value)
+    # Whether it is that of its own episode, `video_path` looks at.
+    field(video, "name", text, default="")
+    field(video, "quality", _one_of(*QUALITIES), default="full")
+    field(video, "recording", _one_of(*_RECORDINGS), default="live")
+    for key in ("fps", "max_fps"):
+        field(video, key, optional(_asked_rate), default=None)
+    return video
+
+
+def _rate(value: Any) -> Fraction:
+    if not _RATE.fullmatch(text(value)):
+        raise ValueError(f"{value!r:.80} is no fraction")
+    return _positive(value)
+
+
+def _asked_rate(value: Any) -> Fraction:
+    if not _ASKED_RATE.fullmatch(text(value)):
+        raise ValueError(f"{value!r:.80} is no rate")
+    try:
+        return to_rate(_positive(value))
+    except InvalidArgument as error:
+        raise ValueError(str(error)) from error
+
+
+def _positive(value: str) -> Fraction:
+    _, _, denominator = value.partition("/")
+    if denominator and not int(denominator):
+        raise ValueError(f"{value!r} divides by zero")
+    if not Fraction(value):
+        raise ValueError("it is zero")
+    return Fraction(value)
+
+
+def _base_name(value: Any) -> str:
+    if not _BASE_NAME.fullmatch(text(value)):
+        raise ValueError(f"{value!r:.80} is no file's name")
+    return str(value)
+
+
+def _stride(value: Any) -> int:
+    number = integer(value)
+    if isinstance(value, float) or not 1 <= number <= _MOST_STEPS_A_FRAME:
+        raise ValueError(f"{number!r:.80} is no number of steps")
+    return number
+
+
+def _one_of(*choices: str) -> Any:
+    def choice(value: Any) -> str:
+        if text(value) not in choices:
+            raise ValueError(f"{value!r:.80} is not one of {', '.join(choices)}")
+        return str(value)
+
+    return choice
