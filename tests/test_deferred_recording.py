@@ -469,6 +469,21 @@ def test_recording_does_not_disturb(env_id: str, tmp_path: Path) -> None:
     assert run(make(env_id)) == run(monitored(make(env_id), tmp_path, workers=0))
 
 
+def test_global_random_state_is_left_alone(tmp_path: Path) -> None:
+    """Python's and NumPy's, also where a library is loaded for the first time."""
+    code = (
+        "import random, sys, gymnasium, numpy as np, mjrec\n"
+        "env = gymnasium.make('InvertedPendulum-v5', height=48, width=64)\n"
+        "def state(): return random.getstate(), np.random.get_state()[1].tolist()\n"
+        "before = state()\n"
+        "env = mjrec.Monitor(env, sys.argv[1], workers=1)\n"
+        "env.reset(seed=0); env.step([0.0]); env.close()\n"
+        "assert state() == before\n"
+    )
+    done = run_script(code, tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
 def test_same_pixels_as_the_environment_shows(tmp_path: Path) -> None:
     """Every frame's hash is that of `env.render()` at that moment."""
     frames = shown_by_env("HalfCheetah-v5", 3)

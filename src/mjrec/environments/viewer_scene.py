@@ -67,12 +67,12 @@ class ViewerScene:
         # The same objects for good, because they are watched.
         self._camera = resolve_camera(simulated.model, own)
         self._option = viewer_option()
+        self._labelled: tuple[Any, Any] | None = None
         self._start()
 
     def __call__(self) -> SceneView:
         """Return what is shown from here on; `at_picture` keeps it up to date."""
         self._update()
-        asked = self._camera if self._asked is None else self._asked
         return SceneView(
             camera=self._camera,
             option=self._option,
@@ -80,7 +80,7 @@ class ViewerScene:
             fresh=False,
             height=self._height,
             width=self._width,
-            label=camera_label(self._model, asked),
+            label=self._label(),
         )
 
     def at_picture(self, capture: Callable[[], None]) -> None:
@@ -112,6 +112,14 @@ class ViewerScene:
         if renderer is not None and renderer.model is not self._simulated.model:
             return "the renderer draws another model than the environment simulates"
         return None if viewer is None else _addition(viewer, self._new_flags)
+
+    def _label(self) -> str | int | dict[str, Any]:
+        """Return what metadata calls the camera, which takes a while to find out."""
+        asked = self._camera if self._asked is None else self._asked
+        seen = (self._model, asked, *_pose(self._camera))
+        if self._labelled is None or self._labelled[0] != seen:
+            self._labelled = (seen, camera_label(self._model, asked))
+        return self._labelled[1]
 
     def _start(self) -> None:
         self._model = self._simulated.model
@@ -157,6 +165,14 @@ class ViewerScene:
         # Other modes' viewers have cameras of their own.
         viewers = getattr(self._renderer, "_viewers", None)
         return viewers.get(_MODE) if viewers else None
+
+
+def _pose(camera: Any) -> tuple[Any, ...]:
+    return (
+        *(int(camera.type), camera.fixedcamid, camera.trackbodyid),
+        *(camera.distance, camera.azimuth, camera.elevation),
+        *camera.lookat.tolist(),
+    )
 
 
 def _own_side(simulated: Any, name: str) -> int:

@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 import contextlib
+import random
 import sys
 from collections.abc import Callable, Iterator
 
-import rich.console
-import rich.progress
-
-from ..rendering.render_service import Progress
+from ..rendering.progress import Progress
 
 __all__ = ["waiting_display"]
 
@@ -25,6 +23,10 @@ def waiting_display() -> Iterator[Callable[[Progress], None]]:
     if not sys.stderr.isatty():
         yield _nothing
         return
+    _load_rich()
+    import rich.console
+    import rich.progress
+
     with rich.progress.Progress(
         rich.progress.TextColumn("rendering {task.fields[videos]}"),
         rich.progress.BarColumn(),
@@ -44,6 +46,15 @@ def waiting_display() -> Iterator[Callable[[Progress], None]]:
             )
 
         yield show
+
+
+def _load_rich() -> None:
+    # It draws random numbers when it is imported, and the user's are not ours. Loaded
+    # only where there is a bar to show.
+    state = random.getstate()
+    import rich.progress  # noqa: F401
+
+    random.setstate(state)
 
 
 def _nothing(progress: Progress) -> None:

@@ -7,6 +7,7 @@ settles its OpenGL backend when it is imported.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 __all__ = ["simulation_in", "simulation_time"]
@@ -28,10 +29,16 @@ def simulation_in(env: object) -> Any:
         None where there is no simulation that can be seen.
     """
     base = getattr(env, "unwrapped", env)
-    for holder in (base, *(getattr(base, name, None) for name in _HOLDERS)):
+    for holder in _holders(base):
         if _is_mujocos(holder, "model") and _is_mujocos(holder, "data"):
             return holder
     return None
+
+
+def _holders(base: object) -> Iterator[object]:
+    yield base
+    for name in _HOLDERS:
+        yield getattr(base, name, None)
 
 
 def simulation_time(env: object) -> float | None:
