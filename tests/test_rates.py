@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjrec import InvalidArgument
-from mjrec.rates import MAX_DENOMINATOR, rate_from_timestep, to_rate
+from mjrec.rates import MAX_DENOMINATOR, rate_from_timestep, stride_for, to_rate
 
 
 @pytest.mark.parametrize(
@@ -65,3 +65,28 @@ def test_impossible_timestep_is_an_error(timestep: float) -> None:
     """Time goes forward."""
     with pytest.raises(InvalidArgument, match="timestep"):
         rate_from_timestep(timestep)
+
+
+@pytest.mark.parametrize(
+    ("rate", "max_fps", "stride"),
+    [
+        (Fraction(20), None, 1),
+        (Fraction(20), 60, 1),
+        (Fraction(125), 30, 5),
+        (Fraction(125), 25, 5),
+        (Fraction(125), Fraction(249, 10), 6),
+        (Fraction(200, 3), 30, 3),
+        (Fraction(1, 2), 0.001, 500),
+    ],
+)
+def test_stride_is_the_smallest_that_fits(
+    rate: Fraction, max_fps: Any, stride: int
+) -> None:
+    """Every step, every second, every third ..."""
+    assert stride_for(rate, max_fps) == stride
+
+
+def test_error_names_the_option_that_was_wrong() -> None:
+    """`max_fps` is not `fps`."""
+    with pytest.raises(InvalidArgument, match=r"^max_fps must be"):
+        stride_for(Fraction(20), 0)

@@ -33,6 +33,7 @@ Every message says what was asked, what is there, and what to do.
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -290,10 +291,14 @@ class UnreadableFile(Error):
     def __init__(self, path: Path, reason: object) -> None:
         self.path = path
         self.reason = str(reason)
-        super().__init__(
-            f"Cannot read {path}: {reason}. The other files of its directory are as "
-            "good as before; to read them, move this one away."
+        # Nothing can be moved away that is not there.
+        advice = (
+            " The other files of its directory are as good as before; to read them, "
+            "move this one away."
+            if os.path.lexists(path)
+            else ""
         )
+        super().__init__(f"Cannot read {path}: {reason}.{advice}")
 
 
 class MissingDependency(Error, ImportError):

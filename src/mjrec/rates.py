@@ -17,12 +17,16 @@ __all__ = ["MAX_DENOMINATOR", "rate_from_timestep", "stride_for", "to_rate"]
 MAX_DENOMINATOR = 10**6
 
 
-def to_rate(fps: float | Fraction) -> Fraction:
+def to_rate(fps: float | Fraction, *, name: str = "fps") -> Fraction:
     """Return `fps` frames per second as an exact fraction.
 
     A `Fraction` and an integer are taken as they are. A float is taken as the simplest
     fraction that has the same float value to within a millionth: 29.97 is 2997/100 and
     30000/1001 given as a float is 30000/1001.
+
+    Args:
+        fps: frames per second.
+        name: what the error calls it.
 
     Raises:
         InvalidArgument: `fps` is not a number, is a bool, NaN, infinite, zero or
@@ -30,11 +34,11 @@ def to_rate(fps: float | Fraction) -> Fraction:
     """
     if isinstance(fps, bool) or not isinstance(fps, numbers.Real):
         raise InvalidArgument(
-            f"fps must be a positive number of frames per second, got {fps!r}."
+            f"{name} must be a positive number of frames per second, got {fps!r}."
         )
     if not math.isfinite(fps) or fps <= 0:
         raise InvalidArgument(
-            f"fps must be a positive, finite number of frames per second, got {fps}."
+            f"{name} must be a positive, finite number of frames per second, got {fps}."
         )
     rate = (
         Fraction(fps)
@@ -44,7 +48,7 @@ def to_rate(fps: float | Fraction) -> Fraction:
     )
     if not Fraction(1, 1000) <= rate <= MAX_DENOMINATOR:
         raise InvalidArgument(
-            f"fps must be from 0.001 to {MAX_DENOMINATOR}, got {fps}."
+            f"{name} must be from 0.001 to {MAX_DENOMINATOR}, got {fps}."
         )
     return rate
 
@@ -78,4 +82,4 @@ def stride_for(rate: Fraction, max_fps: float | Fraction | None) -> int:
     """
     if max_fps is None:
         return 1
-    return math.ceil(rate / to_rate(max_fps)) or 1
+    return math.ceil(rate / to_rate(max_fps, name="max_fps")) or 1

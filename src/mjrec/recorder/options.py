@@ -52,9 +52,13 @@ class RecorderOptions:
 
     def __post_init__(self) -> None:
         type_of_mode(self.mode)
-        for rate in (self.fps, self.max_fps):
-            if rate is not None:
-                to_rate(rate)
+        for name in ("fps", "max_fps"):
+            if getattr(self, name) is not None:
+                to_rate(getattr(self, name), name=name)
+        if not isinstance(self.observations, bool):
+            raise InvalidArgument(
+                f"observations must be True or False, got {self.observations!r}."
+            )
         check_quality(self.quality)
         if self.render not in (None, DEFERRED, LIVE, OFF):
             raise InvalidArgument(

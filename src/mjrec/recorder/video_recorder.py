@@ -119,7 +119,7 @@ class VideoRecorder:
         self._declared = declared or (lambda: declared_rate(env))
         self._facts = facts
         self._fps = None if fps is None else to_rate(fps)
-        self._max_fps = None if max_fps is None else to_rate(max_fps)
+        self._max_fps = None if max_fps is None else to_rate(max_fps, name="max_fps")
         self._stride = 1
         self._last_taken = -1
         self._frame_hashes = frame_hashes

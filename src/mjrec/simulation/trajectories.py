@@ -225,6 +225,8 @@ class Trajectory:
 
     def _step(self, step: int) -> int:
         count = len(self.states)
+        if isinstance(step, bool) or not isinstance(step, int | np.integer):
+            raise InvalidArgument(f"A step is a whole number, got {step!r}.")
         if not -count <= step < count:
             raise InvalidArgument(
                 f"{self.path.name} holds {count} states, counted from 0; there is no "
