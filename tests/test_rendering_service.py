@@ -304,6 +304,37 @@ def test_a_server_that_cannot_start_says_why(
     assert "could not be started" in service.failures[log.name]
 
 
+def test_what_libraries_print_disturbs_nobody(
+    tmp_path: Path,
+    start: Callable[..., RenderService],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Be it before the server has begun or in the midst of its work."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, sys\n"
+        "if sys.argv[0] == '-m':\n"
+        "    os.write(1, b'early words\\n[1]\\n')\n"
+        "    import mjrec.rendering.finishing as f\n"
+        "    add = f.EpisodeFinisher.add\n"
+        "    def tell(*a, **k):\n"
+        "        print('late words', flush=True)\n"
+        "        os.write(1, b'half a line')\n"
+        "        return add(*a, **k)\n"
+        "    f.EpisodeFinisher.add = tell\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    service = start()
+    log = write_log(tmp_path, video=None)
+    service.submit(log)
+    with caplog.at_level(logging.WARNING):
+        service.wait()
+    assert service.failures == {}
+    assert finished([log]) == [True]
+    assert "early words" in caplog.text
+    assert "late words" not in caplog.text
+
+
 def test_the_servers_warnings_are_logged_here(
     tmp_path: Path,
     start: Callable[..., RenderService],

@@ -8,12 +8,22 @@ without a guard would run again), cannot be started from daemonic processes, and
 
 from __future__ import annotations
 
+import json
+import logging
 import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-__all__ = ["environment_of_child", "python_command"]
+__all__ = [
+    "environment_of_child",
+    "python_command",
+    "said_in",
+    "take_standard_output",
+]
+
+logger = logging.getLogger(__name__)
 
 
 def python_command(module: str) -> list[str]:
@@ -38,6 +48,30 @@ def environment_of_child(environ: Mapping[str, str]) -> dict[str, str]:
     # What has the separator in its name cannot be said there.
     entries_said = [entry for entry in entries if os.pathsep not in entry]
     return {**environ, "PYTHONPATH": os.pathsep.join(entries_said)}
+
+
+def take_standard_output() -> int:
+    """Return a descriptor of the standard output, for what is said to the parent.
+
+    From here on the standard output is the standard error: libraries and drivers print
+    whenever they like. Children do not get the descriptor.
+    """
+    sys.stdout.flush()
+    descriptor = os.dup(sys.stdout.fileno())
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    return descriptor
+
+
+def said_in(line: bytes) -> dict[str, Any]:
+    """Return what a child has said in a line; nothing if that is no JSON object."""
+    try:
+        said = json.loads(line)
+    except (ValueError, RecursionError):
+        said = None
+    if isinstance(said, dict):
+        return said
+    logger.warning("A process of mjrec's said what is not understood: %.200r", line)
+    return {}
 
 
 def _is_of_main(entry: str) -> bool:

@@ -9,6 +9,8 @@ input it is told the base name of one ended trajectory a line, and at last
     {"done": "<trajectory>", "name": "<video or trajectory>", "failure": null}
     {"log": [30, "..."]}                                for the simulation's log
 
+What libraries print goes to the standard error.
+
 It ends when all is done, and at once, leaving the rest as it is, when its standard
 input ends before: then nobody waits for it any more.
 """
@@ -29,6 +31,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from .child_python import take_standard_output
 from .finishing import EpisodeFinisher
 from .pending import EpisodeKey
 from .progress import Progress
@@ -58,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     workers = None if arguments.workers == "auto" else int(arguments.workers)
     signal.signal(signal.SIGTERM, _stop)
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
-    answers = _Answers(sys.stdout.fileno())
+    answers = _Answers(take_standard_output())
     logging.getLogger().addHandler(_ToSimulation(answers))
     try:
         _Service(arguments.directory, workers, _Inbox(), answers).run()

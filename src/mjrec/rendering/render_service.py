@@ -9,7 +9,6 @@ is told to wait. No thread, no simulator and no OpenGL comes into this process.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import select
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..errors import Error
-from .child_python import environment_of_child, python_command
+from .child_python import environment_of_child, python_command, said_in
 from .cpu_slots import check_workers
 from .progress import Progress
 
@@ -242,7 +241,7 @@ class _Server:
                 # Before anything else is read: an interruption loses no line.
                 while b"\n" in self._unread:
                     line, _, self._unread = self._unread.partition(b"\n")
-                    yield json.loads(line)
+                    yield said_in(line)
 
     def wait_for_news(self, seconds: float) -> None:
         """Wait until it says something or ends, or so many seconds have passed."""

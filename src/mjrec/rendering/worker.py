@@ -34,6 +34,7 @@ from typing import IO, Any
 
 from ..gl import use_gl
 from .carried_errors import carried
+from .child_python import take_standard_output
 from .frame_ring import FrameRing
 
 __all__ = ["main"]
@@ -43,7 +44,7 @@ _NICE = 10
 
 def main() -> None:
     """Draw until the standard input ends."""
-    answers = _Answers(_take_standard_output())
+    answers = _Answers(os.fdopen(take_standard_output(), "wb"))
     logging.getLogger().addHandler(_ToParent(answers))
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
     orders = _Orders()
@@ -164,13 +165,6 @@ class _ToParent(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self._answers.say(log=[record.levelno, record.getMessage()])
-
-
-def _take_standard_output() -> IO[bytes]:
-    """Return the standard output, which from here on is the standard error."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return answers
 
 
 if __name__ == "__main__":

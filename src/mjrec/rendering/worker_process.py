@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import IO, Any
 
 from ..errors import Error
-from .child_python import environment_of_child, python_command
+from .child_python import environment_of_child, python_command, said_in
 from .frame_ring import FrameRing
 
 __all__ = ["WorkerProcess"]
@@ -99,7 +99,7 @@ class WorkerProcess:
             self._has_ended = True
             return None
         *lines, self._rest = (self._rest + data).split(b"\n")
-        return [json.loads(line) for line in lines]
+        return [said for line in lines if (said := said_in(line))]
 
     def listen(self) -> bool:
         """Keep the end of what it prints; return whether there may be more later."""
