@@ -174,6 +174,7 @@ def test_leaving_otherwise_renders_nothing(
     assert "1 video pending" in caplog.text
     assert videos_in(tmp_path) == []
     assert len(list(tmp_path.glob("openaigym.trajectory.*"))) == 1
+    assert len(list(tmp_path.glob("openaigym.model.*.mjb.gz"))) == 1
 
 
 def test_garbage_collection_renders_nothing(tmp_path: Path) -> None:

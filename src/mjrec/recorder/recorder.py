@@ -347,8 +347,6 @@ class Recorder:
         if self.closed:
             return
         self._end_by_close()
-        if self._states is not None:
-            self._states.finish()
         if self._rendering is not None:
             self._rendering.wait(on_progress)
         self._finish_trajectories()
@@ -380,7 +378,13 @@ class Recorder:
         try:
             self._take_last_picture()
         finally:
-            self._end_episode(complete=False, reason="close")
+            try:
+                self._end_episode(complete=False, reason="close")
+            finally:
+                # A trajectory without its model is worth nothing, and what stores it
+                # may end with the process.
+                if self._states is not None:
+                    self._states.finish()
 
     def failures(self) -> Mapping[str, str]:
         """Return why videos could not be rendered, by their names."""
