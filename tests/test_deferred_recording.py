@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import hashlib
 import json
 import logging
 import os
@@ -13,11 +14,12 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco import MujocoEnv
 from processes import children
 from recordings import frames_in, manifest_of, metadata_of, videos_in
 
@@ -311,6 +313,83 @@ def test_workers_are_a_number(value: Any, pendulum: Any, tmp_path: Path) -> None
         mjrec.Monitor(pendulum, tmp_path, workers=value)
 
 
+GRID = """
+<mujoco>
+  <extension><plugin plugin="mujoco.sensor.touch_grid"/></extension>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/><light pos="0 0 3"/>
+    <body pos="0 0 .09"><freejoint/><geom size=".1"/><site name="s"/></body>
+  </worldbody>
+  <sensor>
+    <plugin plugin="mujoco.sensor.touch_grid" objtype="site" objname="s">
+      <config key="size" value="7 7"/><config key="fov" value="45 45"/>
+      <config key="gamma" value="0"/><config key="nchannel" value="1"/>
+    </plugin>
+  </sensor>
+</mujoco>
+"""
+
+
+class Touching(MujocoEnv):
+    """A ball on the floor, whose touch a plugin draws."""
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["human", "rgb_array", "depth_array"],
+        "render_fps": 500,
+    }
+
+    def __init__(self, path: Path, render_mode: str | None) -> None:
+        path.write_text(GRID)
+        space = gymnasium.spaces.Box(-np.inf, np.inf, (13,), np.float64)
+        super().__init__(
+            str(path), 1, observation_space=space, render_mode=render_mode, **SIZE
+        )
+
+    def step(self, action: Any) -> Any:
+        self.do_simulation(action, 1)
+        return self._state(), 0.0, False, False, {}
+
+    def reset_model(self) -> Any:
+        self.set_state(self.init_qpos, self.init_qvel)
+        return self._state()
+
+    def _state(self) -> Any:
+        return np.concatenate([self.data.qpos, self.data.qvel])
+
+
+def test_plugin_that_draws_is_recorded_live_with_a_message(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its pictures do not follow from what can be put back."""
+    env = Touching(tmp_path / "grid.xml", "rgb_array")
+    with mjrec.Monitor(env, tmp_path / "d", env_id="Touching-v0") as monitor:
+        monitor.reset()
+        monitor.step(np.zeros(0))
+    [said] = [r.getMessage() for r in caplog.records if "drawn live" in r.getMessage()]
+    assert "mujoco.sensor.touch_grid" in said
+    metadata = metadata_of(tmp_path / "d", 0)
+    assert metadata["recording"] == "live"
+    assert metadata["pictures"] == "env.render"
+    assert len(frames_in(tmp_path / "d", 0)) == 2
+
+
+@pytest.mark.parametrize(
+    ("render", "mode", "error"),
+    [("deferred", "rgb_array", "PicturesDiffer"), (None, None, "NoPictures")],
+)
+def test_plugin_that_draws_and_no_way_to_record_it(
+    render: Any, mode: Any, error: str, tmp_path: Path
+) -> None:
+    """One clear error at the first reset, instead of unchecked pictures."""
+    env = Touching(tmp_path / "grid.xml", mode)
+    directory = tmp_path / "d"
+    monitor = mjrec.Monitor(env, directory, render=render, env_id="Touching-v0")
+    with pytest.raises(getattr(mjrec, error), match="touch_grid"):
+        monitor.reset()
+    monitor.close()
+    assert videos_in(directory) == []
+
+
 # --- which trajectories --------------------------------------------------------------
 
 
@@ -365,6 +444,34 @@ def test_max_fps_takes_every_nth_step_and_the_last(
     assert metadata["frame_steps"] == [[0, 3], [4, 4]]
     assert metadata["playback_speed"] == 1
     assert len(frames_in(tmp_path, 0)) == 3
+
+
+def test_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
+    """One worker or three."""
+    hashes = set()
+    for workers in (1, 3):
+        directory = tmp_path / str(workers)
+        with mjrec.Monitor(make("Hopper-v5"), directory, workers=workers) as env:
+            steps(env, 8)
+        [video] = directory.glob("*.mp4")
+        hashes.add(hashlib.sha256(video.read_bytes()).hexdigest())
+        hashes.add(metadata_of(directory, 0)["file_sha256"])
+    assert len(hashes) == 1
+
+
+def test_one_episode_uses_all_workers(tmp_path: Path) -> None:
+    """Its frames come in order, drawn by as many processes as were asked for."""
+    with mjrec.Monitor(make("Hopper-v5"), tmp_path, workers=0) as env:
+        steps(env, 12)
+    [path] = tmp_path.glob("*.h5")
+    before = children()
+    frames = mjrec.render(path, workers=2)
+    first = [next(frames) for _ in range(6)]
+    assert len(children() - before) == 2
+    one_by_one = [*first, *frames]
+    for frame, same in zip(one_by_one, mjrec.render(path), strict=True):
+        np.testing.assert_array_equal(frame, same)
+    assert children() == before
 
 
 def test_live_recording_takes_the_same_frames(tmp_path: Path) -> None:
