@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Giving an ended log its final form, without the memory of the caller's process.
+
+A long log is turned into HDF5 by a process of its own:
+`python -m mjrec.rendering.log_finishing LOG`. It says one JSON object,
+`{"finished": "<path>"}` or `{"error": {...}}`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from ..errors import Error
+from ..formats.trajectory_file import finish_trajectory
+from .carried_errors import carried, unpacked
+from .child_python import (
+    environment_of_child,
+    python_command,
+    said_in,
+    take_standard_output,
+)
+
+__all__ = ["finish_log", "main"]
+
+_MODULE = "mjrec.rendering.log_finishing"
+
+# Up to here it takes no longer than starting a process, and a few MB.
+_LARGEST_HERE = 8 << 20
+_SECONDS_TO_LEAVE = 3.0
+_END_OF_STDERR = 1500
+
+
+def finish_log(log: Path) -> Path:
+    """Make the HDF5 file of an ended log, and remove the log.
+
+    What `finish_trajectory` does, for a long log in a process of its own. It may be
+    interrupted (Ctrl-C): then no process and no half file is left, and the log stays.
+
+    Returns:
+        The path of the HDF5 file.
+
+    Raises:
+        Error: as `finish_trajectory`; or the process was killed, and the log stays.
+    """
+    try:
+        size = log.stat().st_size
+    except OSError:
+        # Whatever that means, it is told in one way.
+        size = 0
+    if size <= _LARGEST_HERE:
+        return finish_trajectory(log)
+    try:
+        # Not a pipe, which could fill up while the other one is read.
+        with tempfile.TemporaryFile() as words, _start(log, words) as process:
+            return _result(log, process, words)
+    except OSError as error:
+        if isinstance(error, Error):
+            raise
+        # No process can be started, or no file made: it costs memory then.
+        return finish_trajectory(log)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Finish the log that is named; return the exit status."""
+    [path] = sys.argv[1:] if argv is None else argv
+    answers = take_standard_output()
+    # So that the unfinished file is removed.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    said: dict[str, Any]
+    try:
+        said = {"finished": str(finish_trajectory(Path(path)))}
+    except Exception as error:
+        said = {"error": carried(error)}
+    with contextlib.suppress(BrokenPipeError):
+        os.write(answers, json.dumps(said).encode())
+    return 0
+
+
+class _Finisher(subprocess.Popen[bytes]):
+    """The process; it has ended when the block that it is used in is left."""
+
+    def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
+        try:
+            if self.poll() is None:
+                self.terminate()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self.wait(_SECONDS_TO_LEAVE)
+        finally:
+            # Also when a second Ctrl-C comes.
+            if self.poll() is None:
+                self.kill()
+            super().__exit__(kind, value, traceback)
+
+
+def _start(log: Path, words: IO[bytes]) -> _Finisher:
+    return _Finisher(
+        [*python_command(_MODULE), str(log)],
+        env=environment_of_child(os.environ),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=words,
+        # Ctrl-C in a terminal is the caller's to handle.
+        start_new_session=True,
+    )
+
+
+def _result(log: Path, process: _Finisher, words: IO[bytes]) -> Path:
+    assert process.stdout is not None
+    said: Mapping[str, Any] = {}
+    # One that is killed says nothing, and libraries may have said something before.
+    for line in process.stdout:
+        said = said_in(line)
+    status = process.wait()
+    if "finished" in said:
+        return Path(said["finished"])
+    if "error" in said:
+        raise unpacked(said["error"])
+    how = f"was killed by signal {-status}" if status < 0 else f"ended with {status}"
+    size = words.seek(0, os.SEEK_END)
+    words.seek(max(0, size - _END_OF_STDERR))
+    last_words = words.read().decode(errors="replace").strip() or "(nothing)"
+    raise Error(
+        f"The process that was to finish {log} {how}. The log stays, and `mjrec "
+        f"render` of its directory tries again. The end of what it said: {last_words}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
