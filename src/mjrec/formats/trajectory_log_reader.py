@@ -8,6 +8,7 @@ of is not known.
 
 from __future__ import annotations
 
+import array
 import bisect
 import io
 import math
@@ -97,21 +98,23 @@ class TrajectoryLogReader(TrajectoryReader):
 
     def _prepare(self) -> None:
         header = self.header
-        arrays = [array for array in (header.action, header.observation) if array]
+        arrays = [kind for kind in (header.action, header.observation) if kind]
         self._state_size = 8 * header.state_length
-        filled = self._state_size + sum(array.size for array in arrays)
+        filled = self._state_size + sum(kind.size for kind in arrays)
         self._steps = _Rows(STEP, STEP_PREFIX.size + filled)
         self._frames = _Rows(FRAME, FRAME_PREFIX.size + header.snapshot.size)
-        self._step_facts: list[tuple[float, bool, bool]] = []
-        self._frame_steps: list[int] = []
+        # Not lists of numbers, each of which would be an object.
+        self._rewards = array.array("d")
+        self._flags = {name: bytearray() for name in ("terminated", "truncated")}
+        self._frame_steps = array.array("q")
         self._changes: list[_Record] = []
 
     def _finish(self) -> None:
         self.row_count = self._steps.count
-        facts = self._step_facts[1:]
-        self.rewards = np.array([reward for reward, _, _ in facts], np.float64)
-        self.terminated = np.array([flag for _, flag, _ in facts], np.bool_)
-        self.truncated = np.array([flag for _, _, flag in facts], np.bool_)
+        # The row of the reset has none.
+        self.rewards = np.array(self._rewards[1:], np.float64)
+        self.terminated = np.array(self._flags["terminated"][1:], np.bool_)
+        self.truncated = np.array(self._flags["truncated"][1:], np.bool_)
         known = bisect.bisect_left(self._frame_steps, self.row_count)
         self.dropped += len(self._frame_steps) - known
         self.frame_steps = np.array(self._frame_steps[:known], np.int64)
@@ -136,11 +139,13 @@ class TrajectoryLogReader(TrajectoryReader):
         if record.length != self._steps.length:
             return False
         prefix = window.read(record.offset, STEP_PREFIX.size)
-        step, *facts = STEP_PREFIX.unpack(prefix)
+        step, reward, terminated, truncated = STEP_PREFIX.unpack(prefix)
         if step != self._steps.count:
             return False
         self._steps.add(record.offset)
-        self._step_facts.append(tuple(facts))
+        self._rewards.append(reward)
+        self._flags["terminated"].append(terminated)
+        self._flags["truncated"].append(truncated)
         return True
 
     def _take_frame(self, window: _Window, record: _Record) -> bool:
