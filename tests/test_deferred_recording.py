@@ -275,6 +275,19 @@ def test_overlay_is_recorded_live_and_says_why(
     assert frames_in(tmp_path, 0)[0][0].min() > 240
 
 
+def test_drawing_a_live_recording_again_says_what_is_missing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What a wrapper painted on top is in no state."""
+    with mjrec.Monitor(Overlay(make(render_mode="rgb_array")), tmp_path) as env:
+        steps(env, 1)
+    [path] = tmp_path.glob("*.h5")
+    caplog.clear()
+    assert next(mjrec.render(path))[0].max() < 240
+    assert "recorded live, because the wrapper" in caplog.text
+    assert "Overlay" in caplog.text
+
+
 def test_deferred_by_force_is_an_error_that_names_the_class(tmp_path: Path) -> None:
     """Nothing is written."""
     env = Overlay(make(render_mode="rgb_array"))

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Literal, Self
 
 from ..environments.scenes import Scenes
 from ..errors import RenderError
-from ..formats.trajectory_file import finish_trajectory as finish_log
 from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
 from ..recorder.exit_guard import ExitGuard
@@ -19,6 +18,7 @@ from ..recorder.options import DEFERRED, RecorderOptions
 from ..recorder.recorder import EpisodePictures, Recorder, Rendering, Subject
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.video_recorder import VideoRecorder
+from ..rendering.log_finishing import finish_log
 from ..rendering.render_service import RenderService
 from ..simulation.inside import simulation_time
 from .rendering_choice import rendering_choice

@@ -513,6 +513,7 @@ class Recorder:
                 "fps": None if options.fps is None else str(options.fps),
                 "max_fps": None if options.max_fps is None else str(options.max_fps),
                 "recording": video,
+                "reason": self._choice.reason if video == LIVE else None,
             },
         }
 

@@ -17,7 +17,11 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidArgument
 from ..frames import Frame
 from .recorded_facts import open_for_rendering
-from .recorded_pictures import check_has_pictures, chosen_frames
+from .recorded_pictures import (
+    check_has_pictures,
+    chosen_frames,
+    warn_of_other_pictures,
+)
 from .views import View, plain_camera
 from .workers import DrawingWorkers
 
@@ -86,6 +90,7 @@ def render(
     )
     with open_for_rendering(path) as reader:
         check_has_pictures(reader)
+        warn_of_other_pictures(reader)
         chosen = chosen_frames(reader.frame_count, reader.header.facts, max_fps)
     pool = DrawingWorkers(workers)
     return _Pictures(pool, lambda: pool.frames(path, chosen.indices, view))

@@ -83,6 +83,7 @@ def _video(value: Any) -> Mapping[str, Any]:
     field(video, "name", text, default="")
     field(video, "quality", _one_of(*QUALITIES), default="full")
     field(video, "recording", _one_of(*_RECORDINGS), default="live")
+    field(video, "reason", optional(text), default=None)
     for key in ("fps", "max_fps"):
         field(video, key, optional(_asked_rate), default=None)
     return video

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any, NamedTuple
@@ -11,7 +12,15 @@ from ..errors import InvalidArgument, NoPictures
 from ..formats.trajectory_reader import TrajectoryReader
 from ..rates import stride_for, to_rate
 
-__all__ = ["ChosenFrames", "check_has_pictures", "chosen_frames", "recorded_rate"]
+__all__ = [
+    "ChosenFrames",
+    "check_has_pictures",
+    "chosen_frames",
+    "recorded_rate",
+    "warn_of_other_pictures",
+]
+
+logger = logging.getLogger(__name__)
 
 
 class ChosenFrames(NamedTuple):
@@ -38,6 +47,17 @@ def check_has_pictures(reader: TrajectoryReader) -> None:
         f"{reader.path} holds no snapshots to draw pictures from: {reason}. If it has "
         "states, mjrec.render_states can draw those."
     )
+
+
+def warn_of_other_pictures(reader: TrajectoryReader) -> None:
+    """Say so where the environment showed more than its scene."""
+    reason = (reader.header.facts.get("video") or {}).get("reason")
+    if reason:
+        logger.warning(
+            "%s was recorded live, because %s. What is drawn here is the scene alone.",
+            reader.path.name,
+            reason,
+        )
 
 
 def chosen_frames(

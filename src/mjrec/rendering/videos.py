@@ -23,7 +23,12 @@ from ..frames import Frame
 from ..rates import to_rate
 from ..recorder.versions import versions
 from .recorded_facts import open_for_rendering
-from .recorded_pictures import ChosenFrames, chosen_frames, recorded_rate
+from .recorded_pictures import (
+    ChosenFrames,
+    chosen_frames,
+    recorded_rate,
+    warn_of_other_pictures,
+)
 from .views import View, plain_camera
 from .workers import DrawingWorkers
 
@@ -80,6 +85,7 @@ def render_video(
                 )
                 return None
             raise NoPictures(_why_no_pictures(trajectory, facts))
+        warn_of_other_pictures(reader)
         chosen = chosen_frames(reader.frame_count, facts, max_fps)
         stride = facts.get("stride", 1) * chosen.every
         steps = reader.frame_steps[chosen.indices].tolist()
