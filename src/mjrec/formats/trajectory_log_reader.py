@@ -278,7 +278,8 @@ class _Rows:
         while done < len(out):
             run = bisect.bisect_right(self._first_rows, start + done) - 1
             skipped = start + done - self._first_rows[run]
-            end = (*self._first_rows, self.count)[run + 1]
+            is_last = run + 1 == len(self._first_rows)
+            end = self.count if is_last else self._first_rows[run + 1]
             part = out[done : done + end - start - done]
             _fill(descriptor, self._offsets[run] + skipped * self.stride, part)
             done += len(part)

@@ -88,7 +88,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 class _Finisher(subprocess.Popen[bytes]):
     """The process; it has ended when the block that it is used in is left."""
 
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        try:
+            super().__init__(*arguments, **options)
+        except BaseException:
+            # Ctrl-C, when there is a process already.
+            if getattr(self, "pid", None) is not None:
+                self._end()
+            raise
+
     def __exit__(self, kind: Any, value: Any, traceback: Any) -> None:
+        try:
+            self._end()
+        finally:
+            super().__exit__(kind, value, traceback)
+
+    def _end(self) -> None:
         try:
             if self.poll() is None:
                 self.terminate()
@@ -98,7 +113,7 @@ class _Finisher(subprocess.Popen[bytes]):
             # Also when a second Ctrl-C comes.
             if self.poll() is None:
                 self.kill()
-            super().__exit__(kind, value, traceback)
+                self.wait()
 
 
 def _start(log: Path, words: IO[bytes]) -> _Finisher:
