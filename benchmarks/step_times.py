@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Single steps, in one process and in turns: `python -m benchmarks.step_times`.
+
+On a machine with other work whole runs differ more from each other than a monitor
+costs. Here every step is timed, in rounds that take turns, and the quantiles of all
+steps tell what the others hide. Writing, and what begins and ends an episode, is in the
+times of the episodes.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from time import perf_counter_ns
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import mjrec
+
+STEPS = {"HalfCheetah-v5": 6000, "Humanoid-v5": 3000}
+ROUNDS = 5
+QUANTILES = (5, 25, 50)
+
+
+def times(env: Any, actions: list[Any]) -> tuple[list[int], list[int]]:
+    """Return the nanoseconds of every step, and of every episode with its reset."""
+    steps, episodes, seed = [], [], 0
+    began = perf_counter_ns()
+    env.reset(seed=seed)
+    for action in actions:
+        start = perf_counter_ns()
+        _, _, terminated, truncated, _ = env.step(action)
+        steps.append(perf_counter_ns() - start)
+        if terminated or truncated:
+            seed += 1
+            env.reset(seed=seed)
+            episodes.append(perf_counter_ns() - began)
+            began = perf_counter_ns()
+    return steps, episodes
+
+
+def measure(env_id: str, count: int) -> None:
+    """Print the quantiles of one environment."""
+    bare = gymnasium.make(env_id)
+    bare.action_space.seed(0)
+    actions = [bare.action_space.sample() for _ in range(count)]
+    with (
+        tempfile.TemporaryDirectory() as counted,
+        tempfile.TemporaryDirectory() as all_,
+    ):
+        variants = {
+            "bare": bare,
+            "counted": _monitored(env_id, counted, lambda episode: False),
+            "captured": _monitored(env_id, all_, lambda episode: True),
+        }
+        found: dict[str, tuple[list[int], list[int]]] = {
+            name: ([], []) for name in variants
+        }
+        for _ in range(ROUNDS):
+            for name, env in variants.items():
+                for total, part in zip(found[name], times(env, actions), strict=True):
+                    total += part
+        variants["counted"].close(wait=False)
+        variants["captured"].close(wait=False)
+    bare.close()
+    for index, unit in enumerate(("step", "episode")):
+        for quantile in QUANTILES:
+            values = [np.percentile(found[name][index], quantile) for name in variants]
+            print(
+                f"{env_id:15} {unit:8} {quantile:3}% "
+                + " ".join(f"{value / 1e3:10.1f}us" for value in values)
+                + f"   {values[0] / values[1]:.3f} {values[0] / values[2]:.3f} of bare"
+            )
+
+
+def _monitored(env_id: str, directory: str, schedule: Any) -> Any:
+    return mjrec.Monitor(
+        gymnasium.make(env_id), directory, schedule, workers=0, allow_early_reset=True
+    )
+
+
+def main() -> None:
+    """Measure every environment."""
+    print(f"{'':30} {'bare':>12} {'counted':>12} {'captured':>12}")
+    for env_id, count in STEPS.items():
+        measure(env_id, count)
+
+
+if __name__ == "__main__":
+    main()
