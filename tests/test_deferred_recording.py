@@ -22,6 +22,7 @@ import pytest
 from gymnasium.envs.mujoco import MujocoEnv
 from processes import children
 from recordings import frames_in, manifest_of, metadata_of, videos_in
+from touch_grid import TOUCH_GRID
 
 import mjrec
 
@@ -326,23 +327,6 @@ def test_workers_are_a_number(value: Any, pendulum: Any, tmp_path: Path) -> None
         mjrec.Monitor(pendulum, tmp_path, workers=value)
 
 
-GRID = """
-<mujoco>
-  <extension><plugin plugin="mujoco.sensor.touch_grid"/></extension>
-  <worldbody>
-    <geom type="plane" size="1 1 1"/><light pos="0 0 3"/>
-    <body pos="0 0 .09"><freejoint/><geom size=".1"/><site name="s"/></body>
-  </worldbody>
-  <sensor>
-    <plugin plugin="mujoco.sensor.touch_grid" objtype="site" objname="s">
-      <config key="size" value="7 7"/><config key="fov" value="45 45"/>
-      <config key="gamma" value="0"/><config key="nchannel" value="1"/>
-    </plugin>
-  </sensor>
-</mujoco>
-"""
-
-
 class Touching(MujocoEnv):
     """A ball on the floor, whose touch a plugin draws."""
 
@@ -352,7 +336,7 @@ class Touching(MujocoEnv):
     }
 
     def __init__(self, path: Path, render_mode: str | None) -> None:
-        path.write_text(GRID)
+        path.write_text(TOUCH_GRID)
         space = gymnasium.spaces.Box(-np.inf, np.inf, (13,), np.float64)
         super().__init__(
             str(path), 1, observation_space=space, render_mode=render_mode, **SIZE

@@ -5,25 +5,10 @@ from __future__ import annotations
 
 import mujoco
 import pytest
+from touch_grid import TOUCH_GRID
 
 from mjrec.simulation import drawing_plugins
 from mjrec.simulation.drawing_plugins import drawing_plugin
-
-GRID = """
-<mujoco>
-  <extension><plugin plugin="mujoco.sensor.touch_grid"/></extension>
-  <worldbody>
-    <geom type="plane" size="1 1 1"/>
-    <body pos="0 0 .5"><freejoint/><geom size=".1"/><site name="s"/></body>
-  </worldbody>
-  <sensor>
-    <plugin plugin="mujoco.sensor.touch_grid" objtype="site" objname="s">
-      <config key="size" value="7 7"/><config key="fov" value="45 45"/>
-      <config key="gamma" value="0"/><config key="nchannel" value="1"/>
-    </plugin>
-  </sensor>
-</mujoco>
-"""
 
 CABLE = """
 <mujoco>
@@ -60,7 +45,7 @@ def compiled(xml: str) -> mujoco.MjModel:
 
 def test_a_touch_grid_draws_before_anything_touches_it() -> None:
     """Its cells appear with the first contact, so that no picture tells."""
-    assert drawing_plugin(compiled(GRID)) == "mujoco.sensor.touch_grid"
+    assert drawing_plugin(compiled(TOUCH_GRID)) == "mujoco.sensor.touch_grid"
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from touch_grid import TOUCH_GRID
 
 from mjrec.errors import ClosedError, PicturesDiffer
 from mjrec.simulation.episode_states import EpisodeStates
@@ -316,26 +317,9 @@ def test_an_obstacle_is_a_refusal_and_in_mid_episode_an_error(tmp_path: Path) ->
         simulation.capture()
 
 
-GRID = """
-<mujoco>
-  <extension><plugin plugin="mujoco.sensor.touch_grid"/></extension>
-  <worldbody>
-    <geom type="plane" size="1 1 1"/>
-    <body pos="0 0 .5"><freejoint/><geom size=".1"/><site name="s"/></body>
-  </worldbody>
-  <sensor>
-    <plugin plugin="mujoco.sensor.touch_grid" objtype="site" objname="s">
-      <config key="size" value="7 7"/><config key="fov" value="45 45"/>
-      <config key="gamma" value="0"/><config key="nchannel" value="1"/>
-    </plugin>
-  </sensor>
-</mujoco>
-"""
-
-
 def test_a_plugin_that_draws_is_refused_by_name(tmp_path: Path) -> None:
     """Before it has drawn anything."""
-    simulation = Simulation(tmp_path, GRID)
+    simulation = Simulation(tmp_path, TOUCH_GRID)
     assert "mujoco.sensor.touch_grid draws" in (simulation.begin().refusal or "")
 
 
