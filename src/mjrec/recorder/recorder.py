@@ -315,10 +315,12 @@ class Recorder:
             )
         try:
             if self._trajectory is not None:
-                self._record_states(
-                    self._trajectory,
-                    (reward, terminated, truncated, observation, done, picture),
-                )
+                try:
+                    self._trajectory.step(
+                        reward, terminated, truncated, observation, done, picture
+                    )
+                except (PicturesDiffer, FileNotWritten) as error:
+                    self._stop_recording(self._trajectory, error)
             if self._live_video is not None:
                 self._take_picture(self._live_video, missing=not picture)
                 if done and picture:
@@ -565,16 +567,16 @@ class Recorder:
             or self._schedule is not disable_videos
         )
 
-    def _record_states(self, trajectory: TrajectoryRecorder, step: Any) -> None:
-        """Record a step, given as the arguments of `TrajectoryRecorder.step`."""
-        try:
-            trajectory.step(*step)
-        except PicturesDiffer as error:
+    def _stop_recording(
+        self, trajectory: TrajectoryRecorder, error: PicturesDiffer | FileNotWritten
+    ) -> None:
+        """Record no more frames, or nothing more at all, after an error."""
+        if isinstance(error, PicturesDiffer):
             self._stop_frames(trajectory, error)
-        except FileNotWritten as error:
-            trajectory.stop(str(error))
-            self._break_deferred(str(error))
-            raise
+            return
+        trajectory.stop(str(error))
+        self._break_deferred(str(error))
+        raise error
 
     def _stop_frames(
         self, trajectory: TrajectoryRecorder, error: PicturesDiffer

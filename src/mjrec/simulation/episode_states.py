@@ -326,12 +326,12 @@ class _QuickCapture:
         pictures: PictureStates,
     ) -> None:
         self._is_unmoved = is_unmoved
-        self._memory = memory
+        self._is_unchanged = memory.is_unchanged
         self.take = pictures.source.take
 
     def is_same(self) -> bool:
         """Tell whether view and model are as they were at the capture before."""
-        return self._is_unmoved() and self._memory.is_unchanged()
+        return self._is_unmoved() and self._is_unchanged()
 
 
 def _called_in(around: Callable[[Callable[[], None]], None], do: Callable[[], T]) -> T:
