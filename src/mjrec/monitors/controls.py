@@ -92,8 +92,9 @@ class MonitorControls:
     def model_changed(self) -> None:
         """Say that a texture, a height field or a mesh was changed in mid-episode.
 
-        Everything else that changes in a model is noticed, and so are these at every
-        reset. The next recorded frame shows the change.
+        All else that a picture depends on is noticed by itself, and at every reset
+        everything is. The next recorded frame shows the change; what only the physics
+        depend on (masses, damping) is then in the trajectory too, for replays.
         """
         self._recorder.model_changed()
 
