@@ -39,8 +39,12 @@ def robots_that_reset() -> Iterator[None]:
     """Let Gymnasium-Robotics compare MuJoCo's enumerations with NumPy's integers.
 
     From mujoco 3.12 on `mjtJoint.mjJNT_FREE == np.int32(0)` is False, and resets of
-    Fetch, the hand and the kitchen end at an assertion.
+    Fetch, the hand and the kitchen end at an assertion. Does nothing without the
+    package.
     """
+    if not has_robotics:
+        yield
+        return
     _register()
     joints = {f"mjJNT_{n}": i for i, n in enumerate(("FREE", "BALL", "SLIDE", "HINGE"))}
     ints = {**vars(mujoco), "mjtJoint": types.SimpleNamespace(**joints)}
