@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from interruption import ctrl_c_soon
 from processes import children
 from trajectories_by_hand import write_log
 
@@ -112,11 +111,19 @@ def test_without_another_process_it_is_done_here(
 
 @pytest.mark.usefixtures("elsewhere")
 def test_ctrl_c_leaves_no_process_and_no_half_file(
-    tmp_path: Path, names: Callable[[Path], list[str]]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    names: Callable[[Path], list[str]],
 ) -> None:
-    """The log stays."""
+    """Where it comes while the process is waited for; the log stays."""
+
+    def interrupted(*_: object) -> Path:
+        assert children()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(log_finishing, "_result", interrupted)
     log = write_log(tmp_path)
-    with pytest.raises(KeyboardInterrupt), ctrl_c_soon():
+    with pytest.raises(KeyboardInterrupt):
         finish_log(log)
     assert not children()
     assert names(tmp_path) == [log.name]

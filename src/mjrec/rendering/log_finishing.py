@@ -44,6 +44,8 @@ def finish_log(log: Path) -> Path:
 
     What `finish_trajectory` does, for a long log in a process of its own. It may be
     interrupted (Ctrl-C): then no process and no half file is left, and the log stays.
+    In the very moment in which the process is started it may be left alone instead; it
+    then finishes the log and ends.
 
     Returns:
         The path of the HDF5 file.
