@@ -21,12 +21,13 @@ from mjrec import GLError, load_results
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import Infix, lock_name, video_lock_name
 from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.video_metadata import is_done
 from mjrec.rendering import crew
 from mjrec.rendering.finishing import EpisodeFinisher, finish_pending
 from mjrec.rendering.outcomes import Outcome
 from mjrec.rendering.pending import EpisodeKey, claim, look_at, recorded_episodes
 from mjrec.rendering.progress import Progress
-from mjrec.rendering.rendered_manifests import is_done, reconcile, update_manifest
+from mjrec.rendering.rendered_manifests import reconcile, update_manifest
 
 KEY = EpisodeKey(INFIX, 0)
 VIDEO = "openaigym.video.0.7.video000000"

@@ -15,7 +15,8 @@ from recordings import frames_of
 from trajectories_by_hand import Painter, grey, write_finished, write_log
 
 from mjrec import InvalidFrame, Monitor, NoPictures, UnreadableFile
-from mjrec.rendering.videos import metadata_path, render_video, video_path
+from mjrec.formats.video_metadata import metadata_path
+from mjrec.rendering.videos import render_video, video_path
 from mjrec.rendering.views import View
 
 STEM = "openaigym.video.0.7.video000000"

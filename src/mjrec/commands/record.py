@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import secrets
 import sys
 from pathlib import Path
@@ -16,10 +15,10 @@ import tyro
 
 from .. import json_text
 from ..errors import InvalidArgument
-from ..frames import check_size
 from ..sessions import Session, SessionEpisode, record_session
 from .help_text import flowing_help
 from .progress import EpisodeProgress
+from .view_options import camera_of, size_of
 
 __all__ = ["record"]
 
@@ -84,7 +83,7 @@ def record(
         env_kwargs: more arguments for the environment, as a JSON object.
         as_json: print one JSON object at the end, and nothing else.
     """
-    height, width = _size(size)
+    height, width = size_of(size)
     if seed is None:
         seed = secrets.randbits(31)
     session = Session(
@@ -97,7 +96,7 @@ def record(
         schedule=schedule,
         force=force,
         resume=resume,
-        camera=_camera(camera),
+        camera=camera_of(camera),
         height=height,
         width=width,
         fps=fps,
@@ -186,18 +185,6 @@ def _pending(video: Path) -> str:
     return "" if video.exists() else f"  (pending: mjrec render {video.parent})"
 
 
-def _size(text: str | None) -> tuple[int | None, int | None]:
-    """Return `(height, width)` of WIDTHxHEIGHT."""
-    if text is None:
-        return None, None
-    match = re.fullmatch(r"(\d+)x(\d+)", text.strip(), re.ASCII | re.IGNORECASE)
-    if match is None:
-        raise InvalidArgument(
-            f"--size must be WIDTHxHEIGHT in pixels, such as 640x480, got {text!r}."
-        )
-    return check_size(int(match[2]), int(match[1]))
-
-
 def _kwargs(text: str) -> dict[str, Any]:
     try:
         kwargs = json.loads(text)
@@ -208,13 +195,6 @@ def _kwargs(text: str) -> dict[str, Any]:
     if not isinstance(kwargs, dict):
         raise InvalidArgument(f"--env-kwargs must be a JSON object, got {text!r}.")
     return kwargs
-
-
-def _camera(text: str | None) -> str | int | None:
-    """Return a camera's number, if `text` is a whole number, else its name."""
-    if text is not None and re.fullmatch(r"-?\d+", text, re.ASCII):
-        return int(text)
-    return text
 
 
 def _count(number: int, noun: str) -> str:

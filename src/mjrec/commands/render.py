@@ -17,6 +17,7 @@ from ..errors import InvalidArgument
 from ..formats.monitor_directory import iter_monitor_files
 from ..formats.trajectory_file import find_trajectory
 from ..machine import usable_cpus
+from ..monitors.render_progress import RenderProgress
 from ..rendering.again import Variant, render_again
 from ..rendering.cpu_slots import check_workers
 from ..rendering.finishing import finish_pending
@@ -24,7 +25,6 @@ from ..rendering.outcomes import Outcome
 from ..rendering.pending import EpisodeKey, recorded_episodes
 from ..rendering.views import View
 from .help_text import flowing_help
-from .render_progress import RenderProgress
 from .view_options import camera_of, size_of
 
 __all__ = ["render"]

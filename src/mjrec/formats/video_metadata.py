@@ -10,11 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
+from .json_fields import read_object
 from .video_writer import VideoFile
 
-__all__ = ["StepRuns", "file_facts", "playback_speed", "timing_facts"]
+__all__ = [
+    "StepRuns",
+    "file_facts",
+    "is_broken",
+    "is_done",
+    "metadata_path",
+    "playback_speed",
+    "timing_facts",
+]
 
 
 class StepRuns:
@@ -103,3 +113,22 @@ def file_facts(file: VideoFile) -> dict[str, Any]:
         "file_sha256": file.file_sha256,
         "decoded_sha256": file.decoded_sha256,
     }
+
+
+def metadata_path(video: Path) -> Path:
+    """Return the name of the metadata file of a video."""
+    return video.with_suffix(".meta.json")
+
+
+def is_done(video: Path) -> bool:
+    """Tell whether nothing is left to do about a video: it is there, or given up."""
+    metadata = metadata_path(video)
+    return metadata.exists() and (video.exists() or is_broken(metadata))
+
+
+def is_broken(metadata: Path) -> bool:
+    """Tell whether a video's metadata says that it broke."""
+    try:
+        return bool(read_object(metadata).get("broken"))
+    except (OSError, ValueError):
+        return False

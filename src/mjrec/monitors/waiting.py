@@ -23,38 +23,17 @@ def waiting_display() -> Iterator[Callable[[Progress], None]]:
     if not sys.stderr.isatty():
         yield _nothing
         return
-    _load_rich()
-    import rich.console
-    import rich.progress
-
-    with rich.progress.Progress(
-        rich.progress.TextColumn("rendering {task.fields[videos]}"),
-        rich.progress.BarColumn(),
-        rich.progress.TextColumn("{task.completed}/{task.total} frames"),
-        rich.progress.TimeRemainingColumn(),
-        console=rich.console.Console(stderr=True),
-        transient=True,
-    ) as bar:
-        task = bar.add_task("", total=None, videos="")
-
-        def show(progress: Progress) -> None:
-            bar.update(
-                task,
-                completed=progress.frames_done,
-                total=progress.frames,
-                videos=f"{progress.videos_done}/{progress.videos} videos",
-            )
-
-        yield show
-
-
-def _load_rich() -> None:
-    # It draws random numbers when it is imported, and the user's are not ours. Loaded
+    # Rich draws random numbers when it is imported, and the user's are not ours. Loaded
     # only where there is a bar to show.
     state = random.getstate()
-    import rich.progress  # noqa: F401
+    import rich.console
+
+    from .render_progress import RenderProgress
 
     random.setstate(state)
+    console = rich.console.Console(stderr=True)
+    with RenderProgress(console, title="rendering ") as progress:
+        yield progress.show
 
 
 def _nothing(progress: Progress) -> None:

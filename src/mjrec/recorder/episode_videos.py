@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
+from ..formats.video_metadata import is_broken, is_done, metadata_path
 from .deferred_video import DeferredVideo
 from .video_recorder import VideoRecorder
 
@@ -69,20 +69,10 @@ class EpisodeVideos:
         waiting = []
         for entry in self._deferred:
             video = entry[2]
-            metadata = video.with_suffix(".meta.json")
-            if not metadata.exists():
+            if not is_done(video):
                 waiting.append(entry)
-            elif _says_broken(metadata):
-                self._broken.append(metadata.name)
-            elif video.exists():
-                self._finished.append((video.name, metadata.name))
+            elif is_broken(metadata_path(video)):
+                self._broken.append(metadata_path(video).name)
             else:
-                waiting.append(entry)
+                self._finished.append((video.name, metadata_path(video).name))
         self._deferred = waiting
-
-
-def _says_broken(metadata: Path) -> bool:
-    try:
-        return bool(json.loads(metadata.read_bytes()).get("broken"))
-    except (OSError, ValueError, AttributeError):
-        return False

@@ -28,8 +28,8 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.trajectory_file import find_trajectory
+from ..formats.video_metadata import is_done
 from .recorded_facts import open_for_rendering
-from .rendered_manifests import is_done
 from .videos import video_path
 
 __all__ = ["EpisodeKey", "PendingEpisode", "claim", "look_at", "recorded_episodes"]

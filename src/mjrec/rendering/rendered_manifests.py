@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DirectoryNotWritable, UnreadableFile
-from ..formats.json_fields import read_object
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.manifest import Manifest, read_manifest, write_manifest
 from ..formats.monitor_directory import (
@@ -29,23 +28,9 @@ from ..formats.monitor_directory import (
     manifest_lock_name,
     manifest_name,
 )
-from .videos import metadata_path
+from ..formats.video_metadata import is_broken, is_done, metadata_path
 
-__all__ = ["is_broken", "is_done", "reconcile", "update_manifest"]
-
-
-def is_done(video: Path) -> bool:
-    """Tell whether nothing is left to do about a video: it is there, or given up."""
-    metadata = metadata_path(video)
-    return metadata.exists() and (video.exists() or is_broken(metadata))
-
-
-def is_broken(metadata: Path) -> bool:
-    """Tell whether a video's metadata says that it broke."""
-    try:
-        return bool(read_object(metadata).get("broken"))
-    except (OSError, ValueError):
-        return False
+__all__ = ["reconcile", "update_manifest"]
 
 
 def reconcile(directory: Path) -> None:

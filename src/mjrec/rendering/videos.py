@@ -17,7 +17,12 @@ from ..atomic_files import write_text
 from ..errors import NoPictures, UnreadableFile
 from ..formats.monitor_directory import Infix, episode_of, infix_of, video_prefix
 from ..formats.trajectory_reader import TrajectoryReader
-from ..formats.video_metadata import StepRuns, file_facts, timing_facts
+from ..formats.video_metadata import (
+    StepRuns,
+    file_facts,
+    metadata_path,
+    timing_facts,
+)
 from ..formats.video_writer import VideoFile, VideoWriter
 from ..frames import Frame
 from ..rates import to_rate
@@ -32,7 +37,7 @@ from .recorded_pictures import (
 from .views import View, plain_camera
 from .workers import DrawingWorkers
 
-__all__ = ["metadata_path", "render_video", "video_path"]
+__all__ = ["render_video", "video_path"]
 
 # Of an episode that ended before its second step: any is as good.
 _RATE_OF_ONE_FRAME = Fraction(30)
@@ -128,11 +133,6 @@ def video_path(trajectory: Path, facts: Mapping[str, Any]) -> Path:
         trajectory,
         f"the video that it names, {name!r:.200}, is not that of its own episode",
     )
-
-
-def metadata_path(video: Path) -> Path:
-    """Return the name of the metadata file of a video."""
-    return video.with_suffix(".meta.json")
 
 
 def _usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:

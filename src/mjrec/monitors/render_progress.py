@@ -18,11 +18,12 @@ class RenderProgress:
 
     Args:
         console: where to; lines that are printed to it meanwhile stand above the bar.
+        title: stands before the number of videos.
     """
 
-    def __init__(self, console: rich.console.Console) -> None:
+    def __init__(self, console: rich.console.Console, *, title: str = "") -> None:
         self._bar = rich.progress.Progress(
-            rich.progress.TextColumn("{task.fields[videos]}"),
+            rich.progress.TextColumn("{task.description}{task.fields[videos]}"),
             rich.progress.BarColumn(bar_width=20),
             rich.progress.TextColumn("{task.completed}/{task.total} frames"),
             rich.progress.TimeElapsedColumn(),
@@ -32,7 +33,7 @@ class RenderProgress:
             disable=not console.is_terminal,
             transient=True,
         )
-        self._task = self._bar.add_task("", total=0, videos="")
+        self._task = self._bar.add_task(title, total=0, videos="")
 
     def __enter__(self) -> RenderProgress:
         self._bar.start()
