@@ -192,6 +192,13 @@ def test_import_is_inert() -> None:
     ).split() == ["[]", "True"]
 
 
+def test_monitors_load_no_hdf5() -> None:
+    """Trajectories are logs while an environment runs."""
+    assert _run(
+        "import sys, mjrec.monitors.gymnasium_monitor; print('h5py' in sys.modules)"
+    ).split() == ["False"]
+
+
 def test_read_half_needs_no_simulator() -> None:
     """Results are read on a machine without mujoco, OpenGL or ffmpeg."""
     assert _run(

@@ -18,7 +18,6 @@ from ..recorder.options import DEFERRED, RecorderOptions
 from ..recorder.recorder import EpisodePictures, Recorder, Rendering, Subject
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.video_recorder import VideoRecorder
-from ..rendering.log_finishing import finish_log
 from ..rendering.render_service import RenderService
 from ..simulation.inside import simulation_time
 from .rendering_choice import rendering_choice
@@ -169,7 +168,7 @@ class MonitorControls:
             ),
             options=options,
             rendering=_rendering(options.workers) if choice.mode == DEFERRED else None,
-            finish_log=finish_log,
+            finish_log=_finish_log,
         )
         self._guard = ExitGuard(
             self,
@@ -196,6 +195,13 @@ def _rendering(workers: int | None) -> Callable[[Path], Rendering] | None:
     if workers == 0:
         return None
     return functools.partial(RenderService, workers=workers)
+
+
+def _finish_log(log: Path) -> None:
+    # Not at the top: it loads h5py, which the simulation has no use for.
+    from ..rendering.log_finishing import finish_log
+
+    finish_log(log)
 
 
 def _close(
