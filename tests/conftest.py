@@ -20,6 +20,8 @@ import numpy as np
 import pytest
 from processes import children
 
+from mjrec.formats.ffmpeg import ffmpeg_executable
+
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
 
@@ -123,6 +125,22 @@ def kill_children(name: str) -> int:
 def kill_ffmpeg() -> Callable[[], int]:
     """Return a function that kills this process's encoders."""
     return lambda: kill_children("ffmpeg")
+
+
+@pytest.fixture
+def stuck_encoder(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """Let every encoder begin and never go on; the returned file says that one has."""
+    begun = tmp_path_factory.mktemp("encoder") / "begun"
+    program = begun.with_name("ffmpeg")
+    program.write_text(
+        f'#!/bin/sh\ncase "$*" in *libx264*) touch {begun}; exec sleep 60;; esac\n'
+        f'exec "{ffmpeg_executable()}" "$@"\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    return begun
 
 
 @pytest.fixture

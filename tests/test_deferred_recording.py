@@ -223,16 +223,19 @@ def test_end_of_the_interpreter_renders_nothing(tmp_path: Path) -> None:
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
 
 
-def test_ctrl_c_while_waiting_leaves_the_rest_pending(tmp_path: Path) -> None:
+def test_ctrl_c_while_waiting_leaves_the_rest_pending(
+    tmp_path: Path, stuck_encoder: Path
+) -> None:
     """The manifest is written, the line is said, and the process ends at once."""
-    code = SCRIPT.replace('"InvertedPendulum-v5", height=48, width=64', '"Humanoid-v5"')
-    code += (
-        "for _ in range(9): env.step(env.action_space.sample())\n"
-        "import os, signal, threading\n"
-        "threading.Timer(1, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
+    code = SCRIPT + (
+        "import os, signal, threading, time\n"
+        "def interrupt():\n"
+        "    while not os.path.exists(sys.argv[2]): time.sleep(0.01)\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "threading.Thread(target=interrupt).start()\n"
         "env.close()\n"
     )
-    done = run_script(code, tmp_path)
+    done = run_script(code, tmp_path, stuck_encoder)
     assert done.returncode == -signal.SIGINT, done.stderr
     assert "1 video pending: mjrec render" in done.stderr
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1

@@ -198,14 +198,14 @@ def test_a_model_that_never_comes_is_an_error(
 
 
 def test_stopping_leaves_what_is_not_done(
-    recorded: Path, start: Callable[..., RenderService]
+    recorded: Path, start: Callable[..., RenderService], stuck_encoder: Path
 ) -> None:
     """At once, in the midst of a video; no process and no temporary file stays."""
     before = children()
     service = start(recorded)
     for log in sorted(recorded.glob("*.log")):
         service.submit(log)
-    wait_until(lambda: list(recorded.glob("*.h5")))
+    wait_until(stuck_encoder.exists)
     began = time.monotonic()
     service.stop()
     assert time.monotonic() - began < 3
