@@ -59,6 +59,7 @@ class ViewerScene:
     ) -> None:
         self._simulated = simulated
         self._asked = camera
+        self._data: Any = None
         self._height, self._width = check_size(
             _own_side(simulated, "height") if height is None else height,
             _own_side(simulated, "width") if width is None else width,
@@ -73,6 +74,7 @@ class ViewerScene:
     def __call__(self) -> SceneView:
         """Return what is shown from here on; `at_picture` keeps it up to date."""
         self._update()
+        self._data = self._simulated.data
         return SceneView(
             camera=self._camera,
             option=self._option,
@@ -92,18 +94,20 @@ class ViewerScene:
     def is_unmoved(self) -> bool:
         """Tell, in a moment, that nothing is other than at the picture before.
 
-        As far as that is sure without a closer look: there is no viewer that anybody
-        could have touched, and the camera does not follow fields of the model.
+        As far as that is sure without a closer look: it is the same simulation as when
+        it was asked what is shown, there is no viewer that anybody could have touched,
+        and the camera does not follow fields of the model.
         """
-        renderer = self._renderer
+        renderer, simulated = self._renderer, self._simulated
         return (
             self._is_settled
             and renderer is not None
             and self._asked != FREE_CAMERA
             and not renderer._viewers
             and renderer.camera_id == self._camera_id
-            and self._simulated.mujoco_renderer is renderer
-            and self._simulated.model is self._model is renderer.model
+            and simulated.mujoco_renderer is renderer
+            and simulated.data is self._data
+            and simulated.model is self._model is renderer.model
         )
 
     def obstacle(self) -> str | None:

@@ -242,6 +242,56 @@ class TrajectoryLogWriter:
         tail.frames = index + 1
         return row
 
+    def add_moment(
+        self,
+        step: int,
+        reward: float,
+        terminated: bool,
+        truncated: bool,
+        row: bytes,
+        snapshot: bytes,
+    ) -> None:
+        """Add the row of a step and that of its frame: both, or none of them.
+
+        Args:
+            step: as of `step_row`, as are the three after it.
+            reward: of the step.
+            terminated: the task ended the episode.
+            truncated: a limit from outside the task ended it.
+            row: what `step_row` would have the caller fill, of the same length.
+            snapshot: likewise of `frame_row`.
+
+        Raises:
+            FileNotWritten: the disk is full; nothing was added.
+            ClosedError: after `close` or `discard`.
+        """
+        tail = self._tail
+        at, frame_at = tail.steps, tail.frames
+        steps, frames = self._steps, self._frames
+        if (
+            at == steps.capacity
+            or frame_at == frames.capacity
+            or monotonic() >= tail.due
+        ):
+            self.flush()
+            tail = self._tail
+            at = frame_at = 0
+        if at == len(steps.rows):
+            steps.next_row()
+        if frame_at == len(frames.rows):
+            frames.next_row()
+        start = steps.starts[at]
+        STEP_PREFIX.pack_into(steps.memory, start, step, reward, terminated, truncated)
+        start += STEP_PREFIX.size
+        steps.memory[start : start + len(row)] = row
+        start = frames.starts[frame_at]
+        FRAME_PREFIX.pack_into(frames.memory, start, step)
+        start += FRAME_PREFIX.size
+        frames.memory[start : start + len(snapshot)] = snapshot
+        tail.steps = at + 1
+        tail.frames = frame_at + 1
+        tail.last = b""
+
     def withdraw_row(self) -> None:
         """Take back the row that was given out last, because it could not be filled.
 

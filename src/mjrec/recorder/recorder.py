@@ -7,6 +7,7 @@ import contextlib
 import logging
 import os
 import time
+import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -145,6 +146,8 @@ class Recorder:
         self._options = options
         self._env_info = {"gym_version": _GYM_VERSION, "env_id": subject.env_id}
         self._pid = os.getpid()
+        self._is_forked = False
+        _recorders.add(self)
         self._videos = EpisodeVideos()
         self._decision = (-1, False)
         self._place: OpenDirectory = open_directory(
@@ -233,7 +236,7 @@ class Recorder:
             ResetNotAllowed: in mid-episode, unless early resets are allowed.
             Error: in a process forked from the one that made the recorder.
         """
-        if os.getpid() != self._pid:
+        if self._is_forked:
             self._refuse_process()
         self.stats_recorder.before_reset()
         if not self._is_unbegun():
@@ -281,7 +284,7 @@ class Recorder:
             ResetNeeded: before the first reset, or after the end of an episode.
             Error: in a process forked from the one that made the recorder.
         """
-        if os.getpid() != self._pid:
+        if self._is_forked:
             self._refuse_process()
         self.stats_recorder.before_step()
         if self._trajectory is not None:
@@ -743,6 +746,18 @@ class Recorder:
             "broken": self._videos.broken(),
             "versions": dict(versions()),
         }
+
+
+# Asking the system for the process's number at every step takes as long as counting it.
+_recorders: weakref.WeakSet[Recorder] = weakref.WeakSet()
+
+
+def _refuse_what_the_parent_made() -> None:
+    for recorder in _recorders:
+        recorder._is_forked = True
+
+
+os.register_at_fork(after_in_child=_refuse_what_the_parent_made)
 
 
 def _check_pictures(subject: Subject) -> None:

@@ -17,7 +17,7 @@ from ..errors import PicturesDiffer
 from ..formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
 from ..formats.trajectory_log import RowBlocks, TrajectoryLogWriter
 from ..rates import rate_from_timestep, stride_for
-from ..simulation.state_source import EpisodeStart, StateSource
+from ..simulation.state_source import EpisodeStart, MomentMemory, StateSource
 from .step_arrays import StepArray, action_array, step_array
 
 __all__ = ["Pace", "TrajectoryRecorder"]
@@ -94,6 +94,9 @@ class TrajectoryRecorder:
         self._is_stopped = False
         # What a row holds behind its state; and a state where there is none.
         self._behind_state: tuple[memoryview, ...] = ()
+        # Where all of a step, and its frame, can be copied without asking further.
+        self._memory: MomentMemory | None = None
+        self._step_memory: tuple[memoryview, ...] = ()
         self._no_state = np.full(self._state_bytes // 8, np.nan).tobytes()
         self._irregular: set[str] = set()
         self._action: StepArray | None = None
@@ -126,6 +129,7 @@ class TrajectoryRecorder:
     def stop_frames(self, reason: str) -> None:
         """Take no more snapshots, and say why."""
         self._takes_frames = False
+        self._memory = None
         self.note(broken_reason=reason)
 
     def stop(self, reason: str) -> None:
@@ -167,6 +171,20 @@ class TrajectoryRecorder:
         if self._observation is not None and not self._observation.set(observation):
             self._note_irregular("observations")
         number = self.steps + 1
+        memory = self._memory
+        if (
+            memory is not None
+            and has_picture
+            and number % self._stride == 0
+            and memory.is_current()
+        ):
+            # The usual step, in half the time of the others.
+            whole = b"".join(self._step_memory)
+            snapshot = b"".join(memory.snapshot)
+            log.add_moment(number, reward, terminated, truncated, whole, snapshot)
+            self.steps = self._last_frame = number
+            self.frame_count += 1
+            return
         row = log.step_row(number, reward, terminated, truncated)
         self.steps = number
         state: Any = self._no_state
@@ -301,6 +319,10 @@ class TrajectoryRecorder:
         elapsed = _difference(self._first_time, self._pace.clock())
         rate = rate_from_timestep(elapsed) if elapsed else self._pace.declared()
         self._stride = stride_for(rate, self._pace.max_fps)
+        memory = self._start.memory
+        if self._takes_frames and memory is not None:
+            self._memory = memory
+            self._step_memory = (*memory.state, *self._behind_state)
         log.add_facts(
             {
                 "rate": str(rate),

@@ -27,7 +27,8 @@ from .picture_states import (
     moves_cameras,
 )
 from .scene_view import SceneView
-from .state_source import EpisodeStart
+from .state_memory import has_state_memory, state_memory
+from .state_source import EpisodeStart, MomentMemory
 
 __all__ = ["EpisodeStates"]
 
@@ -51,8 +52,9 @@ class EpisodeStates:
         authored: returns what the model was made from, where that is known.
         obstacle: returns why the picture of this moment cannot be made from the state,
             or None.
-        is_unmoved: tells, faster than `at_picture` and `obstacle` do, that the view is
-            as it was and nothing stands in the way: neither is then called.
+        is_unmoved: tells, faster than the others do, that simulation and view are as
+            when `view` was asked, and nothing stands in the way: no other is then
+            called.
     """
 
     def __init__(
@@ -107,7 +109,7 @@ class EpisodeStates:
         refused = self._refusal is not None
         self._quick = None
         if self._is_unmoved is not None and pictures.stand_alone and not refused:
-            self._quick = _QuickCapture(self._is_unmoved, stored.memory, pictures)
+            self._quick = _QuickCapture(self._is_unmoved, stored, pictures)
         return EpisodeStart(
             state=stored.components,
             snapshot=RowLayout() if refused else pictures.layout,
@@ -115,9 +117,10 @@ class EpisodeStates:
             scene=None if refused else pictures.facts(),
             model_fields=fields,
             refusal=self._refusal,
+            memory=None if self._quick is None else self._quick.memory(),
         )
 
-    def capture_state(self) -> memoryview:
+    def capture_state(self) -> bytes | memoryview:
         """Return the state of this moment; the next call overwrites it.
 
         Raises:
@@ -144,7 +147,7 @@ class EpisodeStates:
                 which was possible when the episode began.
         """
         quick = self._quick
-        if quick is not None and not self._look_at_everything and quick.is_same():
+        if quick is not None and quick.is_current():
             # The usual case, in half the time of the others.
             quick.take(out)
             return None
@@ -174,6 +177,9 @@ class EpisodeStates:
     def model_changed(self) -> None:
         """Note that anything in the model may be another; the next capture looks."""
         self._look_at_everything = True
+        if self._quick is not None:
+            self._quick.is_over = True
+            self._quick = None
 
     def finish(self) -> None:
         """Wait until every model is stored.
@@ -281,15 +287,21 @@ class _StoredModel:
         self._model = model
         self._checked = CheckedPictures()
         self._kept: KeptCameras | None = None
+        self._has_state_memory = has_state_memory(model)
         self._state = np.empty(mujoco.mj_stateSize(model, STATE_SPEC))
         self._state_bytes = self._state.view(np.uint8).data
+        self.state_memory: tuple[memoryview, ...] | None = None
 
     def follow(self, data: mujoco.MjData) -> None:
         """Record the states of `data` from here on."""
         self.data = data
+        if self._has_state_memory:
+            self.state_memory = state_memory(self._model, data)
 
-    def read_state(self) -> memoryview:
-        """Return the state; the memory is the same at each call."""
+    def read_state(self) -> bytes | memoryview:
+        """Return the state; the next call may overwrite it."""
+        if self.state_memory is not None:
+            return b"".join(self.state_memory)
         mujoco.mj_getState(self._model, self.data, self._state, STATE_SPEC)
         return self._state_bytes
 
@@ -317,21 +329,35 @@ class _QuickCapture:
 
     Attributes:
         take: writes a snapshot.
+        is_over: set to True where a closer look is needed from here on.
     """
 
     def __init__(
         self,
         is_unmoved: Callable[[], bool],
-        memory: ModelMemory,
+        stored: _StoredModel,
         pictures: PictureStates,
     ) -> None:
+        self.is_over = False
         self._is_unmoved = is_unmoved
-        self._is_unchanged = memory.is_unchanged
+        self._is_unchanged = stored.memory.is_unchanged
+        self._state_memory = stored.state_memory
+        self._source = pictures.source
         self.take = pictures.source.take
 
-    def is_same(self) -> bool:
+    def is_current(self) -> bool:
         """Tell whether view and model are as they were at the capture before."""
-        return self._is_unmoved() and self._is_unchanged()
+        return not self.is_over and self._is_unmoved() and self._is_unchanged()
+
+    def memory(self) -> MomentMemory | None:
+        """Return what somebody else can copy."""
+        if self._state_memory is None or not self._source.is_plain:
+            return None
+        return MomentMemory(
+            state=self._state_memory,
+            snapshot=self._source.memory,
+            is_current=self.is_current,
+        )
 
 
 def _called_in(around: Callable[[Callable[[], None]], None], do: Callable[[], T]) -> T:

@@ -215,6 +215,10 @@ class SnapshotSource:
         model: the model; kept alive, as is the data.
         data: its data.
         layout: what `snapshot_layout` gave for the model.
+
+    Attributes:
+        memory: what a snapshot consists of, in its order.
+        is_plain: all of it is the data's own; else `take` brings it up to date.
     """
 
     def __init__(
@@ -229,14 +233,15 @@ class SnapshotSource:
                 arrays.append(self._colours.rgba)
             else:
                 arrays.append(getattr(data, field.name))
-        self._views = [array.reshape(-1).view(np.uint8).data for array in arrays]
+        self.is_plain = self._colours is None
+        self.memory = tuple(array.reshape(-1).view(np.uint8).data for array in arrays)
 
     def take(self, out: NDArray[np.uint8]) -> None:
         """Write a snapshot of this moment into `out`, `(layout.size,) uint8`."""
         if self._colours is not None:
             self._colours.update()
         # Three times as fast as `np.concatenate` into `out`, for a few short arrays.
-        out.data[:] = b"".join(self._views)
+        out.data[:] = b"".join(self.memory)
 
 
 def _array(model: mujoco.MjModel, name: str) -> Array:

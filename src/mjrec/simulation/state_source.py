@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +14,27 @@ from numpy.typing import NDArray
 
 from ..formats.trajectory import RowLayout, StateComponent
 
-__all__ = ["EpisodeStart", "StateSource"]
+__all__ = ["EpisodeStart", "MomentMemory", "StateSource"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MomentMemory:
+    """The memory of a simulation itself, for a recorder that copies it on its own.
+
+    Asking for a state and a snapshot costs more than copying both.
+
+    Attributes:
+        state: what the state consists of, in its order.
+        snapshot: what a snapshot consists of, likewise.
+        is_current: tells that nothing but the state is other than at the capture
+            before, which is usual: the memory then holds this moment, until the
+            environment is called again. Where it does not, `capture_state` and
+            `capture_snapshot` are to be asked.
+    """
+
+    state: tuple[memoryview, ...]
+    snapshot: tuple[memoryview, ...]
+    is_current: Callable[[], bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +50,7 @@ class EpisodeStart:
         model_fields: what is other than in the stored model.
         refusal: why no picture can be made from snapshots of this model; None where
             it can, which was checked.
+        memory: for this episode; None where each moment needs a closer look.
     """
 
     state: tuple[StateComponent, ...]
@@ -38,6 +59,7 @@ class EpisodeStart:
     scene: Mapping[str, Any] | None
     model_fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     refusal: str | None = None
+    memory: MomentMemory | None = None
 
 
 class StateSource(Protocol):
@@ -52,7 +74,7 @@ class StateSource(Protocol):
     def begin_episode(self) -> EpisodeStart:
         """Return what is there now, just after a reset."""
 
-    def capture_state(self) -> memoryview:
+    def capture_state(self) -> bytes | memoryview:
         """Return the state of this moment, as bytes.
 
         They stay until the next call, which overwrites them.
