@@ -284,9 +284,10 @@ class Recorder:
             ResetNeeded: before the first reset, or after the end of an episode.
             Error: in a process forked from the one that made the recorder.
         """
-        if self._is_forked:
-            self._refuse_process()
-        self.stats_recorder.before_step()
+        stats = self.stats_recorder
+        # The usual case first: this is asked at every step.
+        if self._is_forked or stats.done is not False or stats.closed:
+            self._refuse_step()
         if self._trajectory is not None:
             self._trajectory.before_step(action)
 
@@ -310,7 +311,8 @@ class Recorder:
             observation: what the step returned.
         """
         reward = reward_to_float(reward)
-        done = self.stats_recorder.after_step(None, reward, terminated or truncated)
+        done = bool(terminated or truncated)
+        self.stats_recorder.count(reward, done)
         if done:
             # First of all, so that no failing video can lose the episode.
             self._journal_episode(
@@ -411,6 +413,11 @@ class Recorder:
                 "video" if pending == 1 else "videos",
                 self.directory,
             )
+
+    def _refuse_step(self) -> None:
+        if self._is_forked:
+            self._refuse_process()
+        self.stats_recorder.before_step()
 
     def _refuse_process(self) -> None:
         raise Error(

@@ -137,18 +137,22 @@ class StatsRecorder:
         Raises:
             InvalidArgument: the reward is not one number.
         """
+        self.count(reward_to_float(reward), bool(done))
+        if done and self.autoreset:
+            self.before_reset()
+            self.after_reset(observation)
+        return bool(done)
+
+    def count(self, reward: float, done: bool) -> None:
+        """Count a step, as `after_step` does; nothing begins another episode."""
         assert self.steps is not None  # before_step has seen to it
         assert self.rewards is not None
-        self.rewards += reward_to_float(reward)
+        self.rewards += reward
         self.steps += 1
         self.total_steps += 1
-        self.done = bool(done)
-        if self.done:
+        self.done = done
+        if done:
             self.save_complete()
-            if self.autoreset:
-                self.before_reset()
-                self.after_reset(observation)
-        return self.done
 
     def before_reset(self) -> None:
         """Check that a reset may be made.
