@@ -46,6 +46,8 @@ BALL = """
 class Simulation:
     """What an environment has, and a recorder of its states."""
 
+    is_unmoved = False
+
     def __init__(self, directory: Path, xml: str = BALL, **options: Any) -> None:
         self.camera, self.option = mujoco.MjvCamera(), mujoco.MjvOption()
         self.directory = directory
@@ -111,6 +113,54 @@ def test_a_state_is_the_integration_state(simulation: Simulation) -> None:
         assert bytes(state) == expected.tobytes()
     offsets = {component.name: component.offset for component in start.state}
     assert expected[offsets["qpos"]] == simulation.data.qpos[0]
+
+
+@pytest.fixture
+def still(tmp_path: Path) -> Iterator[Simulation]:
+    """One that tells whether its view has moved."""
+    made = Simulation(tmp_path, is_unmoved=lambda: made.is_unmoved)
+    made.is_unmoved = True
+    yield made
+    made.states.finish()
+    made.states.close()
+
+
+def test_its_memory_holds_what_is_captured(still: Simulation) -> None:
+    """State and snapshot, for as long as nothing else has changed."""
+    memory = still.begin().memory
+    assert memory is not None
+    for _ in range(3):
+        still.step()
+        assert memory.is_current()
+        assert b"".join(memory.state) == bytes(still.states.capture_state())
+        assert still.capture() is None
+        assert b"".join(memory.snapshot) == still.row.tobytes()
+    assert still.begin().memory is not None
+
+
+def test_its_memory_is_not_current_while_anything_else_has_changed(
+    still: Simulation,
+) -> None:
+    """A field of the model, the view, or what `model_changed` says."""
+    memory = still.begin().memory
+    assert memory is not None
+    still.model.geom_rgba[0] = (1, 0, 0, 1)
+    assert not memory.is_current()
+    assert list(still.capture()) == ["geom_rgba"]
+    assert memory.is_current()
+    still.is_unmoved = False
+    assert not memory.is_current()
+    still.is_unmoved = True
+    assert memory.is_current()
+    still.states.model_changed()
+    assert not memory.is_current()
+
+
+def test_there_is_no_such_memory_where_a_closer_look_is_needed(
+    simulation: Simulation,
+) -> None:
+    """Nobody tells here whether the view has moved."""
+    assert simulation.begin().memory is None
 
 
 def test_a_picture_follows_from_what_was_recorded(simulation: Simulation) -> None:

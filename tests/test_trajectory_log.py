@@ -270,6 +270,38 @@ def test_a_withdrawn_row_was_never_there(path: Path) -> None:
     check(read(path), 4)
 
 
+def add_moment(writer: TrajectoryLogWriter, step: int) -> None:
+    row, snapshot = step_bytes(step), frame_bytes(step)
+    writer.add_moment(step, step / 3, step == 8, step == 9, row, snapshot)
+
+
+def test_a_moment_is_a_step_with_its_frame(tmp_path: Path) -> None:
+    """The file is the same, byte for byte, also where blocks are full."""
+    path = tmp_path / "moments.log"
+    writer = TrajectoryLogWriter(path, HEADER)
+    steps = 2 * min(writer.blocks.steps.capacity, writer.blocks.frames.capacity) + 3
+    write_step(writer, 0)
+    for step in range(1, steps + 1):
+        add_moment(writer, step)
+    # There is nothing to take back.
+    writer.withdraw_row()
+    writer.close()
+    check(read(path), steps)
+
+
+def test_a_moment_that_finds_no_room_was_not_added(path: Path) -> None:
+    """Neither its step nor its frame; both can be added again."""
+    writer = write(path, 0)
+    rows = min(writer.blocks.steps.capacity, writer.blocks.frames.capacity)
+    for step in range(1, rows):
+        add_moment(writer, step)
+    with file_size_limit(5000), pytest.raises(FileNotWritten):
+        add_moment(writer, rows)
+    add_moment(writer, rows)
+    writer.close()
+    check(read(path), rows)
+
+
 def test_a_flush_is_due_after_a_second(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -520,6 +552,7 @@ def test_a_closed_log_takes_nothing(path: Path) -> None:
     for use in (
         lambda: writer.step_row(2, 0, False, False),
         lambda: writer.frame_row(2),
+        lambda: add_moment(writer, 2),
         lambda: writer.add_facts({}),
         lambda: writer.add_model_change(ModelChange(step=0, fields={})),
         writer.flush,

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -19,7 +20,7 @@ from mjrec.formats.trajectory import (
 )
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
-from mjrec.simulation.state_source import EpisodeStart
+from mjrec.simulation.state_source import EpisodeStart, MomentMemory
 
 
 class Counter:
@@ -67,6 +68,30 @@ class Counter:
     def model_changed(self) -> None: ...
     def finish(self) -> None: ...
     def close(self) -> None: ...
+
+
+class Remembered(Counter):
+    """The same with memory of its own, where asking is needed only now and then."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[int] = []
+        self.numbers = np.zeros(6)
+        views = [part.view(np.uint8).data for part in np.split(self.numbers, [1, 3])]
+        memory = MomentMemory(
+            state=(views[0], views[1]),
+            snapshot=(views[2],),
+            is_current=self.is_current,
+        )
+        self.start = dataclasses.replace(Counter.start, memory=memory)
+
+    def is_current(self) -> bool:
+        self.numbers[:] = (self.time(), self.step, -self.step, *[self.step] * 3)
+        return self.step not in self.changes and self.step < self.hidden_from
+
+    def capture_state(self) -> memoryview:
+        self.asked.append(self.step)
+        return super().capture_state()
 
 
 def recorder(
@@ -129,6 +154,39 @@ def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:
     assert (facts["rate"], facts["timestep"], facts["stride"]) == ("50", "1/50", 1)
     assert facts["complete"] is True
     assert trajectory.frame_count == 4
+
+
+@pytest.mark.parametrize(("max_fps", "hidden_from"), [(None, 99), (25, 99), (None, 7)])
+def test_memory_of_the_simulation_gives_the_same(
+    tmp_path: Path, max_fps: Any, hidden_from: int
+) -> None:
+    """It is asked at the reset, at the first step, and where something has changed."""
+    logs = []
+    for states in (Counter(), Remembered()):
+        states.changes[5] = {"geom_rgba": np.zeros((1, 4), np.float32)}
+        states.hidden_from = hidden_from
+        path = tmp_path / f"{type(states).__name__}.log"
+        trajectory = recorder(path, states, max_fps=max_fps)
+        for step in range(1, 10):
+            trajectory.before_step(np.full(2, step, np.float32))
+            states.step = step
+            try:
+                trajectory.step(step / 2, False, False, None, False, True)
+            except PicturesDiffer as error:
+                trajectory.stop_frames(str(error))
+        trajectory.end({})
+        logs.append(path)
+    read, expected = content(logs[1]), content(logs[0])
+    assert read.states.tobytes() == expected.states.tobytes()
+    assert read.snapshots.tobytes() == expected.snapshots.tobytes()
+    assert read.frame_steps.tolist() == expected.frame_steps.tolist()
+    assert read.header.facts == expected.header.facts
+    assert [change.step for change in read.model_changes] == [
+        change.step for change in expected.model_changes
+    ]
+    assert isinstance(states, Remembered)
+    if max_fps is None:
+        assert states.asked == [0, 1, 5, *range(hidden_from, 10)]
 
 
 @pytest.mark.parametrize(

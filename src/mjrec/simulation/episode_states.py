@@ -291,11 +291,14 @@ class _StoredModel:
         self._state = np.empty(mujoco.mj_stateSize(model, STATE_SPEC))
         self._state_bytes = self._state.view(np.uint8).data
         self.state_memory: tuple[memoryview, ...] | None = None
+        self._followed: int | None = None
 
     def follow(self, data: mujoco.MjData) -> None:
         """Record the states of `data` from here on."""
         self.data = data
-        if self._has_state_memory:
+        if self._has_state_memory and data._address != self._followed:
+            # It is kept alive, so that no other can have its address.
+            self._followed = data._address
             self.state_memory = state_memory(self._model, data)
 
     def read_state(self) -> bytes | memoryview:

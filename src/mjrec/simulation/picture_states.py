@@ -171,10 +171,11 @@ class PictureStates:
         Args:
             changed_fields: of the model, other than in the stored one.
         """
-        if not changed_fields and self.is_sound(changed_fields):
+        is_sound = self.is_sound(changed_fields)
+        if is_sound and not changed_fields:
             return None
         reason = needs_constraints(self._model, self.view.option)
-        if reason is not None or self.is_sound(changed_fields):
+        if reason is not None or is_sound:
             return reason
         row = np.empty(self.layout.size, np.uint8)
         self.source.take(row)
