@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from .errors import (
     ArchiveError,
+    BlankVideo,
     ClosedError,
     DifferentEnvironment,
     DirectoryInUse,
@@ -89,6 +90,7 @@ _LAZY = {
 # `DmEnvMonitor` needs dm_env.
 __all__ = [
     "ArchiveError",
+    "BlankVideo",
     "ClosedError",
     "DifferentEnvironment",
     "DirectoryInUse",

@@ -21,6 +21,7 @@
     ├── EncoderError                        ffmpeg failed or died
     │   └── FrameCountError                 the finished file lacks or doubles frames
     ├── RenderError                         videos could not be made of their states
+    ├── BlankVideo                          strict=True, and nothing is to be seen
     ├── GLError                             no backend renders, or the wrong one
     ├── PolicyError                         a policy raised or gave a bad action
     ├── ArchiveError                        write_archive's checks
@@ -40,6 +41,7 @@ from typing import Any
 
 __all__ = [
     "ArchiveError",
+    "BlankVideo",
     "ClosedError",
     "DifferentEnvironment",
     "DirectoryInUse",
@@ -227,6 +229,26 @@ class RenderError(Error):
         super().__init__(
             f"{len(self.failures)} of the videos in {directory} could not be rendered: "
             f"{reasons} Their states are kept; to try again: mjrec render {directory}"
+        )
+
+
+class BlankVideo(Error):
+    """With `strict=True`: a video is whole, and shows nothing.
+
+    Attributes:
+        path: the video; it is kept, and so is its metadata, which says the same.
+        frame_count: how many frames it has.
+        suspicion: what is wrong with it.
+    """
+
+    def __init__(self, path: Path, *, frame_count: int, suspicion: str) -> None:
+        self.path = path
+        self.frame_count = frame_count
+        self.suspicion = suspicion
+        super().__init__(
+            f"{path} shows nothing: {suspicion}. The file is kept. Look at the lights "
+            "and the camera of the model, and at what `mjrec doctor` says of OpenGL; "
+            "without strict (--strict) this is a warning."
         )
 
 

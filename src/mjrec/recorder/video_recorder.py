@@ -14,6 +14,7 @@ from typing import Any, Protocol, Self
 
 from .. import json_text
 from ..atomic_files import write_text
+from ..blank_frames import BlankFrames
 from ..errors import InvalidArgument, InvalidFrame
 from ..formats.asciicast import AsciicastWriter, text_of_frame
 from ..formats.video_metadata import StepRuns, file_facts, timing_facts
@@ -78,6 +79,8 @@ class VideoRecorder:
         clock: returns the simulated time in seconds, or None where there is none.
         declared: returns the rate to take where there is no simulated time.
         facts: returns more for the metadata, asked for once, after the last frame.
+        strict: whether images that show nothing (all black, of one colour each, or all
+            the same) are an error of `close`; else they are a warning.
 
     Raises:
         InvalidArgument: both `path` and `base_path` are given, or the extension is
@@ -106,6 +109,7 @@ class VideoRecorder:
         clock: Callable[[], float | None] | None = None,
         declared: Callable[[], Fraction] | None = None,
         facts: Callable[[], Mapping[str, Any]] | None = None,
+        strict: bool = False,
     ) -> None:
         self.env = env
         self.enabled = bool(enabled) and can_give_pictures(env)
@@ -118,6 +122,8 @@ class VideoRecorder:
         self._clock = clock or (lambda: simulation_time(env))
         self._declared = declared or (lambda: declared_rate(env))
         self._facts = facts
+        self._strict = strict
+        self._blank_frames = BlankFrames()
         self._fps = None if fps is None else to_rate(fps)
         self._max_fps = None if max_fps is None else to_rate(max_fps, name="max_fps")
         self._stride = 1
@@ -221,6 +227,7 @@ class VideoRecorder:
 
         Raises:
             EncoderError: ffmpeg failed; the metadata is written all the same.
+            BlankVideo: with `strict`; the video and its metadata are there.
         """
         if self._closed:
             return
@@ -234,6 +241,8 @@ class VideoRecorder:
                 raise
             self._write_metadata()
         self._closed = True
+        if self.finished and self.path is not None:
+            self._blank_frames.judge(Path(self.path), strict=self._strict)
 
     def __enter__(self) -> Self:
         return self
@@ -278,6 +287,7 @@ class VideoRecorder:
     def _checked_frame(self, frame: object) -> Frame:
         checked = check_frame(frame, size=self._size)
         self._size = (checked.shape[0], checked.shape[1])
+        self._blank_frames.add(checked)
         return checked
 
     def _add(self, frame: Any) -> None:
@@ -390,7 +400,8 @@ class VideoRecorder:
             encoder = {"backend": "TextEncoder", "version": 1}
             return {"encoder_version": encoder, **description}
         if isinstance(self._writer, VideoWriter) and self._writer.result is not None:
-            return {**description, **file_facts(self._writer.result)}
+            file = file_facts(self._writer.result)
+            return {**description, **file, **self._blank_frames.facts()}
         return description
 
 

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How long something may make no progress."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from mjrec import InvalidArgument
+from mjrec.patience import Patience, patience_s
+
+
+def test_the_environment_variable_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two minutes without it."""
+    monkeypatch.delenv("MJREC_PATIENCE", raising=False)
+    assert patience_s() == 120
+    monkeypatch.setenv("MJREC_PATIENCE", "2.5")
+    assert patience_s() == 2.5
+    assert Patience().seconds == 2.5
+
+
+@pytest.mark.parametrize("text", ["soon", "0", "-1", "inf", "nan"])
+def test_what_is_no_time_is_an_error(
+    text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It names the variable."""
+    monkeypatch.setenv("MJREC_PATIENCE", text)
+    with pytest.raises(InvalidArgument, match="MJREC_PATIENCE"):
+        patience_s()
+
+
+def test_it_ends_and_begins_anew() -> None:
+    """Progress gives all the time once more."""
+    patience = Patience(0.02)
+    while not patience.is_over:
+        time.sleep(patience.begin_slice())
+        patience.end_slice()
+    patience.renew()
+    assert not patience.is_over
+
+
+def test_who_was_stopped_counts_no_more_than_he_was_to_wait(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A machine that slept for an hour has not made anything hang."""
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    patience = Patience(120)
+    assert patience.begin_slice() == 1
+    now[0] += 3600
+    patience.end_slice()
+    assert not patience.is_over
