@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import tracemalloc
 from pathlib import Path
 
@@ -226,7 +225,7 @@ def test_a_missing_directory_is_an_error_at_once(tmp_path: Path) -> None:
 
 def test_memory_does_not_grow_with_the_episodes(tmp_path: Path) -> None:
     """Episodes are read as they are asked for."""
-    items = itertools.repeat(entry(0, "x" * 1000), 5000)
+    items = (entry(number, "x" * 1000) for number in range(5000))
     path = write_journal(tmp_path, "0.7", *items)
     tracemalloc.start()
     count = sum(1 for _ in mjrec.iter_episodes(tmp_path))

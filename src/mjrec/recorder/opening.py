@@ -13,7 +13,7 @@ import itertools
 import os
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,22 +24,20 @@ from ..errors import (
     ExistingRecordings,
     UnreadableFile,
 )
-from ..formats.journal import read_journal
+from ..formats.journal import MOST_EPISODES, JournalReader
 from ..formats.locks import Lock, is_locked
-from ..formats.manifest import read_manifest
 from ..formats.monitor_directory import (
     Infix,
     check_uid,
-    episode_of,
     infix_of,
-    is_manifest,
     iter_monitor_files,
     journal_name,
     lock_name,
     manifest_name,
 )
-from ..formats.stats_file import read_stats_file
 from ..results import clear_monitor_files
+from ..results.monitor_files import MonitorFiles, monitors_of
+from ..results.sources import MonitorResults
 
 __all__ = ["OpenDirectory", "open_directory"]
 
@@ -136,69 +134,66 @@ def _check_existing(path: Path, *, force: bool, resume: bool, env_id: str) -> No
     if force:
         clear_monitor_files(path)
         return
-    existing = list(iter_monitor_files(path, hidden=True))
+    existing = [file.name for file in iter_monitor_files(path, hidden=True)]
     if existing and not resume:
-        raise ExistingRecordings(path, [file.name for file in existing])
-    for recorded in _recorded_env_ids(existing):
+        raise ExistingRecordings(path, existing)
+    for recorded in _recorded_env_ids(path):
         if recorded != env_id:
             raise DifferentEnvironment(path, recorded, env_id)
 
 
-def _recorded_env_ids(files: Iterable[Path]) -> Iterator[str]:
-    for file in files:
-        env_info: object = None
-        if is_manifest(file.name):
-            env_info = read_manifest(file).env_info
-        elif file.suffix == ".lock":
-            env_info = _lock_content(file).get("env_info")
-        if isinstance(env_info, Mapping) and isinstance(env_info.get("env_id"), str):
+def _recorded_env_ids(path: Path) -> Iterator[str]:
+    for files in monitors_of(path):
+        env_info = MonitorResults(files).env_info or {}
+        if isinstance(env_info.get("env_id"), str):
             yield env_info["env_id"]
-
-
-def _lock_content(path: Path) -> Mapping[str, object]:
-    # A lock vanishes when its monitor closes, and is empty for a moment after it was
-    # made: neither says anything.
-    try:
-        content = json_text.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, Mapping) else {}
 
 
 def _next_episode_id(path: Path, *, uid: str | None) -> int:
     """Return the number after the highest of the monitors that are not open."""
     highest = -1
-    open_monitors: dict[str, bool] = {}
-    # Also unfinished ones: an episode in flight when a process died has a number.
-    for file in iter_monitor_files(path, hidden=True):
-        text = infix_of(file.name)
-        infix = Infix.parse(text) if text else None
+    for files in monitors_of(path):
+        infix = Infix.parse(files.infix)
         if infix is None or (uid is not None and infix.uid != uid):
             continue
-        if str(infix) not in open_monitors:
-            open_monitors[str(infix)] = is_locked(path / lock_name(infix))
-        if not open_monitors[str(infix)]:
-            highest = max(highest, _highest_episode_id(file))
+        if not is_locked(path / lock_name(infix)):
+            highest = max(highest, _last_episode_id(files))
     return highest + 1
 
 
-def _highest_episode_id(file: Path) -> int:
-    """Return the highest episode number that one monitor file speaks of; -1 if none."""
-    in_name = episode_of(file.name)
-    if in_name is not None:
-        return in_name
-    if file.name.endswith(".jsonl"):
-        return max((entry.episode_id for entry in read_journal(file)), default=-1)
-    if not is_manifest(file.name):
+def _last_episode_id(files: MonitorFiles) -> int:
+    """Return the highest episode number that a monitor's files speak of; -1 if none."""
+    # Names count too: an episode in flight when a process died has a number.
+    return max(files.last_episode_id, _last_journaled(files), _last_counted(files))
+
+
+def _last_journaled(files: MonitorFiles) -> int:
+    if files.journal is None:
         return -1
-    manifest = read_manifest(file)
-    if manifest.mjrec is not None:
-        next_id = manifest.mjrec.get("next_episode_id")
-        if not isinstance(next_id, int):
-            raise UnreadableFile(file, "its mjrec.next_episode_id is no whole number")
+    reader = JournalReader(files.journal)
+    for _ in reader:
+        pass
+    reader.report()
+    return reader.last_episode_id
+
+
+def _last_counted(files: MonitorFiles) -> int:
+    """Return the last number that the manifest says or implies."""
+    results = MonitorResults(files)
+    if results.manifest is None:
+        return -1
+    if results.manifest.mjrec is not None:
+        next_id = results.manifest.mjrec.get("next_episode_id")
+        if type(next_id) is not int or not 0 <= next_id <= MOST_EPISODES:
+            assert files.manifest is not None
+            raise UnreadableFile(
+                files.manifest, "its mjrec.next_episode_id is no episode's number"
+            )
         return next_id - 1
     # Gym's own: its numbers count the resets, each of which has a type, from 0.
-    stats = read_stats_file(file.with_name(manifest.stats))
+    stats = results.saved
+    if stats is None:
+        return -1
     return max(len(stats.timestamps), len(stats.episode_types or ())) - 1
 
 

@@ -60,7 +60,11 @@ def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
                 f"Cannot clear {directory}: a monitor that is still open writes there "
                 f"(it holds {path.name}). Close it first, or use another directory."
             )
-    # Manifests first: if this is interrupted, none lists what is gone.
-    for path in sorted(paths, key=lambda path: not is_manifest(path.name)):
+    # Manifests and journals first: if this is interrupted, none lists what is gone.
+    for path in sorted(paths, key=lambda path: not _is_listing(path.name)):
         path.unlink(missing_ok=True)
     logger.info("Removed %d monitor files from %s.", len(paths), directory)
+
+
+def _is_listing(name: str) -> bool:
+    return is_manifest(name) or name.endswith(".jsonl")

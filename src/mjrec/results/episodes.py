@@ -3,31 +3,21 @@
 
 from __future__ import annotations
 
-import functools
 import os
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
-from ..formats.journal import read_journal
-from ..formats.manifest import read_manifest
-from ..formats.monitor_directory import (
-    Infix,
-    episode_of,
-    infix_of,
-    is_manifest,
-    iter_monitor_files,
-)
-from ..formats.stats_file import read_stats_file
+from ..formats.journal import MOST_EPISODES, JournalEntry, read_journal
+from ..formats.stats_file import StatsFile
 from ..formats.trajectory_log_reader import TrajectoryLogReader
+from .monitor_files import MonitorFiles, monitors_of
+from .numbering import NumberedEpisode, number_episodes
+from .sources import MonitorResults
 
 __all__ = ["Episode", "iter_episodes"]
-
-# Videos of further cameras have the camera's name before the ending.
-_VIDEO = re.compile(r".*\.video(?P<episode>\d{6,})\.(?P<kind>meta\.json|mp4|avi|json)")
 
 
 @dataclass(frozen=True)
@@ -77,67 +67,152 @@ class Episode:
     pending: bool = False
 
 
-class _Files:
-    """The files of one monitor.
+def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
+    """Yield the completed episodes of a directory, monitor after monitor.
 
-    Args:
-        infix: what its files have in common.
-        paths: its files.
+    Monitors come in the order of their infix, the episodes of each in the order of
+    their ends. Monitors that never closed are included, with what their journal
+    holds. The episodes are read as they are asked for: a journal of any length needs
+    little memory.
+
+    Where a journal lacks episodes that the statistics file has, the episodes are the
+    statistics file's, and the journal adds what it says of each. What is damaged in a
+    journal is left out with a warning.
+
+    Gym's files do not say which video shows which episode where an environment was
+    reset twice in a row; such a monitor's episodes have None as their video. So do
+    episodes whose number is lost with their line of the journal; their `episode_id`
+    is the lowest that they can have had.
+
+    Raises:
+        UnreadableFile: there is no such directory (at once), or a file in it is
+            damaged and no other has the same episodes (when it is read).
     """
+    directory = Path(directory)
+    if not directory.is_dir():
+        raise UnreadableFile(directory, "there is no such directory")
+    return _iter_monitors(monitors_of(directory))
 
-    def __init__(self, infix: str, paths: Iterable[Path]) -> None:
-        self.infix = infix
-        self.manifest: Path | None = None
-        self.stats: Path | None = None
-        self.journal: Path | None = None
-        self.videos: dict[int, Path] = {}
-        self.metadata: dict[int, Path] = {}
-        self.trajectories: dict[int, Path] = {}
-        for path in paths:
-            self._sort_in(path)
 
-    def _sort_in(self, path: Path) -> None:
-        video = _VIDEO.fullmatch(path.name)
-        if is_manifest(path.name):
-            self.manifest = path
-        elif path.name.endswith(".stats.json"):
-            self.stats = path
-        elif path.suffix == ".jsonl":
-            self.journal = path
-        elif video is not None:
-            kind = self.metadata if video["kind"] == "meta.json" else self.videos
-            kind[int(video["episode"])] = path
-        elif path.suffix in (".h5", ".log"):
-            self._sort_in_trajectory(path)
+def _iter_monitors(monitors: Iterable[MonitorFiles]) -> Iterator[Episode]:
+    for files in monitors:
+        results = MonitorResults(files)
+        if files.journal is None and not results.details:
+            yield from _from_gym(results)
+        elif results.journal_count >= max(results.saved_count, 0):
+            yield from _from_journal(results)
+        else:
+            yield from _from_stats(results)
 
-    def _sort_in_trajectory(self, path: Path) -> None:
-        number = episode_of(path.name)
-        if number is not None and (
-            path.suffix == ".h5" or number not in self.trajectories
-        ):
-            self.trajectories[number] = path
 
-    def is_pending(self, episode_id: int) -> bool:
-        """Tell whether an episode's video is promised and not there."""
-        trajectory = self.trajectories.get(episode_id)
-        # Metadata without a video is what is left of one that could not be made.
-        if trajectory is None or episode_id in (*self.videos, *self.metadata):
-            return False
-        details = self._details
-        next_episode_id = details.get("next_episode_id")
-        if isinstance(next_episode_id, int) and episode_id < next_episode_id:
-            return episode_id in _pending_ids(details)
-        # Its monitor is open, or was killed.
-        return trajectory.suffix == ".h5" or _says_deferred(trajectory)
+def _from_journal(results: MonitorResults) -> Iterator[Episode]:
+    assert results.files.journal is not None
+    for entry in read_journal(results.files.journal):
+        yield _journaled(results, entry)
 
-    @functools.cached_property
-    def _details(self) -> Mapping[str, Any]:
-        """What this package adds to a manifest; nothing where there is no sound one."""
-        try:
-            manifest = None if self.manifest is None else read_manifest(self.manifest)
-        except UnreadableFile:
-            return {}
-        return {} if manifest is None or manifest.mjrec is None else manifest.mjrec
+
+def _journaled(results: MonitorResults, entry: JournalEntry) -> Episode:
+    files = results.files
+    return Episode(
+        episode_id=entry.episode_id,
+        length=entry.length,
+        reward=entry.reward,
+        type=entry.type,
+        start_time=entry.start_time,
+        end_time=entry.end_time,
+        seed=entry.seed,
+        options=entry.options,
+        terminated=entry.terminated,
+        truncated=entry.truncated,
+        monitor=files.infix,
+        video=files.videos.get(entry.episode_id),
+        metadata=files.metadata.get(entry.episode_id),
+        trajectory=files.trajectories.get(entry.episode_id),
+        pending=_is_pending(results, entry.episode_id),
+    )
+
+
+def _from_stats(results: MonitorResults) -> Iterator[Episode]:
+    """Yield what a statistics file of this package has and the journal lacks."""
+    stats = results.saved
+    if stats is None:
+        return
+    first = _episode_number(results.details.get("first_episode_id"))
+    for numbered in number_episodes(
+        stats,
+        _readable_entries(results),
+        first=0 if first is None else first,
+        following=_episode_number(results.details.get("next_episode_id")),
+    ):
+        if numbered.entry is not None:
+            yield _journaled(results, numbered.entry)
+        else:
+            yield _saved(results, stats, numbered)
+
+
+def _readable_entries(results: MonitorResults) -> Iterator[JournalEntry]:
+    if results.files.journal is not None and results.journal_count > 0:
+        yield from read_journal(results.files.journal)
+
+
+def _saved(
+    results: MonitorResults, stats: StatsFile, numbered: NumberedEpisode
+) -> Episode:
+    number = numbered.episode_id
+    # A video is never shown for another episode.
+    files = results.files if numbered.is_certain else MonitorFiles("", ())
+    return Episode(
+        episode_id=number,
+        length=stats.episode_lengths[numbered.index],
+        reward=stats.episode_rewards[numbered.index],
+        type=_types(stats)[numbered.index],
+        start_time=None,
+        end_time=stats.timestamps[numbered.index],
+        seed=None,
+        options=None,
+        terminated=None,
+        truncated=None,
+        monitor=results.files.infix,
+        video=files.videos.get(number),
+        metadata=files.metadata.get(number),
+        trajectory=files.trajectories.get(number),
+        pending=numbered.is_certain and _is_pending(results, number),
+    )
+
+
+def _from_gym(results: MonitorResults) -> Iterator[Episode]:
+    stats = results.saved
+    if stats is None:
+        return
+    # Gym noted a type at each reset, and numbered the videos by resets. One more than
+    # episodes is the last one, which did not end; two more are resets in a row.
+    is_numbered = len(_types(stats)) <= len(stats.timestamps) + 1
+    for index in range(len(stats.timestamps)):
+        yield _saved(results, stats, NumberedEpisode(index, index, is_numbered, None))
+
+
+def _types(stats: StatsFile) -> Sequence[str]:
+    types = stats.episode_types
+    return ("t",) * len(stats.timestamps) if types is None else types
+
+
+def _is_pending(results: MonitorResults, episode_id: int) -> bool:
+    """Tell whether an episode's video is promised and not there."""
+    files = results.files
+    trajectory = files.trajectories.get(episode_id)
+    # Metadata without a video is what is left of one that could not be made.
+    if trajectory is None or episode_id in (*files.videos, *files.metadata):
+        return False
+    known = _episode_number(results.details.get("next_episode_id")) or 0
+    # The last one was still running when a manifest was written that others followed.
+    if episode_id < known - results.is_behind:
+        return episode_id in _pending_ids(results.details)
+    # Its monitor is open, or was killed.
+    return trajectory.suffix == ".h5" or _says_deferred(trajectory)
+
+
+def _episode_number(value: object) -> int | None:
+    return value if type(value) is int and 0 <= value <= MOST_EPISODES else None
 
 
 def _pending_ids(details: Mapping[str, Any]) -> list[Any]:
@@ -155,106 +230,3 @@ def _says_deferred(log: Path) -> bool:
         # Damaged, or finished just now.
         return False
     return isinstance(video, dict) and video.get("recording") == "deferred"
-
-
-def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
-    """Yield the completed episodes of a directory, monitor after monitor.
-
-    Monitors come in the order of their infix, the episodes of each in the order of
-    their ends. Monitors that never closed are included, with what their journal
-    holds. The episodes are read as they are asked for: a journal of any length needs
-    little memory.
-
-    Gym's files do not say which video shows which episode where an environment was
-    reset twice in a row; such a monitor's episodes have None as their video.
-
-    Raises:
-        UnreadableFile: there is no such directory (at once), or a file in it is
-            damaged (when it is read).
-    """
-    directory = Path(directory)
-    if not directory.is_dir():
-        raise UnreadableFile(directory, "there is no such directory")
-    return _iter_monitors(_monitors(directory))
-
-
-def _iter_monitors(monitors: Iterable[_Files]) -> Iterator[Episode]:
-    for files in monitors:
-        if files.journal is not None:
-            yield from _from_journal(files, files.journal)
-        else:
-            yield from _from_stats(files)
-
-
-def _monitors(directory: Path) -> list[_Files]:
-    grouped: dict[str, list[Path]] = {}
-    for path in iter_monitor_files(directory):
-        infix = infix_of(path.name)
-        if infix is not None:
-            grouped.setdefault(infix, []).append(path)
-    return [_Files(infix, grouped[infix]) for infix in sorted(grouped, key=_order)]
-
-
-def _order(infix: str) -> tuple[int, int, int, str]:
-    parsed = Infix.parse(infix)
-    if parsed is None:
-        return (1, 0, 0, infix)
-    # Process ids are numbers: 9 comes before 10.
-    number = int(parsed.uid) if parsed.uid.isdecimal() else 0
-    return (0, parsed.monitor_id, number, parsed.uid)
-
-
-def _from_journal(files: _Files, journal: Path) -> Iterator[Episode]:
-    for entry in read_journal(journal):
-        yield Episode(
-            episode_id=entry.episode_id,
-            length=entry.length,
-            reward=entry.reward,
-            type=entry.type,
-            start_time=entry.start_time,
-            end_time=entry.end_time,
-            seed=entry.seed,
-            options=entry.options,
-            terminated=entry.terminated,
-            truncated=entry.truncated,
-            monitor=files.infix,
-            video=files.videos.get(entry.episode_id),
-            metadata=files.metadata.get(entry.episode_id),
-            trajectory=files.trajectories.get(entry.episode_id),
-            pending=files.is_pending(entry.episode_id),
-        )
-
-
-def _from_stats(files: _Files) -> Iterator[Episode]:
-    path = _stats_path(files)
-    if path is None:
-        return
-    stats = read_stats_file(path)
-    count = len(stats.timestamps)
-    types = ("t",) * count if stats.episode_types is None else stats.episode_types
-    # Gym noted a type at each reset, and numbered the videos by resets. One more than
-    # episodes is the last one, which did not end; two more are resets in a row.
-    numbered = len(types) <= count + 1
-    for index in range(count):
-        yield Episode(
-            episode_id=index,
-            length=stats.episode_lengths[index],
-            reward=stats.episode_rewards[index],
-            type=types[index],
-            start_time=None,
-            end_time=stats.timestamps[index],
-            seed=None,
-            options=None,
-            terminated=None,
-            truncated=None,
-            monitor=files.infix,
-            video=files.videos.get(index) if numbered else None,
-            metadata=files.metadata.get(index) if numbered else None,
-        )
-
-
-def _stats_path(files: _Files) -> Path | None:
-    if files.manifest is None:
-        # A process that died between writing the two.
-        return files.stats
-    return files.manifest.parent / read_manifest(files.manifest).stats

@@ -10,9 +10,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..formats.manifest import Manifest, read_manifest
 from ..formats.stats_file import StatsFile, read_stats_file
-from .detection import detect_training_manifests
+from ..formats.video_metadata import is_broken
+from .monitor_files import MonitorFiles, monitors_of
+from .recorded_environment import GYM_VERSION
+from .sources import MonitorResults
 
 __all__ = ["MergedStats", "load_results", "merge_stats_files"]
 
@@ -46,7 +48,7 @@ class MergedStats(NamedTuple):
 
 
 def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Return the results of all closed monitors of a directory, merged.
+    """Return the results of all monitors of a directory, merged.
 
     The dictionary has gym's keys: `manifests`, `env_info`, `data_sources`,
     `timestamps`, `episode_lengths`, `episode_rewards`, `episode_types`,
@@ -54,31 +56,40 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
     `data_sources` is an index into `manifests` and into `initial_reset_timestamps`.
     `videos` holds pairs of the paths of a video and its metadata.
 
-    Manifests of several environments or versions are accepted with a warning that
+    A monitor that never closed, because it was killed or is still open, counts with
+    the complete episodes of its journal, if they are more than those of its
+    statistics file; episodes are never taken from both. Where it left no manifest,
+    the path of its journal stands among `manifests`; its videos are those that are
+    there and not broken. What is damaged in a journal is left out with a warning.
+
+    Monitors of several environments or versions are accepted with a warning that
     shows the difference; `env_info` is then the newest's. Listed videos that are
     gone are left out with a warning.
 
     Returns:
         The results, or None, with an error in the log, where there is no such
-        directory or no manifest in it.
+        directory, or neither a manifest nor a journal in it.
 
     Raises:
-        UnreadableFile: a manifest or statistics file is missing or damaged.
+        UnreadableFile: a manifest or statistics file is missing or damaged, and there
+            is no journal to be read in its stead.
     """
     directory = Path(directory)
     if not directory.is_dir():
         logger.error("There is no directory %s.", directory)
         return None
-    paths = detect_training_manifests(directory)
-    if not paths:
-        logger.error("There are no manifests in %s.", directory)
+    monitors = [files for files in monitors_of(directory) if _has_results(files)]
+    if not monitors:
+        logger.error("There are no manifests in %s, and no journals.", directory)
         return None
-    manifests = [read_manifest(Path(path)) for path in paths]
-    stats = [read_stats_file(directory / manifest.stats) for manifest in manifests]
+    # In the order of the manifests' names, as gym has it.
+    results = [MonitorResults(files) for files in sorted(monitors, key=_gyms_order)]
+    paths = [_path(monitor) for monitor in results]
+    stats = [monitor.stats() for monitor in results]
     merged = _merge(stats)
     return {
         "manifests": paths,
-        "env_info": _env_info(directory, paths, manifests, stats),
+        "env_info": _env_info(directory, paths, results, stats),
         "data_sources": merged.data_sources,
         "timestamps": merged.timestamps,
         "episode_lengths": merged.episode_lengths,
@@ -86,7 +97,7 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
         "episode_types": merged.episode_types,
         "initial_reset_timestamps": merged.initial_reset_timestamps,
         "initial_reset_timestamp": merged.initial_reset_timestamp,
-        "videos": _videos(directory, manifests),
+        "videos": _videos(directory, results),
     }
 
 
@@ -147,24 +158,39 @@ def _rows(source: int, stats: StatsFile) -> Iterable[_Row]:
     )
 
 
+def _has_results(files: MonitorFiles) -> bool:
+    return files.manifest is not None or files.journal is not None
+
+
+def _gyms_order(files: MonitorFiles) -> str:
+    return f"{files.infix}.manifest.json"
+
+
+def _path(results: MonitorResults) -> str:
+    return str(results.files.manifest or results.files.journal)
+
+
 def _env_info(
     directory: Path,
     paths: Sequence[str],
-    manifests: Sequence[Manifest],
+    results: Sequence[MonitorResults],
     stats: Sequence[StatsFile],
 ) -> dict[str, Any]:
-    infos = [manifest.env_info for manifest in manifests]
-    if all(info == infos[0] for info in infos):
-        return dict(infos[0])
-    newest = max(range(len(infos)), key=lambda index: _last_time(stats[index]))
-    logger.warning(
-        "The monitors of %s recorded different things: %s. Their results are merged; "
-        "env_info is that of %s.",
-        directory,
-        _differences(paths, infos),
-        Path(paths[newest]).name,
-    )
-    return dict(infos[newest])
+    said = [(index, monitor.env_info) for index, monitor in enumerate(results)]
+    # Of a killed monitor there may be nothing left that says it.
+    known = {index: info for index, info in said if info is not None}
+    if not known:
+        return {"gym_version": GYM_VERSION}
+    newest = max(known, key=lambda index: _last_time(stats[index]))
+    if any(info != known[newest] for info in known.values()):
+        logger.warning(
+            "The monitors of %s recorded different things: %s. Their results are "
+            "merged; env_info is that of %s.",
+            directory,
+            _differences([paths[index] for index in known], [*known.values()]),
+            Path(paths[newest]).name,
+        )
+    return dict(known[newest])
 
 
 def _last_time(stats: StatsFile) -> float:
@@ -191,11 +217,13 @@ def _difference(
     return f"{key} is " + ", ".join(f"{v} in {name}" for v, name in values.items())
 
 
-def _videos(directory: Path, manifests: Sequence[Manifest]) -> list[tuple[str, str]]:
+def _videos(
+    directory: Path, results: Sequence[MonitorResults]
+) -> list[tuple[str, str]]:
     listed = [
         (directory / video, directory / metadata)
-        for manifest in manifests
-        for video, metadata in manifest.videos
+        for monitor in results
+        for video, metadata in _names_of_videos(monitor)
     ]
     gone = [video.name for video, _ in listed if not video.is_file()]
     if gone:
@@ -207,3 +235,22 @@ def _videos(directory: Path, manifests: Sequence[Manifest]) -> list[tuple[str, s
             ", ".join(gone[:5]) + (" ..." if len(gone) > 5 else ""),
         )
     return [(str(v), str(m)) for v, m in listed if v.is_file()]
+
+
+def _names_of_videos(results: MonitorResults) -> list[tuple[str, str]]:
+    """Return what the manifest lists, and what was finished after it was written."""
+    manifest = results.manifest
+    listed = [] if manifest is None else list(manifest.videos)
+    if manifest is None or results.is_behind:
+        found = _finished_videos(results.files)
+        # A video gets its name when it is whole, and its metadata after that.
+        listed += [pair for pair in found if pair not in listed]
+    return listed
+
+
+def _finished_videos(files: MonitorFiles) -> list[tuple[str, str]]:
+    return [
+        (files.videos[number].name, files.metadata[number].name)
+        for number in sorted(files.videos.keys() & files.metadata.keys())
+        if not is_broken(files.metadata[number])
+    ]

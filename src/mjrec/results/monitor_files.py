@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a directory, monitor by monitor."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from ..formats.journal import MOST_EPISODES
+from ..formats.monitor_directory import (
+    Infix,
+    episode_of,
+    infix_of,
+    is_manifest,
+    iter_monitor_files,
+)
+
+__all__ = ["MonitorFiles", "monitors_of"]
+
+# Videos of further cameras have the camera's name before the ending.
+_VIDEO = re.compile(r".*\.video(?P<episode>\d{6,})\.(?P<kind>meta\.json|mp4|avi|json)")
+
+
+class MonitorFiles:
+    """The files of one monitor, as far as results are read from them.
+
+    Args:
+        infix: what their names have in common.
+        paths: the files.
+
+    Attributes:
+        infix: as given.
+        manifest: its manifest, where there is one; likewise:
+        stats: its statistics file.
+        journal: its journal.
+        lock: what it claimed its infix with; it is left where the monitor was killed.
+        videos: its videos, by the numbers of their episodes.
+        metadata: their metadata, likewise.
+        trajectories: the recorded states, likewise; finished files rather than logs.
+        last_episode_id: the highest number of an episode in a name, also of a file
+            that was never finished; -1 where there is none.
+    """
+
+    def __init__(self, infix: str, paths: Iterable[Path]) -> None:
+        self.infix = infix
+        self.manifest: Path | None = None
+        self.stats: Path | None = None
+        self.journal: Path | None = None
+        self.lock: Path | None = None
+        self.videos: dict[int, Path] = {}
+        self.metadata: dict[int, Path] = {}
+        self.trajectories: dict[int, Path] = {}
+        self.last_episode_id = -1
+        for path in paths:
+            self._sort_in(path)
+
+    def _sort_in(self, path: Path) -> None:
+        number = episode_of(path.name)
+        # A name may hold any number of digits, and be anybody's.
+        if number is not None and number < MOST_EPISODES:
+            self.last_episode_id = max(self.last_episode_id, number)
+        video = _VIDEO.fullmatch(path.name)
+        if is_manifest(path.name):
+            self.manifest = path
+        elif path.name.endswith(".stats.json"):
+            self.stats = path
+        elif path.suffix == ".jsonl":
+            self.journal = path
+        elif path.name == f".openaigym.{self.infix}.lock":
+            self.lock = path
+        elif video is not None:
+            kind = self.metadata if video["kind"] == "meta.json" else self.videos
+            kind[int(video["episode"])] = path
+        elif path.suffix in (".h5", ".log"):
+            self._sort_in_trajectory(path)
+
+    def _sort_in_trajectory(self, path: Path) -> None:
+        number = episode_of(path.name)
+        if number is not None and (
+            path.suffix == ".h5" or number not in self.trajectories
+        ):
+            self.trajectories[number] = path
+
+
+def monitors_of(directory: Path) -> list[MonitorFiles]:
+    """Return the files of each monitor, in the order of the infixes.
+
+    Monitors of which there is a lock or an unfinished file only are among them.
+    """
+    grouped: dict[str, list[Path]] = {}
+    for path in iter_monitor_files(directory, hidden=True):
+        infix = infix_of(path.name)
+        if infix is not None:
+            grouped.setdefault(infix, []).append(path)
+    return [
+        MonitorFiles(infix, grouped[infix]) for infix in sorted(grouped, key=_order)
+    ]
+
+
+def _order(infix: str) -> tuple[int, int, int, str]:
+    parsed = Infix.parse(infix)
+    if parsed is None:
+        return (1, 0, 0, infix)
+    # Process ids are numbers: 9 comes before 10.
+    number = int(parsed.uid) if parsed.uid.isdecimal() else 0
+    return (0, parsed.monitor_id, number, parsed.uid)

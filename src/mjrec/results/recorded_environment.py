@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a monitor recorded, also where it left no manifest to say it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import UnreadableFile
+from ..formats.journal import JournalReader
+from ..formats.json_fields import json_object, read_object
+from ..formats.manifest import Manifest
+from ..formats.trajectory_log_reader import TrajectoryLogReader
+from .monitor_files import MonitorFiles
+
+__all__ = ["GYM_VERSION", "recorded_env_info"]
+
+# What stands for gym's version in what this package writes.
+GYM_VERSION = "mjrec-1"
+
+# A lock holds a line; this bounds what somebody may have put in its place.
+_LONGEST_LOCK = 1 << 16
+
+# Of many videos or trajectories, the first ones that can be read say it.
+_TRIES = 3
+
+
+def recorded_env_info(
+    files: MonitorFiles, manifest: Manifest | None
+) -> Mapping[str, Any] | None:
+    """Return the `env_info` of a monitor; None where nothing says it.
+
+    The manifest says it; without one the journal, the lock of a monitor that is open
+    or was killed, a running trajectory, the metadata of a video: the first of them
+    that can be read and does.
+
+    Args:
+        files: of the monitor.
+        manifest: what its manifest says, where there is a sound one.
+    """
+    if manifest is not None:
+        return manifest.env_info
+    for path, read in _witnesses(files):
+        try:
+            env_info = read(path)
+        except (OSError, ValueError, UnreadableFile):
+            # Damaged, or gone just now; the next one may know.
+            continue
+        if isinstance(env_info, Mapping) and isinstance(env_info.get("env_id"), str):
+            return env_info
+    return None
+
+
+def _witnesses(
+    files: MonitorFiles,
+) -> Iterator[tuple[Path, Callable[[Path], object]]]:
+    if files.journal is not None:
+        yield files.journal, _in_journal
+    if files.lock is not None:
+        yield files.lock, _in_lock
+    logs = [path for path in files.trajectories.values() if path.suffix == ".log"]
+    yield from ((path, _in_log) for path in logs[:_TRIES])
+    yield from ((path, _in_metadata) for path in [*files.metadata.values()][:_TRIES])
+
+
+def _in_journal(path: Path) -> object:
+    reader = JournalReader(path)
+    # Only the first line has it.
+    next(iter(reader), None)
+    return reader.env_info
+
+
+def _in_lock(path: Path) -> object:
+    # Empty for a moment after it was made. A link is nobody's lock.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        return json_object(os.read(descriptor, _LONGEST_LOCK)).get("env_info")
+    finally:
+        os.close(descriptor)
+
+
+def _in_log(path: Path) -> object:
+    with TrajectoryLogReader(path) as reader:
+        return _of(reader.header.facts.get("env_id"))
+
+
+def _in_metadata(path: Path) -> object:
+    return _of(read_object(path).get("env_id"))
+
+
+def _of(env_id: object) -> Mapping[str, Any]:
+    return {"gym_version": GYM_VERSION, "env_id": env_id}

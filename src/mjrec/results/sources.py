@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which of a monitor's files its statistics are taken from.
+
+A monitor writes each episode twice: into its journal as the episode ends, and into its
+statistics file, which belongs to the manifest, when it closes (or at each reset). A
+killed monitor leaves a journal alone, or an older manifest beside it. The file with
+more episodes wins, and never are episodes taken from both.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import UnreadableFile
+from ..formats.journal import JournalReader, count_lines
+from ..formats.manifest import Manifest, read_manifest
+from ..formats.stats_file import StatsFile, read_stats_file
+from .monitor_files import MonitorFiles
+from .recorded_environment import recorded_env_info
+
+__all__ = ["MonitorResults"]
+
+logger = logging.getLogger(__name__)
+
+
+class MonitorResults:
+    """What one monitor counted, as far as its files still tell.
+
+    Where a manifest or a statistics file is damaged or missing, the journal stands in
+    for it, and the other way round; the log then has a warning that names the file.
+
+    Args:
+        files: of the monitor.
+
+    Attributes:
+        files: as given.
+    """
+
+    def __init__(self, files: MonitorFiles) -> None:
+        self.files = files
+
+    @functools.cached_property
+    def manifest(self) -> Manifest | None:
+        """What the manifest says; None where there is none.
+
+        Raises:
+            UnreadableFile: it is damaged, and there is no journal either.
+        """
+        path = self.files.manifest
+        if path is None:
+            return None
+        try:
+            return read_manifest(path)
+        except UnreadableFile as error:
+            self._without(error)
+            return None
+
+    @functools.cached_property
+    def saved(self) -> StatsFile | None:
+        """What the statistics file holds; None where there is none.
+
+        Raises:
+            UnreadableFile: it is missing though a manifest names it, or damaged, and
+                there is no journal either.
+        """
+        path = self._stats_path
+        if path is None:
+            return None
+        try:
+            return read_stats_file(path)
+        except UnreadableFile as error:
+            self._without(error)
+            return None
+
+    @property
+    def details(self) -> Mapping[str, Any]:
+        """What this package adds to a manifest; nothing where there is none."""
+        manifest = self.manifest
+        return {} if manifest is None or manifest.mjrec is None else manifest.mjrec
+
+    @property
+    def env_info(self) -> Mapping[str, Any] | None:
+        """What was recorded; None where nothing says it."""
+        return recorded_env_info(self.files, self.manifest)
+
+    def stats(self) -> StatsFile:
+        """Return the statistics of the source with more episodes.
+
+        Raises:
+            UnreadableFile: no source can be read.
+        """
+        saved = self.saved
+        journal = self.files.journal
+        count = self.saved_count
+        try:
+            # A closed monitor's journal need not be read for its statistics.
+            if journal is not None and count_lines(journal) > count:
+                journaled = _stats_of(journal, saved)
+                if len(journaled.timestamps) > count:
+                    return journaled
+        except UnreadableFile as error:
+            if saved is None:
+                raise
+            logger.warning("%s Its monitor's statistics file is used.", error)
+        return StatsFile(None, (), (), (), ()) if saved is None else saved
+
+    @functools.cached_property
+    def journal_count(self) -> int:
+        """How many episodes the journal has; -1 where there is none to read."""
+        journal = self.files.journal
+        if journal is None:
+            return -1
+        reader = JournalReader(journal)
+        try:
+            for _ in reader:
+                pass
+        except UnreadableFile as error:
+            if self.saved is None:
+                raise
+            logger.warning("%s Its monitor's statistics file is used.", error)
+            return -1
+        return reader.count
+
+    @property
+    def saved_count(self) -> int:
+        """How many episodes the statistics file has; -1 where there is none to read."""
+        return -1 if self.saved is None else len(self.saved.timestamps)
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether episodes ended after the manifest was written last."""
+        return self.manifest is not None and 0 <= self.saved_count < self.journal_count
+
+    @property
+    def _stats_path(self) -> Path | None:
+        if self.manifest is None:
+            # A process that died between writing the two.
+            return self.files.stats
+        assert self.files.manifest is not None
+        return self.files.manifest.with_name(self.manifest.stats)
+
+    def _without(self, error: UnreadableFile) -> None:
+        if self.files.journal is None:
+            raise error
+        logger.warning("%s Its monitor's journal is used.", error)
+
+
+def _stats_of(journal: Path, saved: StatsFile | None) -> StatsFile:
+    """Return the statistics that a journal amounts to."""
+    starts: list[float] = []
+    ends: list[float] = []
+    lengths: list[int] = []
+    rewards: list[float] = []
+    types: list[str] = []
+    reader = JournalReader(journal)
+    for entry in reader:
+        starts.append(entry.start_time)
+        ends.append(entry.end_time)
+        lengths.append(entry.length)
+        rewards.append(entry.reward)
+        types.append(entry.type)
+    reader.report()
+    # The first reset may have been one whose episode never ended.
+    start = None if saved is None else saved.initial_reset_timestamp
+    if start is None:
+        start = min((s for s in starts if not math.isnan(s)), default=None)
+    return StatsFile(start, tuple(ends), tuple(lengths), tuple(rewards), tuple(types))
