@@ -159,7 +159,7 @@ def test_value_that_holds_itself_is_written() -> None:
     """As what Python shows of it."""
     loop: list[Any] = []
     loop.append(loop)
-    assert loads(dumps(loop)) == {"repr": "[[...]]"}
+    assert loads(dumps(loop)) == [{"repr": "[[...]]"}]
 
 
 def test_existing_recordings_lists_five_at_most() -> None:

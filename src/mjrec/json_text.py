@@ -5,6 +5,10 @@ JSON (RFC 8259) has no NaN and no infinity. Infinity is written as the number
 `1e999`, which is valid JSON and which every IEEE-754 reader, Python's among them,
 reads as infinity; NaN is written as `null`. NumPy's scalars and arrays are written
 as the numbers and lists that they hold.
+
+What is read may have been written by anybody. Text that two readers could take for
+different things (a key that is there twice), and text that needs far more memory or
+stack than its length lets one expect, is refused.
 """
 
 from __future__ import annotations
@@ -12,11 +16,20 @@ from __future__ import annotations
 import json
 import math
 import uuid
+from collections import Counter
 from typing import Any
 
 import numpy as np
 
 __all__ = ["dumps", "float_from_json", "loads"]
+
+# Whatever can be read can also be written again, compared and shown, all of which
+# Python does recursively.
+_DEEPEST = 100
+
+# Of lists, objects and what is in them; each takes at most some eighty bytes. The
+# statistics of four million episodes are as many.
+_MOST_VALUES = 1 << 24
 
 
 def dumps(value: object, *, indent: int | None = None) -> str:
@@ -27,9 +40,13 @@ def dumps(value: object, *, indent: int | None = None) -> str:
     """
     try:
         # Nearly everything is plain, and this is many times as fast.
-        return json.dumps(value, indent=indent, allow_nan=False)
+        text = json.dumps(value, indent=indent, allow_nan=False)
+        # What is written is what `loads` will accept.
+        if text.count("[") + text.count("{") > _DEEPEST:
+            _check_depth(value)
     except (TypeError, ValueError, RecursionError):
         return _dumps_any(value, indent=indent)
+    return text
 
 
 def loads(text: str | bytes) -> Any:
@@ -38,9 +55,22 @@ def loads(text: str | bytes) -> Any:
     Gym's own `NaN` and `Infinity` tokens, which are not JSON, are accepted too.
 
     Raises:
-        ValueError: the text is not JSON.
+        ValueError: the text is not JSON, or not UTF-8, or an object in it has a key
+            twice, or it has far more values, or is nested far more deeply, than
+            anything that is recorded.
     """
-    return json.loads(text)
+    if isinstance(text, bytes):
+        text = text.decode("utf-8-sig")
+    beginnings = text.count("[") + text.count("{")
+    if beginnings + text.count(",") > _MOST_VALUES:
+        raise ValueError(f"it has more than {_MOST_VALUES} values")
+    try:
+        value = json.loads(text, object_pairs_hook=_object)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if beginnings > _DEEPEST:
+        _check_depth(value)
+    return value
 
 
 def float_from_json(value: float | None) -> float:
@@ -48,20 +78,48 @@ def float_from_json(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        counts = Counter(key for key, _ in pairs)
+        ((twice, _),) = counts.most_common(1)
+        raise ValueError(f"the key {twice!r:.100} is there twice")
+    return values
+
+
+def _check_depth(value: Any) -> None:
+    level = [value]
+    for _ in range(_DEEPEST):
+        level = [
+            inner
+            for outer in level
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(inner, dict | list | tuple)
+        ]
+        if not level:
+            return
+    raise ValueError("it is nested too deeply")
+
+
 def _dumps_any(value: object, *, indent: int | None) -> str:
     # json offers no hook for floats. A string that cannot occur by chance stands in
     # for infinity and is exchanged for the number afterwards.
     mark = uuid.uuid4().hex
-    try:
-        plain = _plain(value, mark)
-    except RecursionError:
-        # A value that holds itself; Python's own text of it ends.
-        plain = {"repr": repr(value)}
+    plain = _plain(value, mark, ())
     text = json.dumps(plain, indent=indent, allow_nan=False)
     return text.replace(f'"-{mark}"', "-1e999").replace(f'"{mark}"', "1e999")
 
 
-def _plain(value: object, mark: str) -> Any:
+def _plain(value: object, mark: str, outer: tuple[int, ...]) -> Any:
+    """Return `value` as what JSON knows.
+
+    Args:
+        value: anything.
+        mark: stands for infinity.
+        outer: the identities of what `value` is inside of.
+    """
+    is_too_deep = len(outer) == _DEEPEST - 1 or id(value) in outer
+    inside = (*outer, id(value))
     match value:
         case None | bool() | str():
             return value
@@ -72,13 +130,20 @@ def _plain(value: object, mark: str) -> Any:
         case float() | np.floating():
             return _plain_float(float(value), mark)
         case np.ndarray():
-            return _plain(value.tolist(), mark)
-        case dict():
-            return {str(key): _plain(item, mark) for key, item in value.items()}
-        case list() | tuple() | set() | frozenset():
-            return [_plain(item, mark) for item in value]
+            return _plain(value.tolist(), mark, outer)
+        case dict() if not is_too_deep:
+            return {str(key): _plain(item, mark, inside) for key, item in value.items()}
+        case list() | tuple() | set() | frozenset() if not is_too_deep:
+            return [_plain(item, mark, inside) for item in value]
         case _:
-            return {"repr": repr(value)}
+            return {"repr": _shown(value)}
+
+
+def _shown(value: object) -> str:
+    try:
+        return repr(value)
+    except RecursionError:
+        return f"<{type(value).__name__}, nested very deeply>"
 
 
 def _plain_float(value: float, mark: str) -> float | str | None:

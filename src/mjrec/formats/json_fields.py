@@ -14,8 +14,10 @@ from typing import Any, TypeVar
 
 from ..errors import UnreadableFile
 from ..json_text import float_from_json, loads
+from .regular_files import read_regular
 
 __all__ = [
+    "base_name",
     "boolean",
     "field",
     "integer",
@@ -31,6 +33,14 @@ __all__ = [
 
 T = TypeVar("T")
 
+# The statistics of several million episodes.
+_LONGEST_FILE = 1 << 28
+
+# Counts and numbers of things, as every other language can hold them.
+_LARGEST_INTEGER = 2**63 - 1
+
+_LONGEST_NAME = 255
+
 _KINDS = {
     bool: "true or false",
     dict: "an object",
@@ -44,11 +54,13 @@ _KINDS = {
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn the `ValueError` or `OSError` of the block into `UnreadableFile`."""
+    """Turn an error of the block about the content of a file into `UnreadableFile`."""
     try:
         yield
     except OSError as error:
         raise UnreadableFile(path, error.strerror or error) from error
+    except MemoryError as error:
+        raise UnreadableFile(path, "it needs more memory than there is") from error
     except ValueError as error:
         raise UnreadableFile(path, error) from error
 
@@ -58,12 +70,10 @@ def read_object(path: Path) -> Mapping[str, Any]:
 
     Raises:
         OSError: there is no such file.
-        ValueError: it is no regular file, or does not hold a JSON object.
+        ValueError: it is no regular file of its directory, or does not hold a JSON
+            object.
     """
-    # Opening a pipe would wait for ever.
-    if path.exists() and not path.is_file():
-        raise ValueError("it is not a regular file")
-    return json_object(path.read_bytes())
+    return json_object(read_regular(path, limit=_LONGEST_FILE))
 
 
 def json_object(data: bytes) -> Mapping[str, Any]:
@@ -72,8 +82,6 @@ def json_object(data: bytes) -> Mapping[str, Any]:
         value = loads(data)
     except UnicodeDecodeError as error:
         raise ValueError("it is not UTF-8 text") from error
-    except RecursionError as error:
-        raise ValueError("its JSON is nested too deeply") from error
     except ValueError as error:
         raise ValueError(f"it is not whole JSON ({error})") from error
     return mapping(value)
@@ -114,7 +122,26 @@ def mapping(value: Any) -> Mapping[str, Any]:
 
 def text(value: Any) -> str:
     """Return a text as it is."""
-    return _checked(value, str)
+    try:
+        _checked(value, str).encode()
+    except UnicodeEncodeError as error:
+        raise ValueError("it is a text that no file can hold") from error
+    return str(value)
+
+
+def base_name(value: Any) -> str:
+    """Return the name of a file in the same directory."""
+    name = text(value)
+    if (
+        name in ("", ".", "..")
+        or any(c in name for c in "/\\")
+        or not name.isprintable()
+        or len(name.encode()) > _LONGEST_NAME
+    ):
+        raise ValueError(
+            f"{name[:_LONGEST_NAME]!r} is not the name of a file in the same directory"
+        )
+    return name
 
 
 def boolean(value: Any) -> bool:
@@ -125,8 +152,10 @@ def boolean(value: Any) -> bool:
 def integer(value: Any) -> int:
     """Return a whole number, also one written with a fraction of zero."""
     if isinstance(value, float) and value.is_integer():
-        return int(value)
-    return _checked(value, int)
+        value = int(value)
+    if abs(_checked(value, int)) > _LARGEST_INTEGER:
+        raise ValueError("it is larger than any count")
+    return int(value)
 
 
 def number(value: Any) -> float:

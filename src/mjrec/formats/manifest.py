@@ -16,12 +16,13 @@ from typing import Any
 from ..atomic_files import write_text
 from ..json_text import dumps
 from .json_fields import (
+    base_name,
     field,
+    integer,
     list_of,
     mapping,
     optional,
     read_object,
-    text,
     unreadable,
 )
 
@@ -54,9 +55,9 @@ def read_manifest(path: Path) -> Manifest:
     """
     with unreadable(path):
         values = read_object(path)
-        mjrec = field(values, "mjrec", optional(mapping), default=None)
+        mjrec = field(values, "mjrec", optional(_details), default=None)
         return Manifest(
-            stats=field(values, "stats", _base_name),
+            stats=field(values, "stats", base_name),
             videos=field(values, "videos", list_of(_pair)),
             env_info=field(values, "env_info", mapping),
             mjrec=mjrec,
@@ -70,8 +71,8 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
         ValueError: a name in it is not a base name.
     """
     content = {
-        "stats": _base_name(manifest.stats),
-        "videos": [[_base_name(v), _base_name(m)] for v, m in manifest.videos],
+        "stats": base_name(manifest.stats),
+        "videos": [[base_name(v), base_name(m)] for v, m in manifest.videos],
         "env_info": dict(manifest.env_info),
     }
     if manifest.mjrec is not None:
@@ -80,7 +81,7 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
 
 
 def _pair(value: Any) -> tuple[str, str]:
-    names = list_of(_base_name)(value)
+    names = list_of(base_name)(value)
     if len(names) != 2:
         raise ValueError(
             f"a video and its metadata belong together, not {len(names)} names"
@@ -88,8 +89,17 @@ def _pair(value: Any) -> tuple[str, str]:
     return names[0], names[1]
 
 
-def _base_name(value: Any) -> str:
-    name = text(value)
-    if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
-        raise ValueError(f"{name!r} is not the name of a file in the same directory")
-    return name
+def _details(value: Any) -> Mapping[str, Any]:
+    """Return what gym did not write, with what others rely on as it should be."""
+    details = mapping(value)
+    field(details, "next_episode_id", optional(_count), default=None)
+    field(details, "pending", optional(list_of(mapping)), default=None)
+    field(details, "broken", optional(list_of(base_name)), default=None)
+    return details
+
+
+def _count(value: Any) -> int:
+    number = integer(value)
+    if number < 0 or not isinstance(value, int):
+        raise ValueError(f"{number} is no number of episodes")
+    return number

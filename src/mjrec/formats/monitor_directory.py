@@ -56,33 +56,37 @@ __all__ = [
 FILE_PREFIX = "openaigym"
 MANIFEST_PREFIX = f"{FILE_PREFIX}.manifest"
 
+# Gym took any text for a uid.
+_INFIX = re.compile(r"(?P<number>[0-9]{1,18})\.(?P<uid>[^/\n\0]+)")
 _UID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}", re.ASCII)
 
 # What this package and every gym wrote; nothing else in a directory is ours. A `~`
 # is gym's temporary name.
-_MANIFEST = re.compile(r"openaigym\.manifest\.(?P<infix>.+)\.manifest\.json")
+#
+# Names also stand in files, which may be anybody's: a name that has a slash in it would
+# lead out of the directory, and a number of a million digits takes minutes to read.
+_INFIX_PART = r"(?P<infix>[^/\n\0]+)"
+_VIDEO = rf"openaigym\.video\.{_INFIX_PART}\.video(?P<episode>[0-9]{{6,18}})"
+_TRAJECTORY = (
+    rf"openaigym\.trajectory\.{_INFIX_PART}\.episode(?P<episode>[0-9]{{6,18}})"
+)
+
+_MANIFEST = re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json")
 _PATTERNS = (
-    re.compile(r"openaigym\.manifest\.(?P<infix>.+)\.manifest\.json~*"),
-    re.compile(r"openaigym\.episode_batch\.(?P<infix>.+)\.stats\.json~*"),
-    re.compile(r"openaigym\.episodes\.(?P<infix>.+)\.jsonl"),
-    re.compile(
-        r"openaigym\.video\.(?P<infix>.+)\.video(?P<episode>\d{6,})\.[^/]*"
-        r"(mp4|avi|json|framehash)"
-    ),
-    re.compile(
-        r"openaigym\.trajectory\.(?P<infix>.+)\.episode(?P<episode>\d{6,})\.(log|h5)"
-    ),
+    re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json~*"),
+    re.compile(rf"openaigym\.episode_batch\.{_INFIX_PART}\.stats\.json~*"),
+    re.compile(rf"openaigym\.episodes\.{_INFIX_PART}\.jsonl"),
+    re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
+    re.compile(rf"{_TRAJECTORY}\.(log|h5)"),
     re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
 )
 _HIDDEN = (
-    re.compile(r"\.openaigym\.video\.(?P<infix>.+)\.video(?P<episode>\d{6,})\.lock"),
-    re.compile(r"\.openaigym\.render\.\d+\.lock"),
-    re.compile(r"\.openaigym\.manifest\.(?P<infix>.+)\.lock"),
-    re.compile(r"\.openaigym\.(?P<infix>.+)\.lock"),
-    re.compile(
-        r"\.openaigym\.video\.(?P<infix>.+)\.video(?P<episode>\d{6,})\.[^/]*\.part"
-    ),
-    re.compile(r"\.openaigym\..+\.part"),
+    re.compile(rf"\.{_VIDEO}\.lock"),
+    re.compile(r"\.openaigym\.render\.[0-9]+\.lock"),
+    re.compile(rf"\.openaigym\.manifest\.{_INFIX_PART}\.lock"),
+    re.compile(rf"\.openaigym\.{_INFIX_PART}\.lock"),
+    re.compile(rf"\.{_VIDEO}\.[^/\n\0]*\.part"),
+    re.compile(r"\.openaigym\.[^/\n\0]+\.part"),
 )
 
 
@@ -104,10 +108,8 @@ class Infix:
     @classmethod
     def parse(cls, text: str) -> Infix | None:
         """Return the infix written as `text`; None for one of another making."""
-        number, dot, uid = text.partition(".")
-        if not (dot and uid and number.isascii() and number.isdigit()):
-            return None
-        return cls(int(number), uid)
+        match = _INFIX.fullmatch(text)
+        return None if match is None else cls(int(match["number"]), match["uid"])
 
 
 def check_uid(uid: object) -> str:
