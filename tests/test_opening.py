@@ -17,7 +17,10 @@ from mjrec import (
     DirectoryNotWritable,
     ExistingRecordings,
     InvalidArgument,
+    UnreadableFile,
 )
+from mjrec.formats.journal import JournalEntry, JournalWriter
+from mjrec.formats.manifest import Manifest, write_manifest
 from mjrec.recorder.opening import OpenDirectory, open_directory
 
 ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
@@ -186,6 +189,55 @@ os.kill(os.getpid(), signal.SIGKILL)
     place = open_(tmp_path, resume=True)
     assert place.first_episode_id == 4
     place.lock.release()
+
+
+def test_torn_line_keeps_its_number(
+    tmp_path: Path, make_corridor: Any, play: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its episode is lost, and the next one is not taken for it; the log says so."""
+    record(tmp_path, make_corridor, play)
+    (journal,) = tmp_path.glob("*.jsonl")
+    for path in tmp_path.glob("*.json"):
+        path.unlink()
+    journal.write_bytes(journal.read_bytes()[:-20])
+    place = open_(tmp_path, resume=True)
+    assert place.first_episode_id == 2
+    assert "line 2 (episode 1): it was cut off" in caplog.text
+    place.lock.release()
+
+
+@pytest.mark.parametrize("next_id", [None, True, -1, 1.5, "7", 10**4000, {}])
+def test_impossible_next_number_is_an_error(tmp_path: Path, next_id: object) -> None:
+    """A manifest may come from anybody; numbers go into names of files."""
+    stats = "openaigym.episode_batch.0.7.stats.json"
+    path = tmp_path / "openaigym.manifest.0.7.manifest.json"
+    details = {"next_episode_id": next_id}
+    write_manifest(path, Manifest(stats, (), ENV_INFO, details))
+    with pytest.raises(UnreadableFile, match=rf"{path.name}.*next_episode_id"):
+        open_(tmp_path, resume=True)
+
+
+def test_name_with_an_impossible_number_does_not_count(tmp_path: Path) -> None:
+    """It would make names that no file can have."""
+    write_video(tmp_path, "0.7", 10**150)
+    write_video(tmp_path, "0.7", 4)
+    place = open_(tmp_path, resume=True)
+    assert place.first_episode_id == 5
+    place.lock.release()
+
+
+def test_resume_over_a_journal_of_another_environment_is_an_error(
+    tmp_path: Path,
+) -> None:
+    """Where the monitor was killed and its lock was not copied along."""
+    writer = JournalWriter(
+        tmp_path / "openaigym.episodes.0.7.jsonl",
+        env_info=ENV_INFO | {"env_id": "Ant-v5"},
+    )
+    writer.append(JournalEntry(0, 1, 1.0, "t", 0.0, 1.0, 0, None, True, False))
+    writer.close()
+    with pytest.raises(DifferentEnvironment, match=r"Ant-v5.*Corridor"):
+        open_(tmp_path, resume=True)
 
 
 def test_resume_over_another_environment_is_an_error(

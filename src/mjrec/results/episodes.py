@@ -204,8 +204,8 @@ def _is_pending(results: MonitorResults, episode_id: int) -> bool:
     if trajectory is None or episode_id in (*files.videos, *files.metadata):
         return False
     known = _episode_number(results.details.get("next_episode_id")) or 0
-    # The last one was still running when a manifest was written that others followed.
-    if episode_id < known - results.is_behind:
+    # The last one was running when the manifest was written that it outlived.
+    if episode_id < known - (results.is_behind and results.saved is not None):
         return episode_id in _pending_ids(results.details)
     # Its monitor is open, or was killed.
     return trajectory.suffix == ".h5" or _says_deferred(trajectory)

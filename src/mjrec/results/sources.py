@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,7 @@ class MonitorResults:
 
     def __init__(self, files: MonitorFiles) -> None:
         self.files = files
+        self._said: set[Path] = set()
 
     @functools.cached_property
     def manifest(self) -> Manifest | None:
@@ -94,47 +95,48 @@ class MonitorResults:
         Raises:
             UnreadableFile: no source can be read.
         """
-        saved = self.saved
-        journal = self.files.journal
-        count = self.saved_count
-        try:
-            # A closed monitor's journal need not be read for its statistics.
-            if journal is not None and count_lines(journal) > count:
-                journaled = _stats_of(journal, saved)
-                if len(journaled.timestamps) > count:
-                    return journaled
-        except UnreadableFile as error:
-            if saved is None:
-                raise
-            logger.warning("%s Its monitor's statistics file is used.", error)
+        saved, journal = self.saved, self.files.journal
+        if journal is not None and self.is_behind:
+            return _stats_of(journal, saved)
         return StatsFile(None, (), (), (), ()) if saved is None else saved
 
     @functools.cached_property
     def journal_count(self) -> int:
-        """How many episodes the journal has; -1 where there is none to read."""
-        journal = self.files.journal
-        if journal is None:
-            return -1
-        reader = JournalReader(journal)
-        try:
-            for _ in reader:
-                pass
-        except UnreadableFile as error:
-            if self.saved is None:
-                raise
-            logger.warning("%s Its monitor's statistics file is used.", error)
-            return -1
-        return reader.count
+        """How many episodes the journal has; -1 where there is none to read.
+
+        Raises:
+            UnreadableFile: it cannot be read, and there are no statistics either.
+        """
+        return self._of_journal(_count_episodes)
 
     @property
     def saved_count(self) -> int:
         """How many episodes the statistics file has; -1 where there is none to read."""
         return -1 if self.saved is None else len(self.saved.timestamps)
 
-    @property
+    @functools.cached_property
     def is_behind(self) -> bool:
-        """Whether episodes ended after the manifest was written last."""
-        return self.manifest is not None and 0 <= self.saved_count < self.journal_count
+        """Whether the journal has episodes that the statistics file lacks.
+
+        Raises:
+            UnreadableFile: as `journal_count`.
+        """
+        # A closed monitor's journal need not be understood for that.
+        return (
+            self._of_journal(count_lines) > self.saved_count
+            and self.journal_count > self.saved_count
+        )
+
+    def _of_journal(self, count: Callable[[Path], int]) -> int:
+        if self.files.journal is None:
+            return -1
+        try:
+            return count(self.files.journal)
+        except UnreadableFile as error:
+            if self.saved is None:
+                raise
+            self._say(error, "statistics file")
+            return -1
 
     @property
     def _stats_path(self) -> Path | None:
@@ -147,7 +149,19 @@ class MonitorResults:
     def _without(self, error: UnreadableFile) -> None:
         if self.files.journal is None:
             raise error
-        logger.warning("%s Its monitor's journal is used.", error)
+        self._say(error, "journal")
+
+    def _say(self, error: UnreadableFile, instead: str) -> None:
+        if error.path not in self._said:
+            self._said.add(error.path)
+            logger.warning("%s Its monitor's %s is used instead.", error, instead)
+
+
+def _count_episodes(journal: Path) -> int:
+    reader = JournalReader(journal)
+    for _ in reader:
+        pass
+    return reader.count
 
 
 def _stats_of(journal: Path, saved: StatsFile | None) -> StatsFile:
