@@ -177,3 +177,81 @@ def test_a_fork_does_not_keep_the_pipe_open() -> None:
         "os.kill(child, signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let what makes no progress hang after a moment."""
+    monkeypatch.setenv("MJREC_PATIENCE", "0.3")
+
+
+def hang_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    # Not replaced by what it starts: a wrapper script, that has to go with it.
+    program = script(tmp_path / "wrapper", f"echo begun >&2; {text}; exit 0")
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_program_that_hangs_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With what it has started, and its last words are in the error."""
+    hang_at(tmp_path, monkeypatch, "sleep 33.25")
+    with pytest.raises(EncoderError, match=r"(?s)progress for 0.3 sec.*begun") as hung:
+        run_ffmpeg(["-version"], standard_input=b"x" * 10**6)
+    assert hung.value.returncode == -signal.SIGKILL
+    assert not still_runs("sleep", "33.25")
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("way", ["write", "read", "wait"])
+def test_a_process_that_hangs_is_ended(
+    way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether it takes nothing, gives nothing or does not end."""
+    hang_at(tmp_path, monkeypatch, "sleep 33.75")
+    process = FfmpegProcess(["-"], what="No.", reads=way == "write", writes=True)
+    try:
+        with pytest.raises(EncoderError, match=r"No\. It made no progress for 0.3"):
+            {
+                "write": lambda: process.write(bytes(3 << 20)),
+                "read": lambda: process.read(1),
+                "wait": process.wait,
+            }[way]()
+    finally:
+        process.kill()
+        process.release()
+    assert not still_runs("sleep", "33.75")
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_slow_process_does_not_hang(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As long as something moves: what it takes, gives, or writes into its file."""
+    out = tmp_path / "out"
+    hang_at(
+        tmp_path,
+        monkeypatch,
+        "for k in 1 2 3 4 5; do head -c 65536 >/dev/null; echo $k; sleep 0.1; done; "
+        f"exec >&-; for k in 1 2 3 4 5; do echo $k >>{out}; sleep 0.1; done",
+    )
+    process = FfmpegProcess([f"file:{out}"], what="No.", reads=True, writes=True)
+    process.write(bytes(1 << 20 | 3 << 16))
+    assert b"".join(iter(lambda: process.read(9), b"")) == b"1\n2\n3\n4\n5\n"
+    process.wait()
+    process.release()
+
+
+def still_runs(*command: str) -> bool:
+    wanted = "\0".join([*command, ""]).encode()
+    return any(
+        read_or_nothing(path) == wanted for path in Path("/proc").glob("[0-9]*/cmdline")
+    )
+
+
+def read_or_nothing(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""

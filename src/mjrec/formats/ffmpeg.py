@@ -15,16 +15,19 @@ import functools
 import hashlib
 import os
 import re
+import select
 import shutil
+import signal
 import subprocess
 import tempfile
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Protocol
 
 from ..errors import EncoderError, Error, InvalidArgument, MissingDependency
 from ..frames import Frame
+from ..patience import Patience
 
 __all__ = [
     "FfmpegProcess",
@@ -104,28 +107,42 @@ def run_ffmpeg(
         what: what fails when it fails: the first sentence of the error.
 
     Raises:
-        EncoderError: its exit status is not 0.
+        EncoderError: its exit status is not 0, or it took longer than `patience_s`.
         Error: it could not be started, as `ffmpeg_executable` where that is its fault.
     """
     command = [ffmpeg_executable(), *arguments]
+    patience = Patience()
     try:
-        done = subprocess.run(
+        process = subprocess.Popen(
             command,
-            input=standard_input,
-            capture_output=True,
-            check=False,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             start_new_session=True,
         )
     except OSError as error:
         raise _not_started(command[0], error) from error
-    if done.returncode != 0:
+    with process:
+        try:
+            output, said = _communicate(process, standard_input, patience)
+        except BaseException:
+            _kill(process)
+            raise
+    if process.returncode != 0:
         raise EncoderError(
-            what,
+            _with_hanging(what, patience),
             command=command,
-            returncode=done.returncode,
-            stderr=_text(done.stderr[-_END_OF_STDERR:]),
+            returncode=process.returncode,
+            stderr=_text(said[-_END_OF_STDERR:]),
         )
-    return done
+    return subprocess.CompletedProcess(command, process.returncode, output, said)
+
+
+class HasFileno(Protocol):
+    """What is an open file."""
+
+    def fileno(self) -> int:
+        """Return its descriptor."""
 
 
 class FfmpegProcess:
@@ -141,6 +158,9 @@ class FfmpegProcess:
         reads: whether it is fed through `write`.
         writes: whether it is read through `read`.
 
+    Each method that waits for it ends it when it has hung for `patience_s`: when it
+    takes no byte, gives none, or has all and does not write on in its file.
+
     Raises:
         Error: as `run_ffmpeg`, if it could not be started.
     """
@@ -152,9 +172,11 @@ class FfmpegProcess:
         what: str,
         reads: bool = False,
         writes: bool = False,
+        keeps: HasFileno | None = None,
     ) -> None:
         self._what = what
         self._command = [ffmpeg_executable(), *arguments]
+        self._patience = Patience()
         # A file, not a pipe: nobody has to empty it while the process runs.
         self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  see release
         try:
@@ -165,6 +187,7 @@ class FfmpegProcess:
                 stderr=self._stderr,
                 bufsize=0,
                 start_new_session=True,
+                pass_fds=() if keeps is None else (keeps.fileno(),),
             )
         except BaseException as error:
             self._stderr.close()
@@ -173,6 +196,8 @@ class FfmpegProcess:
             raise
         try:
             self._enlarge_pipes()
+            if self._process.stdin is not None:
+                os.set_blocking(self._process.stdin.fileno(), False)
             _running.add(self)
         except BaseException:
             self.kill()
@@ -193,23 +218,32 @@ class FfmpegProcess:
         """Feed `data`, waiting until the pipe has taken all of it.
 
         Raises:
-            EncoderError: ffmpeg has ended.
+            EncoderError: ffmpeg has ended, or hangs.
         """
         pipe = self._process.stdin
         assert pipe is not None
         rest = memoryview(data if isinstance(data, bytes) else data.data).cast("B")
         try:
-            # A raw pipe may take less than it was given.
             while rest:
-                rest = rest[pipe.write(rest) :]
+                # None: it is full.
+                taken = pipe.write(rest)
+                if taken:
+                    rest = rest[taken:]
+                else:
+                    self._wait_for(pipe, select.POLLOUT)
         except (OSError, ValueError) as error:
             # ValueError: the pipe was closed before.
             raise self._died() from error
 
     def read(self, size: int) -> bytes:
-        """Return at most `size` bytes of output; none at its end."""
+        """Return at most `size` bytes of output; none at its end.
+
+        Raises:
+            EncoderError: ffmpeg hangs.
+        """
         pipe = self._process.stdout
         assert pipe is not None
+        self._wait_for(pipe, select.POLLIN)
         return pipe.read(size)
 
     def end_input(self) -> None:
@@ -221,9 +255,17 @@ class FfmpegProcess:
         """Wait for the end. May be called again.
 
         Raises:
-            EncoderError: the exit status is not 0.
+            EncoderError: the exit status is not 0, or it hangs.
         """
-        self._process.wait()
+        written = self._state_of_output()
+        self._patience.renew()
+        while not self._has_ended(self._patience.begin_slice()):
+            self._patience.end_slice()
+            if self._state_of_output() != written:
+                written = self._state_of_output()
+                self._patience.renew()
+            elif self._patience.is_over:
+                raise self._hung()
         if self._process.returncode != 0:
             raise self._error()
 
@@ -233,8 +275,7 @@ class FfmpegProcess:
         The pipes stay open: a thread may be about to write, and the number of a closed
         one may be another file's by then.
         """
-        self._process.kill()
-        self._process.wait()
+        _kill(self._process)
 
     def release(self) -> None:
         """Close the pipes of a process that has ended, once no thread uses them."""
@@ -261,17 +302,59 @@ class FfmpegProcess:
             with contextlib.suppress(OSError):
                 fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
 
+    def _wait_for(self, pipe: IO[bytes], event: int) -> None:
+        """Wait until a pipe is ready, or closed at the other end."""
+        poll = select.poll()
+        poll.register(pipe, event)
+        self._patience.renew()
+        while not poll.poll(1000 * self._patience.begin_slice()):
+            self._patience.end_slice()
+            if self._patience.is_over:
+                raise self._hung()
+
+    def _has_ended(self, seconds: float) -> bool:
+        """Wait for the end, so long at most, and return whether it has come."""
+        try:
+            # `Popen.wait` would look again and again, with pauses that add up.
+            descriptor = os.pidfd_open(self.pid)
+        except OSError:
+            # It was waited for before, or the system knows no such thing.
+            descriptor = None
+        if descriptor is not None:
+            try:
+                select.select([descriptor], [], [], seconds)
+            finally:
+                os.close(descriptor)
+            seconds = 0
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(seconds)
+        return self._process.returncode is not None
+
+    def _state_of_output(self) -> tuple[int, int]:
+        """Return what changes while it writes its file; as one, where it has none."""
+        protocol, _, path = self._command[-1].partition(":")
+        if protocol != "file":
+            return 0, 0
+        try:
+            status = Path(path).stat()
+        except OSError:
+            return 0, 0
+        return status.st_size, status.st_mtime_ns
+
+    def _hung(self) -> EncoderError:
+        _kill(self._process)
+        return self._error()
+
     def _died(self) -> EncoderError:
         try:
             self._process.wait(_SECONDS_TO_DIE)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            _kill(self._process)
         return self._error()
 
     def _error(self) -> EncoderError:
         return EncoderError(
-            self._what,
+            _with_hanging(self._what, self._patience),
             command=self._command,
             returncode=self._process.returncode,
             stderr=self._end_of_stderr(),
@@ -292,6 +375,42 @@ def _close_pipes_after_fork() -> None:
 
 
 os.register_at_fork(after_in_child=_close_pipes_after_fork)
+
+
+def _communicate(
+    process: subprocess.Popen[bytes], standard_input: bytes, patience: Patience
+) -> tuple[bytes, bytes]:
+    """Return what a process writes and says, once it has ended or was ended."""
+    unsaid: bytes | None = standard_input
+    while not patience.is_over:
+        try:
+            return process.communicate(unsaid, timeout=patience.begin_slice())
+        except subprocess.TimeoutExpired:
+            unsaid = None
+            patience.end_slice()
+    _kill(process)
+    # What it has said before.
+    return process.communicate()
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """End a process at once, with those that a wrapper script has started."""
+    if process.poll() is None:
+        # It leads a group of its own. Not more than the process may have ended.
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+    # One whose disk does not answer cannot die.
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(_SECONDS_TO_DIE)
+
+
+def _with_hanging(what: str, patience: Patience) -> str:
+    if not patience.is_over:
+        return what
+    return (
+        f"{what} It made no progress for {patience.seconds:g} seconds, and was ended."
+    )
 
 
 def _identity(executable: str) -> tuple[str, int, int]:
