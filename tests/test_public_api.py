@@ -18,7 +18,7 @@ PACKAGE = Path(mjrec.__file__).parent
 ROWS = (
     {
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
-        *("worker_thread", "gl", "machine", "blank_frames", "patience"),
+        *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
     },
     {"formats"},
     {"results"},

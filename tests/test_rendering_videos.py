@@ -161,7 +161,7 @@ def test_an_episode_of_a_killed_process_says_so(tmp_path: Path) -> None:
     assert file is not None
     metadata = metadata_of(file.path)
     assert metadata["complete"] is False
-    assert metadata["reason"] == "died"
+    assert metadata["reason"] == "killed"
     assert (metadata["length"], metadata["reward"]) == (3, 1.5)
 
 

@@ -28,6 +28,7 @@ from .errors import (
     InvalidFrame,
     MissingDependency,
     NoPictures,
+    NotPicklable,
     PicturesDiffer,
     PolicyError,
     RenderError,
@@ -58,6 +59,8 @@ if TYPE_CHECKING:
     from .results import merge_stats_files as merge_stats_files
     from .schedules import capped_cubic_video_schedule as capped_cubic_video_schedule
     from .schedules import disable_videos as disable_videos
+    from .signals import Terminated as Terminated
+    from .signals import exit_on_signals as exit_on_signals
     from .simulation.trajectories import Trajectory as Trajectory
     from .simulation.trajectories import load_trajectory as load_trajectory
 
@@ -67,6 +70,7 @@ _LAZY = {
     "GymnasiumMonitor": "monitors.gymnasium_monitor",
     "Monitor": "monitors",
     "StatsRecorder": "recorder.stats_recorder",
+    "Terminated": "signals",
     "Trajectory": "simulation.trajectories",
     "VideoRecorder": "recorder.video_recorder",
     "VideoWriter": "formats.video_writer",
@@ -75,6 +79,7 @@ _LAZY = {
     "detect_monitor_files": "results",
     "detect_training_manifests": "results",
     "disable_videos": "schedules",
+    "exit_on_signals": "signals",
     "iter_episodes": "results",
     "load_results": "results",
     "load_trajectory": "simulation.trajectories",
@@ -109,12 +114,14 @@ __all__ = [
     "MissingDependency",
     "Monitor",
     "NoPictures",
+    "NotPicklable",
     "PicturesDiffer",
     "PolicyError",
     "RenderError",
     "ResetNeeded",
     "ResetNotAllowed",
     "StatsRecorder",
+    "Terminated",
     "Trajectory",
     "UnknownName",
     "UnreadableFile",
@@ -125,6 +132,7 @@ __all__ = [
     "detect_monitor_files",
     "detect_training_manifests",
     "disable_videos",
+    "exit_on_signals",
     "iter_episodes",
     "load_results",
     "load_trajectory",

@@ -13,6 +13,7 @@
     ├── FileNotWritten (also OSError)       a full disk, say
     ├── DifferentEnvironment                resume over another environment
     ├── EnvironmentNotMade                  it is known, and making it failed
+    ├── NotPicklable (also TypeError)       a monitor, which belongs to a process
     ├── NoPictures                          the environment cannot be drawn
     ├── PicturesDiffer                      from its state it would look otherwise
     ├── ResetNeeded                         step before reset or after the end
@@ -57,6 +58,7 @@ __all__ = [
     "InvalidFrame",
     "MissingDependency",
     "NoPictures",
+    "NotPicklable",
     "PicturesDiffer",
     "PolicyError",
     "RenderError",
@@ -199,6 +201,10 @@ class EnvironmentNotMade(Error):
         self.name = name
         text = f"Making {name} failed: {reason}"
         super().__init__(f"{text.rstrip('. ')}. {hint}".rstrip())
+
+
+class NotPicklable(Error, TypeError):
+    """A monitor was to be sent to another process, or copied."""
 
 
 class NoPictures(Error):

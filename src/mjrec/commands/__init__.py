@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 import tyro
 
 from ..errors import Error
+from ..signals import exiting_on_signals
 from .doctor import doctor
 from .list_episodes import list_episodes
 from .record import record
@@ -34,13 +35,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status.
 
     0 is success, 1 an error with one message on stderr, 2 (as `SystemExit`) a command
-    line that cannot be understood, 130 an interruption. An error that is not one of
-    ours keeps its traceback.
+    line that cannot be understood, 130 an interruption, 143 (as `SystemExit`) SIGTERM,
+    129 SIGHUP: all of them close the files first. An error that is not one of ours
+    keeps its traceback.
 
     Args:
         argv: the arguments; those of the process, if None.
     """
-    with _warnings_on_stderr():
+    with _warnings_on_stderr(), exiting_on_signals():
         return _run(argv)
 
 

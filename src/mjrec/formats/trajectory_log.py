@@ -369,6 +369,10 @@ class TrajectoryLogWriter:
             self.flush()
         self._let_go()
 
+    def abandon(self) -> None:
+        """Close the file without writing what is not there yet. Idempotent."""
+        self._let_go()
+
     def discard(self) -> None:
         """Leave nothing, whether it was closed or not. Idempotent.
 

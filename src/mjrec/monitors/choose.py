@@ -41,6 +41,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     trajectory_callable: Callable[[int], Any] | bool | None = None,
     observations: bool = False,
     allow_early_reset: bool | None = None,
+    on_error: str = "raise",
     env_id: str | None = None,
 ) -> GymnasiumMonitor | DmEnvMonitor:
     """Record what happens to an environment into a monitor directory.
@@ -102,6 +103,11 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
         allow_early_reset: whether a reset in mid-episode is allowed; the episode is
             then no part of the statistics, and its video is marked incomplete. None
             is what the framework has: no for Gymnasium, yes for dm_env.
+        on_error: "raise", or "warn": where something cannot be recorded (a full disk,
+            a dead encoder, a video that cannot be rendered) the simulation goes on,
+            the log says so once, and the manifest lists under `mjrec.faults` which
+            episodes lack what. What the environment itself raises is raised in any
+            case, and so is wrong use, a step before the first reset for instance.
         env_id: the environment's name in the recordings. None is the name in its
             spec; dm_env environments have none, so theirs is worth giving, as
             `dm_control/<domain>-<task>`.
@@ -140,6 +146,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             workers=workers,
             trajectory_callable=trajectory_callable,
             observations=observations,
+            on_error=on_error,
             allow_early_reset=(
                 monitor.allows_early_reset
                 if allow_early_reset is None

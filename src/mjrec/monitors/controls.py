@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex
 
 from ..environments.scenes import Scenes
-from ..errors import RenderError
+from ..errors import NotPicklable, RenderError
 from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
+from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
-from ..recorder.options import DEFERRED, RecorderOptions
+from ..recorder.options import DEFERRED, WARN, RecorderOptions
 from ..recorder.recorder import EpisodePictures, Recorder, Rendering, Subject
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.video_recorder import VideoRecorder
@@ -24,6 +27,8 @@ from .rendering_choice import rendering_choice
 from .waiting import waiting_display
 
 __all__ = ["MonitorControls"]
+
+logger = logging.getLogger(__name__)
 
 
 class MonitorControls:
@@ -38,6 +43,7 @@ class MonitorControls:
 
     _recorder: Recorder
     _guard: ExitGuard
+    _options: RecorderOptions
     _told_failures = False
 
     @property
@@ -125,6 +131,8 @@ class MonitorControls:
 
     def __exit__(self, *exc_info: Any) -> Literal[False]:
         _, first, _ = exc_info
+        if first is not None:
+            self._recorder.note_error(first)
         try:
             # Whoever leaves by an exception does not wait for videos.
             self.close(wait=first is None)
@@ -135,11 +143,32 @@ class MonitorControls:
             first.add_note(f"Closing the monitor failed too: {second}")
         return False
 
+    def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
+        raise NotPicklable(
+            f"A {type(self).__name__} cannot be pickled or copied: it writes files, "
+            "and two would write the same ones. Make it in the process that uses it, "
+            "inside the function that makes the environment: "
+            "lambda: mjrec.Monitor(gymnasium.make(...), directory, resume=True)."
+        )
+
+    @contextlib.contextmanager
+    def _noting_errors(self) -> Iterator[None]:
+        """Mark the running episode with what is raised inside."""
+        try:
+            yield
+        except BaseException as error:
+            self._recorder.note_error(error)
+            raise
+
     def _raise_failures(self) -> None:
         failures = self._recorder.failures()
-        if failures and not self._told_failures:
-            self._told_failures = True
-            raise RenderError(self.directory, failures)
+        if not failures or self._told_failures:
+            return
+        self._told_failures = True
+        error = RenderError(self.directory, failures)
+        if self._options.on_error != WARN:
+            raise error
+        logger.warning("%s", error)
 
     def _start(
         self,
@@ -153,6 +182,7 @@ class MonitorControls:
         close_environment: Callable[[Any], None],
     ) -> None:
         """Open the directory; from here on the environment is this monitor's."""
+        self._options = options
         choice = rendering_choice(options.render, scenes, env_id)
         self._recorder = Recorder(
             directory,
@@ -178,6 +208,7 @@ class MonitorControls:
                 (pictures, scenes.states),
                 functools.partial(close_environment, env),
             ),
+            at_exit=functools.partial(_note_last_error, self._recorder),
         )
 
     def _begin(
@@ -195,6 +226,12 @@ def _rendering(workers: int | None) -> Callable[[Path], Rendering] | None:
     if workers == 0:
         return None
     return functools.partial(RenderService, workers=workers)
+
+
+def _note_last_error(recorder: Recorder) -> None:
+    error = last_error()
+    if error is not None:
+        recorder.note_error(error)
 
 
 def _finish_log(log: Path) -> None:

@@ -78,7 +78,7 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
         if self._recorder.closed:
             return self._env.reset()
         self._recorder.before_reset()
-        with self._recorder.resetting():
+        with self._noting_errors(), self._recorder.resetting():
             timestep = self._env.reset()
         self._begin(seed=self.seed, observation=timestep.observation)
         return timestep
@@ -90,7 +90,11 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
         if self._recorder.done is not False:
             return self.reset()
         self._recorder.before_step(action)
-        timestep = self._env.step(action)
+        try:
+            timestep = self._env.step(action)
+        except BaseException as error:
+            self._recorder.note_error(error)
+            raise
         if timestep.first():
             # The environment was reset behind the monitor's back.
             self._recorder.before_reset()

@@ -81,7 +81,7 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._recorder.closed:
             return self.env.reset(seed=seed, options=options)
         self._recorder.before_reset()
-        with self._recorder.resetting():
+        with self._noting_errors(), self._recorder.resetting():
             result = self.env.reset(seed=seed, options=options)
         self._begin(seed=seed, options=options, observation=result[0])
         return result
@@ -100,7 +100,11 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._next_step_autoreset and recorder.done:
             return self._reset_by_step(action)
         recorder.before_step(action)
-        result = self.env.step(action)
+        try:
+            result = self.env.step(action)
+        except BaseException as error:
+            recorder.note_error(error)
+            raise
         observation, reward, terminated, truncated, _ = result
         resets_itself = self._same_step_autoreset and bool(terminated or truncated)
         recorder.step(
@@ -119,7 +123,7 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         self, action: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         self._recorder.before_reset()
-        with self._recorder.resetting():
+        with self._noting_errors(), self._recorder.resetting():
             result = self.env.step(action)
         self._begin(observation=result[0])
         return result

@@ -25,23 +25,31 @@ class ExitGuard:
         owner: the object whose end means close.
         close: what to call. It must not refer to `owner`, which would then live for
             ever.
+        at_exit: called before it where the interpreter is ending, likewise.
     """
 
-    def __init__(self, owner: object, close: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        owner: object,
+        close: Callable[[], None],
+        *,
+        at_exit: Callable[[], None] = lambda: None,
+    ) -> None:
         self._close = _in_process(os.getpid(), close)
         self._finalize = weakref.finalize(owner, _aside, self._close)
         # weakref's own exit hook is as old as its first use in the process, and hooks
         # run newest first: simulators would have torn OpenGL down before us.
         self._finalize.atexit = False
         self._first = False
-        atexit.register(self._finalize)
+        self._at_exit = _one_after_the_other(at_exit, self._finalize)
+        atexit.register(self._at_exit)
 
     def run_first_at_exit(self) -> None:
         """Put this hook before all exit hooks that were registered so far; once."""
         if not self._first and self._finalize.alive:
             self._first = True
-            atexit.unregister(self._finalize)
-            atexit.register(self._finalize)
+            atexit.unregister(self._at_exit)
+            atexit.register(self._at_exit)
 
     def close(self) -> None:
         """Call `close`, unless that was done already.
@@ -51,7 +59,7 @@ class ExitGuard:
         if self._finalize.alive:
             self._close()
             self._finalize.detach()
-            atexit.unregister(self._finalize)
+            atexit.unregister(self._at_exit)
 
 
 def _in_process(pid: int, close: Callable[[], None]) -> Callable[[], None]:
@@ -60,6 +68,17 @@ def _in_process(pid: int, close: Callable[[], None]) -> Callable[[], None]:
             close()
 
     return close_here
+
+
+def _one_after_the_other(
+    first: Callable[[], None], finalize: weakref.finalize[..., object]
+) -> Callable[[], None]:
+    def both() -> None:
+        if finalize.alive:
+            first()
+            finalize()
+
+    return both
 
 
 def _aside(close: Callable[[], None]) -> None:

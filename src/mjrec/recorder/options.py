@@ -18,12 +18,15 @@ __all__ = [
     "DEFERRED",
     "LIVE",
     "OFF",
+    "RAISE",
+    "WARN",
     "RecorderOptions",
     "RenderingChoice",
     "type_of_mode",
 ]
 
 DEFERRED, LIVE, OFF = "deferred", "live", "off"
+RAISE, WARN = "raise", "warn"
 _MODES = {None: "t", "training": "t", "evaluation": "e"}
 
 
@@ -49,6 +52,7 @@ class RecorderOptions:
     trajectory_callable: Callable[[int], Any] | bool | None = None
     observations: bool = False
     allow_early_reset: bool = False
+    on_error: str = RAISE
 
     def __post_init__(self) -> None:
         type_of_mode(self.mode)
@@ -70,6 +74,11 @@ class RecorderOptions:
             raise InvalidArgument(
                 "workers must be a whole number of processes, 0 to render nothing now, "
                 f"or None for one for each usable CPU, got {workers!r}."
+            )
+        if self.on_error not in (RAISE, WARN):
+            raise InvalidArgument(
+                'on_error must be "raise", or "warn" to go on without what cannot be '
+                f"recorded, got {self.on_error!r}."
             )
         chosen = self.trajectory_callable
         if not (chosen is None or isinstance(chosen, bool) or callable(chosen)):

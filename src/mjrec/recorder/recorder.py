@@ -29,7 +29,9 @@ from ..formats.trajectory_log import RowBlocks
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
 from .deferred_video import DeferredVideo
+from .endings import RESET, ending
 from .episode_videos import EpisodeVideos
+from .faults import Faults, What
 from .opening import OpenDirectory, open_directory
 from .options import (
     DEFERRED,
@@ -150,6 +152,9 @@ class Recorder:
         _recorders.add(self)
         self._videos = EpisodeVideos()
         self._decision = (-1, False)
+        self._faults = Faults(options.on_error)
+        # Of the running episode, once the environment has raised.
+        self._ending: dict[str, Any] | None = None
         self._place: OpenDirectory = open_directory(
             directory,
             force=options.force,
@@ -238,7 +243,7 @@ class Recorder:
         """
         if self._is_forked:
             self._refuse_process()
-        self.stats_recorder.before_reset()
+        self.stats_recorder.before_reset(after_error=self._ending is not None)
         if not self._is_unbegun():
             self._take_last_picture()
         self._reset_time = time.time()
@@ -264,7 +269,8 @@ class Recorder:
             self._next_episode_id -= 1
             self._discard_episode()
         else:
-            self._end_episode(complete=False, reason="reset")
+            self._end_episode(complete=False, **self._ending or {"reason": RESET})
+        self._ending = None
         self.stats_recorder.after_reset()
         self._episode_start = {
             "start_time": self._reset_time,
@@ -273,9 +279,25 @@ class Recorder:
         }
         episode_id = self._next_episode_id
         self._next_episode_id += 1
-        self._begin_episode(episode_id, observation)
+        try:
+            self._begin_episode(episode_id, observation)
+        except Exception as error:
+            if not self._tolerates("video", error):
+                raise
+            self._trajectory = self._live_video = None
+            self._begin_live_video(episode_id, enabled=False)
         if self._options.write_upon_reset:
             self._flush()
+
+    def note_error(self, error: BaseException) -> None:
+        """Note that the environment's step or reset has raised, or its user has.
+
+        The running episode, if there is one, is marked with it, unless a later step
+        succeeds. A reset is then allowed in any case. Nothing more is taken of the
+        environment's state, which may be half of a step.
+        """
+        if self.stats_recorder.done is False and self._ending is None:
+            self._ending = ending(error)
 
     def before_step(self, action: Any = None) -> None:
         """Check that a step may be taken now, and note its action.
@@ -313,30 +335,31 @@ class Recorder:
         reward = reward_to_float(reward)
         done = bool(terminated or truncated)
         self.stats_recorder.count(reward, done)
-        if done:
-            # First of all, so that no failing video can lose the episode.
-            self._journal_episode(
-                terminated=bool(terminated), truncated=bool(truncated)
-            )
+        self._ending = None
         try:
-            if self._trajectory is not None:
-                try:
-                    self._trajectory.step(
-                        reward, terminated, truncated, observation, done, picture
-                    )
-                except (PicturesDiffer, FileNotWritten) as error:
-                    self._stop_recording(self._trajectory, error)
-            if self._live_video is not None:
-                self._take_picture(self._live_video, missing=not picture)
-                if done and picture:
-                    self._live_video.capture_last()
-        finally:
             if done:
-                self._end_episode(
-                    complete=True,
-                    terminated=bool(terminated),
-                    truncated=bool(truncated),
+                # First of all, so that no failing video can lose the episode.
+                self._journal_episode(
+                    terminated=bool(terminated), truncated=bool(truncated)
                 )
+        finally:
+            try:
+                if self._trajectory is not None:
+                    try:
+                        self._trajectory.step(
+                            reward, terminated, truncated, observation, done, picture
+                        )
+                    except (PicturesDiffer, FileNotWritten) as error:
+                        self._stop_recording(self._trajectory, error)
+                if self._live_video is not None:
+                    self._take_picture(self._live_video, is_there=picture, last=done)
+            finally:
+                if done:
+                    self._end_episode(
+                        complete=True,
+                        terminated=bool(terminated),
+                        truncated=bool(truncated),
+                    )
 
     def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
         """End the running episode, and wait until all videos are rendered.
@@ -356,7 +379,11 @@ class Recorder:
         self._end_by_close()
         if self._rendering is not None:
             self._rendering.wait(on_progress)
-        self._finish_trajectories()
+        try:
+            self._finish_trajectories()
+        except Error as error:
+            if not self._faults.tolerates("trajectory", error, episode_id=None):
+                raise
 
     def close(self) -> None:
         """End the episode, write statistics and manifest, and let go. Idempotent.
@@ -386,12 +413,19 @@ class Recorder:
             self._take_last_picture()
         finally:
             try:
-                self._end_episode(complete=False, reason="close")
+                self._end_episode(complete=False, **self._ending or ending(None))
             finally:
                 # A trajectory without its model is worth nothing, and what stores it
                 # may end with the process.
                 if self._states is not None:
-                    self._states.finish()
+                    self._finish_models(self._states)
+
+    def _finish_models(self, states: StateSource) -> None:
+        try:
+            states.finish()
+        except Error as error:
+            if not self._faults.tolerates("model", error, episode_id=None):
+                raise
 
     def failures(self) -> Mapping[str, str]:
         """Return why videos could not be rendered, by their names."""
@@ -428,7 +462,8 @@ class Recorder:
 
     def _is_unbegun(self) -> bool:
         """Whether the running episode has had its reset only."""
-        return self.stats_recorder.done is False and self.stats_recorder.steps == 0
+        stats = self.stats_recorder
+        return stats.done is False and stats.steps == 0 and self._ending is None
 
     def _begin_episode(self, episode_id: int, observation: Any) -> None:
         wanted = self._decide(episode_id)
@@ -586,7 +621,8 @@ class Recorder:
             return
         trajectory.stop(str(error))
         self._break_deferred(str(error))
-        raise error
+        if not self._tolerates("trajectory", error):
+            raise error
 
     def _stop_frames(
         self, trajectory: TrajectoryRecorder, error: PicturesDiffer
@@ -605,17 +641,27 @@ class Recorder:
             self.video_recorder.broken = True
             self.video_recorder.metadata["broken_reason"] = reason
 
-    def _take_picture(self, recorder: VideoRecorder, *, missing: bool) -> None:
+    def _take_picture(
+        self, recorder: VideoRecorder, *, is_there: bool, last: bool
+    ) -> None:
         if not recorder.functional:
             return
-        if missing:
+        if not is_there:
             recorder.metadata["final_frame"] = "missing"
-        else:
+            return
+        try:
             recorder.capture_frame()
+            if last:
+                recorder.capture_last()
+        except Exception as error:
+            if not self._tolerates("video", error):
+                raise
+            # Also where it is the environment's own `render` that has raised.
+            recorder.give_up(str(error))
 
     def _take_last_picture(self) -> None:
         """Take the picture of the running episode's last step, if it was left out."""
-        if self.stats_recorder.done is not False:
+        if self.stats_recorder.done is not False or self._ending is not None:
             return
         if self._trajectory is not None:
             try:
@@ -623,22 +669,35 @@ class Recorder:
             except PicturesDiffer as error:
                 self._stop_frames(self._trajectory, error)
         if self._live_video is not None:
-            self._live_video.capture_last()
+            try:
+                self._live_video.capture_last()
+            except Exception as error:
+                if not self._tolerates("video", error):
+                    raise
+                self._live_video.give_up(str(error))
 
     def _journal_episode(self, *, terminated: bool, truncated: bool) -> None:
         stats = self.stats_recorder
-        self._journal.append(
-            JournalEntry(
-                episode_id=self._next_episode_id - 1,
-                length=stats.episode_lengths[-1],
-                reward=stats.episode_rewards[-1],
-                type=stats.episode_types[-1],
-                end_time=stats.timestamps[-1],
-                terminated=terminated,
-                truncated=truncated,
-                **self._episode_start,
+        try:
+            self._journal.append(
+                JournalEntry(
+                    episode_id=self._next_episode_id - 1,
+                    length=stats.episode_lengths[-1],
+                    reward=stats.episode_rewards[-1],
+                    type=stats.episode_types[-1],
+                    end_time=stats.timestamps[-1],
+                    terminated=terminated,
+                    truncated=truncated,
+                    **self._episode_start,
+                )
             )
-        )
+        except OSError as error:
+            if not self._tolerates("journal", error):
+                raise
+
+    def _tolerates(self, what: What, error: BaseException) -> bool:
+        """Note what of the running episode is lost; tell whether to go on."""
+        return self._faults.tolerates(what, error, episode_id=self._next_episode_id - 1)
 
     def _discard_episode(self) -> None:
         if self.video_recorder is not None:
@@ -660,15 +719,20 @@ class Recorder:
         if trajectory is None:
             return
         stats = self.stats_recorder
-        trajectory.end(
-            {
-                "complete": complete,
-                **facts,
-                "length": trajectory.steps,
-                "reward": stats.rewards,
-                "end_time": time.time(),
-            }
-        )
+        try:
+            trajectory.end(
+                {
+                    "complete": complete,
+                    **facts,
+                    "length": trajectory.steps,
+                    "reward": stats.rewards,
+                    "end_time": time.time(),
+                }
+            )
+        except FileNotWritten as error:
+            if not self._tolerates("trajectory", error):
+                raise
+            trajectory.abandon()
         self._trajectory, self._blocks = None, trajectory.blocks
         if isinstance(self.video_recorder, DeferredVideo):
             self.video_recorder.close()
@@ -722,11 +786,21 @@ class Recorder:
         )
         try:
             recorder.close()
+        except Error as error:
+            if not self._tolerates("video", error):
+                raise
         finally:
             if recorder.closed:
                 self._videos.add_live(recorder)
 
     def _flush(self) -> None:
+        try:
+            self._write_results()
+        except FileNotWritten as error:
+            if not self._faults.tolerates("statistics", error, episode_id=None):
+                raise
+
+    def _write_results(self) -> None:
         self.stats_recorder.flush()
         write_manifest(
             self.directory / manifest_name(self._place.infix),
@@ -751,6 +825,7 @@ class Recorder:
             "next_episode_id": self._next_episode_id,
             "pending": self._videos.pending(),
             "broken": self._videos.broken(),
+            "faults": self._faults.listed(),
             "versions": dict(versions()),
         }
 

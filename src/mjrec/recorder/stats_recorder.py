@@ -154,15 +154,19 @@ class StatsRecorder:
         if done:
             self.save_complete()
 
-    def before_reset(self) -> None:
+    def before_reset(self, *, after_error: bool = False) -> None:
         """Check that a reset may be made.
+
+        Args:
+            after_error: the environment has raised, so that there is no other way on.
 
         Raises:
             ResetNotAllowed: the episode has begun and is not over.
             ClosedError: the recorder is closed.
         """
         self._check_open()
-        if self.done is False and self.steps and not self.allow_early_reset:
+        allowed = self.allow_early_reset or after_error
+        if self.done is False and self.steps and not allowed:
             raise ResetNotAllowed(
                 f"reset() was called on {self._environment} after {self.steps} steps "
                 "of an episode that is not over. Go on until terminated or truncated "

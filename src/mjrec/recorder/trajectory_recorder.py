@@ -251,6 +251,12 @@ class TrajectoryRecorder:
         self._log.close()
         self._ended = True
 
+    def abandon(self) -> None:
+        """Let go without writing what could not be written; what is there stays."""
+        self._ended = True
+        if self._log is not None:
+            self._log.abandon()
+
     def discard(self) -> None:
         """Leave nothing."""
         self._ended = True

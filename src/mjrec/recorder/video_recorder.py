@@ -204,6 +204,11 @@ class VideoRecorder:
         if self.functional and not self._closed and step > self._last_taken >= 0:
             self._capture(step)
 
+    def give_up(self, reason: str) -> None:
+        """Take no more frames, and say why; those that were taken stay."""
+        if self.functional:
+            self._break(reason)
+
     def _capture(self, step: int) -> None:
         rendered = self.env.render()
         self._last_taken = step

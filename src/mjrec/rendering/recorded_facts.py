@@ -65,7 +65,8 @@ def _check(facts: Mapping[str, Any]) -> None:
     field(facts, "kept", boolean, default=True)
     for key in ("refusal", "broken_reason", "reason"):
         field(facts, key, optional(text), default=None)
-    field(facts, "scene", optional(mapping), default=None)
+    for key in ("scene", "exception"):
+        field(facts, key, optional(mapping), default=None)
     field(facts, "model", optional(_model), default=None)
     field(facts, "video", optional(_video), default=None)
 

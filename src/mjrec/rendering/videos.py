@@ -26,6 +26,7 @@ from ..formats.video_metadata import (
 from ..formats.video_writer import VideoFile, VideoWriter
 from ..frames import Frame
 from ..rates import to_rate
+from ..recorder.endings import KILLED
 from ..recorder.versions import versions
 from .recorded_facts import open_for_rendering
 from .recorded_pictures import (
@@ -173,7 +174,9 @@ def _episode_facts(reader: TrajectoryReader) -> dict[str, Any]:
         ending = {key: facts.get(key) for key in ("terminated", "truncated")}
     else:
         # Whoever was killed could not say why it ended.
-        ending = {"reason": facts.get("reason", "died")}
+        ending = {"reason": facts.get("reason", KILLED)}
+        if "exception" in facts:
+            ending["exception"] = facts["exception"]
     so_far = {"length": reader.step_count, "reward": float(reader.rewards.sum())}
     return {
         "episode_id": facts.get("episode_id"),

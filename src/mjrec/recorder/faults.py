@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What could not be recorded, and whether that ends the simulation."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from .options import WARN
+
+__all__ = ["Faults", "What"]
+
+logger = logging.getLogger(__name__)
+
+What = Literal["video", "trajectory", "statistics", "journal", "model"]
+
+
+@dataclass(frozen=True)
+class _Fault:
+    episode_id: int | None
+    what: What
+    reason: str
+
+
+class Faults:
+    """The faults of one run.
+
+    With `on_error="raise"` a fault is an error that the caller raises; with "warn" it
+    is one warning and a line in the manifest, and the simulation goes on.
+
+    Args:
+        on_error: "raise" or "warn".
+    """
+
+    def __init__(self, on_error: str) -> None:
+        self._warns = on_error == WARN
+        self._faults: list[_Fault] = []
+
+    def tolerates(
+        self, what: What, error: BaseException, *, episode_id: int | None
+    ) -> bool:
+        """Note a fault, and tell whether the simulation may go on.
+
+        Args:
+            what: could not be recorded.
+            error: why.
+            episode_id: of which episode; None for what belongs to none.
+        """
+        if not self._warns:
+            return False
+        fault = _Fault(episode_id, what, str(error))
+        if fault not in self._faults:
+            self._faults.append(fault)
+            of = "" if episode_id is None else f" of episode {episode_id}"
+            logger.warning("The %s%s is not whole: %s", what, of, error)
+        return True
+
+    def listed(self) -> list[dict[str, Any]]:
+        """Return them as the manifest lists them."""
+        return [
+            {"episode_id": f.episode_id, "what": f.what, "reason": f.reason}
+            for f in self._faults
+        ]

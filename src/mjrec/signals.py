@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals that end a process, turned into exceptions, so that files are closed."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+from .errors import Error
+
+__all__ = ["Terminated", "exit_on_signals", "exiting_on_signals", "received"]
+
+# What schedulers and CI send at a time limit, and terminals when they are closed.
+_SIGNALS = ("SIGTERM", "SIGHUP")
+
+
+class Terminated(SystemExit):
+    """A signal has asked the process to end.
+
+    Like Ctrl-C it leaves `with` blocks and runs `finally` clauses; nobody who catches
+    `Exception` catches it. Where nobody does, the exit status is 128 and the signal's
+    number, as shells say it.
+
+    Attributes:
+        signal: its number.
+    """
+
+    def __init__(self, signum: int) -> None:
+        self.signal = signal.Signals(signum)
+        super().__init__(128 + signum)
+
+    def __str__(self) -> str:
+        return self.signal.name
+
+
+def exit_on_signals() -> None:
+    """Let SIGTERM and SIGHUP end this process the way that Ctrl-C does.
+
+    By default they end it at once: what was recorded is there up to the last moment,
+    and `mjrec recover` puts it in order. After this call they raise `Terminated` in
+    the main thread instead, so that monitors close their files: nothing is rendered
+    any more, and one line says what is pending. The command line does it by itself.
+
+    A signal that is ignored (`nohup`), or that has a handler already, stays as it is.
+
+    Raises:
+        Error: not called in the main thread, where Python handles signals.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        raise Error(
+            "exit_on_signals() was called in the thread "
+            f"{threading.current_thread().name!r}, and Python sets handlers of signals "
+            "in the main thread only: call it there, before the recording begins."
+        )
+    for signum in _deadly():
+        signal.signal(signum, _raise)
+
+
+@contextlib.contextmanager
+def exiting_on_signals() -> Iterator[None]:
+    """Do what `exit_on_signals` does inside a `with` block; elsewhere nothing.
+
+    In another thread than the main one it does nothing at all.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handled = _deadly()
+    exit_on_signals()
+    try:
+        yield
+    finally:
+        for signum in handled:
+            signal.signal(signum, signal.SIG_DFL)
+
+
+def _deadly() -> list[signal.Signals]:
+    """Return those of the signals that would end the process at once."""
+    known = [getattr(signal, name, None) for name in _SIGNALS]
+    return [s for s in known if s is not None and signal.getsignal(s) is signal.SIG_DFL]
+
+
+def received() -> Terminated | None:
+    """Return what the first signal raised; None where there was none.
+
+    At exit the interpreter does not tell of a `SystemExit` that nobody has caught.
+    """
+    return _received[0] if _received else None
+
+
+_received: list[Terminated] = []
+
+
+def _raise(signum: int, frame: FrameType | None) -> None:
+    error = Terminated(signum)
+    _received.append(error)
+    raise error

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an environment raises goes on unchanged, and the recording says it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from recordings import frames_in, manifest_of, metadata_of, stats_of
+
+import mjrec
+from mjrec import Monitor
+from mjrec.recorder.endings import ending
+
+
+class Breaking(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Raises `error` in the step, or at the reset, that is its turn."""
+
+    error: BaseException | None = None
+
+    def step(self, action: Any) -> Any:
+        if self.error is not None:
+            raise self.error
+        return self.env.step(action)
+
+    def reset(self, **options: Any) -> Any:
+        if self.error is not None:
+            raise self.error
+        return self.env.reset(**options)
+
+
+@pytest.fixture(params=["live", "deferred"])
+def monitored(request: pytest.FixtureRequest, tmp_path: Path) -> Any:
+    """A pendulum that breaks on demand, and its monitor."""
+    env = gymnasium.make(
+        "InvertedPendulum-v5", render_mode="rgb_array", height=32, width=48
+    )
+    broken = Breaking(env)
+    return broken, Monitor(
+        broken, tmp_path, lambda _: True, render=request.param, workers=1
+    )
+
+
+def steps(monitor: Any, count: int) -> None:
+    for _ in range(count):
+        monitor.step(monitor.action_space.sample() * 0)
+
+
+def test_step_that_raises(monitored: Any, tmp_path: Path) -> None:
+    """What was captured is kept and marked; the exception is the environment's own."""
+    broken, monitor = monitored
+    monitor.reset(seed=0)
+    steps(monitor, 3)
+    broken.error = ValueError("the simulation is unstable")
+    with pytest.raises(ValueError, match="unstable") as caught:
+        steps(monitor, 1)
+    assert caught.value is broken.error
+    broken.error = None
+    monitor.reset(seed=1)
+    steps(monitor, 2)
+    monitor.close()
+    metadata = metadata_of(tmp_path, 0)
+    assert (metadata["complete"], metadata["reason"]) == (False, "exception")
+    assert metadata["exception"] == {
+        "type": "ValueError",
+        "message": "the simulation is unstable",
+    }
+    assert len(frames_in(tmp_path, 0)) == 4
+    assert metadata_of(tmp_path, 1)["reason"] == "close"
+    assert len(frames_in(tmp_path, 1)) == 3
+
+
+def test_reset_that_raises(monitored: Any, tmp_path: Path) -> None:
+    """The episode before it, which was not over, is marked with that."""
+    broken, monitor = monitored
+    monitor.stats_recorder.allow_early_reset = True
+    monitor.reset(seed=0)
+    steps(monitor, 2)
+    broken.error = RuntimeError("no such level")
+    with pytest.raises(RuntimeError, match="no such level"):
+        monitor.reset()
+    monitor.close()
+    metadata = metadata_of(tmp_path, 0)
+    assert (metadata["reason"], metadata["exception"]["type"]) == (
+        "exception",
+        "RuntimeError",
+    )
+    assert len(frames_in(tmp_path, 0)) == 3
+
+
+def test_first_reset_that_raises_leaves_a_monitor_that_works(monitored: Any) -> None:
+    """There is no episode to be marked, and the next reset begins the first."""
+    broken, monitor = monitored
+    broken.error = RuntimeError("not yet")
+    with pytest.raises(RuntimeError, match="not yet"):
+        monitor.reset()
+    broken.error = None
+    monitor.reset(seed=0)
+    assert monitor.episode_id == 1
+    monitor.close()
+
+
+def test_step_that_succeeds_the_second_time(monitored: Any, tmp_path: Path) -> None:
+    """The episode goes on, and nothing is wrong with it."""
+    broken, monitor = monitored
+    monitor.reset(seed=0)
+    steps(monitor, 1)
+    broken.error = TimeoutError("again")
+    with pytest.raises(TimeoutError):
+        steps(monitor, 1)
+    broken.error = None
+    steps(monitor, 2)
+    monitor.close()
+    assert metadata_of(tmp_path, 0)["reason"] == "close"
+    assert len(frames_in(tmp_path, 0)) == 4
+
+
+@pytest.mark.parametrize(
+    ("error", "facts"),
+    [
+        (None, {"reason": "close"}),
+        (SystemExit(3), {"reason": "close"}),
+        (KeyboardInterrupt(), {"reason": "interrupt"}),
+        (mjrec.Terminated(15), {"reason": "interrupt"}),
+        (
+            mjrec.Error("x" * 2000),
+            {
+                "reason": "exception",
+                "exception": {"type": "mjrec.errors.Error", "message": "x" * 1000},
+            },
+        ),
+    ],
+)
+def test_what_files_say_of_an_exception(
+    error: BaseException | None, facts: dict[str, Any]
+) -> None:
+    """A type with its module, a message of bounded length."""
+    assert ending(error) == facts
+
+
+def test_an_exception_that_has_no_text() -> None:
+    """Its own __str__ may be what is broken."""
+
+    class Mute(Exception):
+        def __str__(self) -> str:
+            raise RuntimeError
+
+    assert ending(Mute())["exception"]["message"] == ""
+
+
+def test_leaving_with_by_an_exception(monitored: Any, tmp_path: Path) -> None:
+    """Of the user's own code: the episode is marked, and nothing is waited for."""
+    _, monitor = monitored
+    with pytest.raises(ZeroDivisionError), monitor:  # noqa: PT012  a user's program
+        monitor.reset(seed=0)
+        steps(monitor, 1)
+        raise ZeroDivisionError
+    subprocess.run(
+        [sys.executable, "-m", "mjrec", "render", str(tmp_path)],
+        check=False,
+        capture_output=True,
+    )
+    assert metadata_of(tmp_path, 0)["exception"]["type"] == "ZeroDivisionError"
+
+
+PROGRAM = """
+import os, signal, sys, gymnasium, mjrec
+mjrec.exit_on_signals()
+env = gymnasium.make("InvertedPendulum-v5", height=32, width=48)
+env = mjrec.Monitor(env, sys.argv[1], lambda _: True, workers=0)
+for seed in range(2):
+    env.reset(seed=seed)
+    done = False
+    while not done and (seed == 0 or env.stats_recorder.steps < 3):
+        done = env.step(env.action_space.high * (1 - seed))[2]
+"""
+
+
+def run(code: str, directory: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", PROGRAM + code, str(directory)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("code", "status", "reason"),
+    [
+        ("os.kill(os.getpid(), signal.SIGTERM)", 143, "interrupt"),
+        ("os.kill(os.getpid(), signal.SIGHUP)", 129, "interrupt"),
+        ("os.kill(os.getpid(), signal.SIGINT)", -signal.SIGINT, "interrupt"),
+        ("raise OverflowError('too far')", 1, "exception"),
+        ("sys.exit(7)", 7, "close"),
+        ("", 0, "close"),
+    ],
+)
+def test_ways_of_ending_a_program(
+    code: str, status: int, reason: str, tmp_path: Path
+) -> None:
+    """Without `with`, every file is closed and named, nothing is rendered, and said."""
+    done = run(code, tmp_path)
+    assert done.returncode == status, done.stderr
+    assert done.stderr.count("2 videos pending: mjrec render") == 1
+    assert len(stats_of(tmp_path)["episode_lengths"]) == 1
+    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 2
+    assert not list(tmp_path.glob("*.mp4"))
+    trajectory = mjrec.load_trajectory(next(tmp_path.glob("*episode000001.log")))
+    assert trajectory.facts["complete"] is False
+    assert trajectory.facts["reason"] == reason
+    if reason == "exception":
+        assert trajectory.facts["exception"]["message"] == "too far"
