@@ -32,12 +32,13 @@ from typing import TextIO
 
 import numpy as np
 
-from ..atomic_files import temporary_path
+from ..atomic_files import replacing, temporary_path
 from ..errors import DirectoryNotWritable
 from ..frames import Frame
 
 __all__ = [
     "FrameHashFile",
+    "cut_frame_hashes",
     "frame_hash_header",
     "frame_hash_line",
     "frame_hash_path",
@@ -68,20 +69,33 @@ def frame_hash_line(number: int, frame: Frame) -> str:
 class FrameHashFile:
     """A `.framehash` file in the making: complete, or not there.
 
+    A line is with the operating system before the next one: what of it a killed process
+    leaves is true of the frames that its encoder had been given.
+
     Args:
         path: its final name.
         size: `(height, width)` of the frames.
         fps: frames per second.
+        temporary: its name until then; a new one, if None.
 
     Every method raises `DirectoryNotWritable` when the file cannot be written.
     """
 
-    def __init__(self, path: Path, *, size: tuple[int, int], fps: Fraction) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        size: tuple[int, int],
+        fps: Fraction,
+        temporary: Path | None = None,
+    ) -> None:
         self._path = path
-        self._temporary = temporary_path(path)
+        self._temporary = temporary or temporary_path(path)
         self._frame_count = 0
         with self._naming_the_directory():
-            self._file: TextIO = self._temporary.open("w", encoding="ascii")
+            self._file: TextIO = self._temporary.open(
+                "w", encoding="ascii", buffering=1
+            )
             self._file.write(frame_hash_header(height=size[0], width=size[1], fps=fps))
 
     def add(self, frame: Frame) -> None:
@@ -90,10 +104,15 @@ class FrameHashFile:
             self._file.write(frame_hash_line(self._frame_count, frame))
         self._frame_count += 1
 
-    def finish(self) -> None:
-        """Give the file its name. May be called again."""
+    def close(self) -> None:
+        """Close the file, which keeps its temporary name. May be called again."""
         with self._naming_the_directory():
             self._file.close()
+
+    def finish(self) -> None:
+        """Give the file its name. May be called again."""
+        self.close()
+        with self._naming_the_directory():
             if self._temporary.exists():
                 self._temporary.replace(self._path)
 
@@ -110,6 +129,24 @@ class FrameHashFile:
             yield
         except OSError as error:
             raise DirectoryNotWritable(self._path.parent, error) from error
+
+
+def cut_frame_hashes(path: Path, count: int) -> None:
+    """Leave only the first `count` frames' hashes in a file, whole or not at all.
+
+    Raises:
+        OSError: it cannot be read or written.
+        ValueError: it holds fewer, or is no such file.
+    """
+    header = frame_hash_header(height=1, width=1, fps=Fraction(1)).count("\n")
+    lines = path.read_text(encoding="ascii").splitlines(keepends=True)
+    # The last one may be torn.
+    kept = [line for line in lines[: header + count] if line.endswith("\n")]
+    if len(kept) < header + count:
+        raise ValueError(f"it has hashes of fewer than {count} frames")
+    if len(kept) < len(lines):
+        with replacing(path) as temporary:
+            temporary.write_text("".join(kept), encoding="ascii")
 
 
 def frame_hash_path(video: Path) -> Path:

@@ -47,6 +47,7 @@ class Lock:
     Args:
         path: the file to make; it must not exist.
         content: what others may read about its holder; it stays when the holder dies.
+        mode: of the file.
 
     Raises:
         FileExistsError: the file is there, held or left behind.
@@ -56,11 +57,11 @@ class Lock:
     _path: Path
     _descriptor: int | None = None
 
-    def __init__(self, path: Path, content: str) -> None:
+    def __init__(self, path: Path, content: str, *, mode: int = 0o644) -> None:
         self._path = path
         # Python opens every descriptor close-on-exec: an encoder that outlives this
         # process does not keep the lock.
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
         self._hold(descriptor)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -83,6 +84,18 @@ class Lock:
     def _hold(self, descriptor: int) -> None:
         self._descriptor = descriptor
         _held.add(self)
+
+    def fileno(self) -> int:
+        """Return the descriptor. A process that inherits it holds the lock too."""
+        if self._descriptor is None:
+            raise ValueError(f"{self._path.name} is not locked any more")
+        return self._descriptor
+
+    def let_go(self) -> None:
+        """Hold it no longer, and leave the file; further calls do nothing."""
+        descriptor, self._descriptor = self._descriptor, None
+        if descriptor is not None:
+            os.close(descriptor)
 
     def release(self) -> None:
         """Remove the file and let it go; further calls do nothing.

@@ -9,14 +9,13 @@ is complete and its frames have been counted again.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import enum
-import hashlib
 import numbers
 import os
 import tempfile
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -36,18 +35,18 @@ from ..rates import to_rate
 from ..worker_thread import WorkerThread
 from .encoder_settings import (
     MUXERS,
-    EncoderSettings,
     encoder_settings,
     try_encoding,
 )
 from .ffmpeg import (
     FfmpegProcess,
-    every_frame_arguments,
     ffmpeg_executable,
     ffmpeg_sha256,
     ffmpeg_version,
 )
 from .frame_hashes import FrameHashFile, frame_hash_path
+from .locks import Lock
+from .unfinished_video import UnfinishedVideo, VideoFile, as_file
 
 __all__ = ["VideoFile", "VideoWriter"]
 
@@ -56,45 +55,6 @@ __all__ = ["VideoFile", "VideoWriter"]
 _MAX_RATE_TERM = 10**6
 _QUEUED_BYTES = 32 << 20
 _MAX_QUEUED_FRAMES = 64
-_READ_SIZE = 1 << 20
-
-
-@dataclass(frozen=True)
-class VideoFile:
-    """A finished video.
-
-    Attributes:
-        path: the file.
-        frame_count: how many frames it holds, counted by decoding it.
-        height: of a frame as it was written, in pixels.
-        width: of a frame as it was written, in pixels.
-        padded_height: the file's, even where the codec needs it.
-        padded_width: the file's, even where the codec needs it.
-        fps: frames per second.
-        codec: ffmpeg's name of the encoder.
-        pixel_format: ffmpeg's name of the encoded pixels' format.
-        file_sha256: of the file's bytes.
-        decoded_sha256: of the decoded frames, one after the other: the planes Y, U, V
-            for yuv420p, else rgb24.
-        frame_hash_path: the `.framehash` file, if one was asked for.
-        encoder: `ffmpeg` (the binary's base name), `version` (its first line),
-            `sha256` (the binary's) and `arguments` (all of them; the output file is
-            its base name, so that they stay true when the directory moves).
-    """
-
-    path: Path
-    frame_count: int
-    height: int
-    width: int
-    padded_height: int
-    padded_width: int
-    fps: Fraction
-    codec: str
-    pixel_format: str
-    file_sha256: str
-    decoded_sha256: str
-    frame_hash_path: Path | None
-    encoder: dict[str, Any]
 
 
 class _State(enum.Enum):
@@ -171,7 +131,10 @@ class VideoWriter:
             muxer=MUXERS[self.path.suffix.lower()],
             encoder_arguments=encoder_arguments,
         )
-        self._wants_frame_hashes = bool(frame_hashes)
+        self._temporary = temporary_path(self.path)
+        self._temporary_hashes = (
+            temporary_path(frame_hash_path(self.path)) if frame_hashes else None
+        )
         try_encoding(ffmpeg_executable(), self._settings, self.fps)
         self._frame_count = 0
         self._process_id = os.getpid()
@@ -219,6 +182,25 @@ class VideoWriter:
                 self.abort()
             raise
         self._frame_count += 1
+
+    def unfinished(self, height: int, width: int) -> UnfinishedVideo:
+        """Return what the file is until it is finished.
+
+        Args:
+            height: of a frame, in pixels.
+            width: of a frame, in pixels.
+        """
+        return UnfinishedVideo(
+            path=self.path,
+            temporary=self._temporary,
+            hashes=self._temporary_hashes,
+            height=height,
+            width=width,
+            fps=self.fps,
+            codec=self._settings.codec,
+            pixel_format=self._settings.pixel_format,
+            encoder=self._encoder(height, width),
+        )
 
     def close(self) -> None:
         """Finish the file: encode what waits, count the frames again, give the name.
@@ -282,7 +264,7 @@ class VideoWriter:
             return
         # Waiting is not for a finaliser. The thread encodes what waits and ffmpeg
         # finishes its file, under the temporary name.
-        self._encoding.worker.leave()
+        self._encoding.leave()
         warnings.warn(
             f"The VideoWriter of {self.path} was never closed; its frames are in "
             f"{self._encoding.temporary}. Use it in a with statement.",
@@ -313,41 +295,48 @@ class VideoWriter:
         return self._encoding is not None and self._encoding.worker.failed
 
     def _start(self, first: Frame) -> _Encoding:
+        height, width = first.shape[:2]
+        unfinished = self.unfinished(height, width)
         self._encoding = _Encoding(
-            self.path,
-            fps=self.fps,
-            size=(first.shape[0], first.shape[1]),
-            settings=self._settings,
-            frame_hashes=self._wants_frame_hashes,
+            unfinished, self._arguments(unfinished.padded, as_file(self._temporary))
         )
         return self._encoding
+
+    def _arguments(self, padded: tuple[int, int], output: str) -> list[str]:
+        height, width = padded
+        return self._settings.arguments(
+            height=height, width=width, fps=self.fps, output=output
+        )
+
+    def _encoder(self, height: int, width: int) -> dict[str, Any]:
+        padded = height + height % 2, width + width % 2
+        return {
+            "ffmpeg": Path(ffmpeg_executable()).name,
+            "version": ffmpeg_version(),
+            # Reading the whole program takes a while, and is not for the beginning.
+            "sha256": None,
+            "arguments": self._arguments(padded, self.path.name),
+        }
 
 
 class _Encoding:
     """A video in the making: ffmpeg, the thread that feeds it, temporary files."""
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        fps: Fraction,
-        size: tuple[int, int],
-        settings: EncoderSettings,
-        frame_hashes: bool,
-    ) -> None:
-        self.size = size
-        self.temporary = temporary_path(path)
-        self._path = path
-        self._fps = fps
-        self._settings = settings
-        self._padded = (size[0] + size[0] % 2, size[1] + size[1] % 2)
+    def __init__(self, unfinished: UnfinishedVideo, arguments: list[str]) -> None:
+        self.size = (unfinished.height, unfinished.width)
+        self.temporary = unfinished.temporary
+        self._unfinished = unfinished
+        self._path = unfinished.path
         self._encoded = 0
         self._input_ended = False
         self._result: VideoFile | None = None
         with contextlib.ExitStack() as on_failure:
-            self._hashes = self._open_hashes() if frame_hashes else None
+            # First of all: what is not held may be swept up.
+            self._hold = self._hold_file()
+            on_failure.callback(self._hold.release)
+            self._hashes = self._open_hashes()
             on_failure.callback(self._abort_hashes)
-            self._process = self._start_ffmpeg()
+            self._process = self._start_ffmpeg(arguments)
             on_failure.callback(self._end_process)
             self.worker = self._start_worker()
             on_failure.pop_all()
@@ -366,6 +355,7 @@ class _Encoding:
             self._result = self._check()
         self._rename(self._result)
         self._process.release()
+        self._hold.release()
         return self._result
 
     def abort(self) -> None:
@@ -376,20 +366,37 @@ class _Encoding:
         self._end_process()
         self._abort_hashes()
 
-    def _open_hashes(self) -> FrameHashFile:
-        path = frame_hash_path(self._path)
-        return FrameHashFile(path, size=self.size, fps=self._fps)
+    def leave(self) -> None:
+        """Let the encoder go on to the end of what it was given, by itself."""
+        self.worker.leave()
+        self._hold.let_go()
 
-    def _start_ffmpeg(self) -> FfmpegProcess:
-        height, width = self._padded
-        arguments = self._settings.arguments(
-            height=height, width=width, fps=self._fps, output=_as_file(self.temporary)
+    def _hold_file(self) -> Lock:
+        """Make the hidden file, locked: whoever finds it knows that it is in use."""
+        try:
+            # With the mode that a file gets from everybody else.
+            return Lock(self.temporary, "", mode=0o666)
+        except OSError as error:
+            raise DirectoryNotWritable(self._path.parent, error) from error
+
+    def _open_hashes(self) -> FrameHashFile | None:
+        hashes = self._unfinished.hashes
+        if hashes is None:
+            return None
+        return FrameHashFile(
+            frame_hash_path(self._path),
+            size=self.size,
+            fps=self._unfinished.fps,
+            temporary=hashes,
         )
+
+    def _start_ffmpeg(self, arguments: list[str]) -> FfmpegProcess:
         what = f"The video {self._path} could not be encoded."
-        return FfmpegProcess(arguments, what=what, reads=True)
+        # It shares the lock, which it holds to its own end when this process dies.
+        return FfmpegProcess(arguments, what=what, reads=True, keeps=self._hold)
 
     def _start_worker(self) -> WorkerThread[Frame]:
-        height, width = self._padded
+        height, width = self._unfinished.padded
         frame_bytes = height * width * 3
         return WorkerThread[Frame](
             self._encode,
@@ -401,7 +408,9 @@ class _Encoding:
     def _end_process(self) -> None:
         self._process.kill()
         self._process.release()
+        # ffmpeg may have put another file in the place of the one that is held.
         self.temporary.unlink(missing_ok=True)
+        self._hold.release()
 
     def _abort_hashes(self) -> None:
         if self._hashes is not None:
@@ -419,67 +428,22 @@ class _Encoding:
 
     def _check(self) -> VideoFile:
         """Return what the finished file holds."""
-        decoded_sha256 = self._count_and_hash()
-        return VideoFile(
-            path=self._path,
-            frame_count=self._encoded,
-            height=self.size[0],
-            width=self.size[1],
-            padded_height=self._padded[0],
-            padded_width=self._padded[1],
-            fps=self._fps,
-            codec=self._settings.codec,
-            pixel_format=self._settings.pixel_format,
-            file_sha256=_sha256_of_file(self.temporary),
-            decoded_sha256=decoded_sha256,
-            frame_hash_path=frame_hash_path(self._path) if self._hashes else None,
-            encoder=self._describe_encoder(),
-        )
-
-    def _count_and_hash(self) -> str:
-        frame_count, digest = _decode(
-            self.temporary,
-            pixel_format=self._settings.decoded_format,
-            size=self._padded,
-        )
-        if frame_count != self._encoded:
+        file = self._unfinished.check()
+        if file.frame_count != self._encoded:
             raise FrameCountError(
                 f"{self._path} was to hold {self._encoded} frames, and decoding gives "
-                f"{frame_count}. It was not kept.",
+                f"{file.frame_count}. It was not kept.",
                 command=self._process.command,
                 returncode=0,
                 stderr="",
             )
-        return digest
+        encoder = {**file.encoder, "sha256": ffmpeg_sha256()}
+        return dataclasses.replace(file, encoder=encoder)
 
-    def _rename(self, result: VideoFile) -> None:
-        # The hashes first: where there is a video, what belongs to it is there too.
-        try:
-            if self._hashes is not None:
-                self._hashes.finish()
-            elif self._path.exists():
-                # Those of the video that is replaced now would be wrong.
-                frame_hash_path(self._path).unlink(missing_ok=True)
-            self._replace(result)
-        except OSError as error:
-            raise DirectoryNotWritable(self._path.parent, error) from error
-
-    def _replace(self, result: VideoFile) -> None:
-        try:
-            self.temporary.replace(self._path)
-        except FileNotFoundError:
-            # An earlier call may have been interrupted just after it had done this.
-            if _sha256_of_file(self._path) != result.file_sha256:
-                raise
-
-    def _describe_encoder(self) -> dict[str, Any]:
-        executable, *arguments = self._process.command
-        return {
-            "ffmpeg": Path(executable).name,
-            "version": ffmpeg_version(),
-            "sha256": ffmpeg_sha256(),
-            "arguments": [*arguments[:-1], self._path.name],
-        }
+    def _rename(self, file: VideoFile) -> None:
+        if self._hashes is not None:
+            self._hashes.close()
+        self._unfinished.rename(file)
 
 
 def _check_path(path: str | os.PathLike[str]) -> Path:
@@ -521,44 +485,3 @@ def _check_fps(fps: float | Fraction) -> Fraction:
             f"{_MAX_RATE_TERM}. The nearest that can is {nearest}."
         )
     return nearest
-
-
-def _decode(
-    video: Path, *, pixel_format: str, size: tuple[int, int]
-) -> tuple[int, str]:
-    """Return how many frames a file holds and the sha256 of all of them."""
-    process = FfmpegProcess(
-        [
-            *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
-            *("-i", _as_file(video), "-map", "0:v:0", *every_frame_arguments()),
-            *("-f", "rawvideo", "-pix_fmt", pixel_format, "pipe:1"),
-        ],
-        what=f"The finished video {video} cannot be decoded.",
-        writes=True,
-    )
-    try:
-        digest = hashlib.sha256()
-        total = 0
-        while block := process.read(_READ_SIZE):
-            digest.update(block)
-            total += len(block)
-        process.wait()
-    finally:
-        process.kill()
-        process.release()
-    height, width = size
-    frame_bytes = height * width * 3
-    if pixel_format == "yuv420p":
-        frame_bytes //= 2
-    frame_count, rest = divmod(total, frame_bytes)
-    return frame_count + bool(rest), digest.hexdigest()
-
-
-def _sha256_of_file(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _as_file(path: Path) -> str:
-    # Without the prefix a colon in the name would make ffmpeg look for a protocol.
-    return f"file:{path}"
