@@ -9,6 +9,7 @@ from pathlib import Path
 from ..errors import DirectoryNotWritable, InvalidArgument, UnreadableFile
 from .json_fields import unreadable
 from .monitor_directory import Infix, trajectory_prefix
+from .regular_files import open_regular
 from .trajectory_hdf5 import SIGNATURE, TrajectoryHdf5Reader, write_hdf5
 from .trajectory_log_reader import TrajectoryLogReader
 from .trajectory_reader import TrajectoryReader
@@ -37,12 +38,8 @@ def open_trajectory(path: Path) -> TrajectoryReader:
     if path.suffix == _LOG and not path.exists():
         finished = path.with_suffix(_FINISHED)
         path = finished if finished.exists() else path
-    with unreadable(path):
-        # Opening a pipe would wait for ever.
-        if path.exists() and not path.is_file():
-            raise ValueError("it is not a regular file")
-        with path.open("rb") as file:
-            is_finished = file.read(len(SIGNATURE)) == SIGNATURE
+    with unreadable(path), open_regular(path) as file:
+        is_finished = file.read(len(SIGNATURE)) == SIGNATURE
     return TrajectoryHdf5Reader(path) if is_finished else TrajectoryLogReader(path)
 
 

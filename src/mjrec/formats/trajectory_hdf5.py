@@ -28,6 +28,7 @@ from ..atomic_files import replacing
 from ..errors import ClosedError, FileNotWritten, UnreadableFile
 from ..json_text import dumps
 from .json_fields import json_object, unreadable
+from .regular_files import regular_path
 from .trajectory import (
     FORMAT_VERSION,
     Array,
@@ -36,12 +37,14 @@ from .trajectory import (
 )
 from .trajectory_layout import (
     LARGEST_ROW,
+    MOST_PARTS,
     array_from_json,
     check_version,
     field_name,
     header_from_json,
     layout_to_json,
 )
+from .trajectory_log import LONGEST_RECORD
 from .trajectory_reader import TrajectoryReader
 
 __all__ = ["SIGNATURE", "TrajectoryHdf5Reader", "write_hdf5"]
@@ -74,6 +77,11 @@ _FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE))
 # Deflate makes at most 1032 bytes out of one.
 _MOST_EXPANSION = 1040
 _MOST_CHANGES = 1 << 20
+_LONGEST_TEXT = 1 << 26
+
+# What there is once for each step or frame is read when a file is opened, and a file
+# of a few kilobytes can claim any number of them. Two weeks at 50 steps a second.
+_MOST_STEPS = 1 << 26
 
 
 def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
@@ -110,7 +118,7 @@ class TrajectoryHdf5Reader(TrajectoryReader):
         with _reading(path):
             # Without any wish about locking: HDF5 refuses a file that is open in this
             # process with another one, in the user's own code, say.
-            self._file = h5py.File(path, "r")
+            self._file = h5py.File(regular_path(path), "r")
             try:
                 self._open()
             except BaseException:
@@ -131,6 +139,8 @@ class TrajectoryHdf5Reader(TrajectoryReader):
             raise ValueError("its facts or its layout are damaged")
         self.header = header = header_from_json(json_object(facts), json_object(layout))
         self.dropped = _whole_number(attributes, "dropped")
+        self._stored_changes = 0
+        self._stored_by_change: dict[int, int] = {}
         self.rewards = self._column("rewards", "<f8")
         steps = len(self.rewards)
         self.terminated = self._column("terminated", "|b1", steps)
@@ -176,25 +186,35 @@ class TrajectoryHdf5Reader(TrajectoryReader):
         self._check_open()
         with _reading(self.path):
             group = self._group(self._changes, str(index))
-            fields = {
-                field_name(name): self._model_field(group, name) for name in group
-            }
-            return ModelChange(step=_whole_number(group.attrs, "step"), fields=fields)
+            step = _whole_number(group.attrs, "step")
+            if step < 0:
+                raise ValueError("a change of the model is of no step")
+            datasets = self._changed(index, group)
+            fields = {name: _whole(dataset) for name, dataset in datasets.items()}
+            return ModelChange(step=step, fields=fields)
 
-    def _model_field(self, group: h5py.Group, name: str) -> NDArray[Any]:
-        dataset = _checked_dataset(group, name, self.path)
-        kind = array_from_json(
-            {"dtype": dataset.dtype.str, "shape": list(dataset.shape)}
-        )
-        values = np.empty(kind.shape, kind.dtype)
-        if values.size:
-            dataset.read_direct(values)
-        return values
+    def _changed(self, index: int, group: h5py.Group) -> dict[str, Any]:
+        """Return the datasets of a change, which can all be read at once."""
+        if len(group) > MOST_PARTS:
+            raise ValueError(f"a change of the model has {len(group)} fields")
+        datasets = {
+            field_name(name): _checked_dataset(group, name, self.path) for name in group
+        }
+        if sum(map(_size, datasets.values())) > LONGEST_RECORD:
+            raise ValueError("a change of the model is too large")
+        stored = sum(dataset.id.get_storage_size() for dataset in datasets.values())
+        self._stored_changes += stored - self._stored_by_change.get(index, 0)
+        self._stored_by_change[index] = stored
+        # The same data under a million names would be read a million times.
+        if self._stored_changes > self.path.stat().st_size:
+            raise ValueError("its changes of the model are stored in one another")
+        return datasets
 
     def _check_frames(self) -> None:
         steps = self.frame_steps
         bounds = np.concatenate(([0], steps, [max(self.row_count - 1, 0)]))
-        if (np.diff(bounds) < 0).any() or (len(steps) and not self.row_count):
+        # Compared, because differences of such numbers may overflow.
+        if (bounds[1:] < bounds[:-1]).any() or (len(steps) and not self.row_count):
             raise ValueError("its frames are not of its steps, in order")
 
     def _optional(self, name: str, kind: Array | None, count: int) -> Any:
@@ -202,6 +222,8 @@ class TrajectoryHdf5Reader(TrajectoryReader):
 
     def _column(self, name: str, dtype: str, count: int | None = None) -> NDArray[Any]:
         dataset = self._dataset(name, dtype, (), count)
+        if dataset.shape[0] > _MOST_STEPS:
+            raise ValueError(f"it has more than {_MOST_STEPS} {name}")
         return self._read(dataset, 0, dataset.shape[0])
 
     def _dataset(
@@ -266,21 +288,40 @@ def _linked(group: h5py.Group, name: str) -> Any:
 def _checked_dataset(group: h5py.Group, name: str, path: Path) -> Any:
     """Return a dataset that can be read without harm, whoever made the file."""
     dataset = _linked(group, name)
-    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:
+    if not isinstance(dataset, h5py.Dataset):
         raise ValueError(f"its {name} is no dataset")
+    # Before anything else, even its shape: for that, HDF5 opens the other files which
+    # a virtual dataset is put together from.
     properties = dataset.id.get_create_plist()
     filters = {
         properties.get_filter(index)[0] for index in range(properties.get_nfilters())
     }
-    if dataset.is_virtual or dataset.external or filters - _FILTERS:
+    if (
+        properties.get_layout() == h5py.h5d.VIRTUAL
+        or properties.get_external_count()
+        or filters - _FILTERS
+    ):
         raise ValueError(f"its {name} is stored in a way that mjrec does not write")
+    if dataset.shape is None:
+        raise ValueError(f"its {name} is no dataset")
     item = dataset.dtype.itemsize
     chunk = item * math.prod(dataset.chunks or (0,))
     stored = min(dataset.id.get_storage_size(), path.stat().st_size)
-    size = item * math.prod(dataset.shape)
-    if chunk > LARGEST_ROW or size > stored * _MOST_EXPANSION:
+    if chunk > LARGEST_ROW or _size(dataset) > stored * _MOST_EXPANSION:
         raise ValueError(f"its {name} would need more memory than it can hold")
     return dataset
+
+
+def _size(dataset: Any) -> int:
+    return int(dataset.dtype.itemsize * math.prod(dataset.shape))
+
+
+def _whole(dataset: Any) -> NDArray[Any]:
+    kind = array_from_json({"dtype": dataset.dtype.str, "shape": list(dataset.shape)})
+    values = np.empty(kind.shape, kind.dtype)
+    if values.size:
+        dataset.read_direct(values)
+    return values
 
 
 def _attribute(attributes: Any, name: str, kinds: str) -> Any:
@@ -290,6 +331,8 @@ def _attribute(attributes: Any, name: str, kinds: str) -> Any:
     # that has no checksum, and the HDF5 library may never come back from there.
     if identifier.shape != () or identifier.dtype.kind not in kinds:
         raise ValueError(f"its attribute {name!r} is of another type")
+    if identifier.dtype.itemsize > _LONGEST_TEXT:
+        raise ValueError(f"its attribute {name!r} is too long")
     return attributes[name]
 
 
@@ -315,6 +358,9 @@ def _row_type(layout: RowLayout) -> np.dtype[Any]:
 
 
 def _write(file: h5py.File, reader: TrajectoryReader) -> None:
+    # What is written is what a reader will accept.
+    if max(reader.step_count, reader.frame_count) > _MOST_STEPS:
+        raise UnreadableFile(reader.path, f"it has more than {_MOST_STEPS} steps")
     _write_attributes(file, reader)
     _write_steps(file, reader)
     _write_frames(file, reader)

@@ -26,6 +26,7 @@ from .trajectory import (
 
 __all__ = [
     "LARGEST_ROW",
+    "MOST_PARTS",
     "array_from_json",
     "array_to_json",
     "check_version",
@@ -42,6 +43,8 @@ _DTYPES = frozenset(
     + [f"<{kind}{size}" for kind in "iu" for size in (2, 4, 8)]
 )
 _MOST_DIMENSIONS = 16
+# MuJoCo has some hundred arrays.
+MOST_PARTS = 4096
 
 # They become names inside the HDF5 file, where a slash would be a path.
 _NAME = re.compile(r"(?!\.{1,2}$)[^/\x00-\x1f\x7f\ud800-\udfff]{1,200}")
@@ -165,6 +168,8 @@ def _check_layout(fields: tuple[Field, ...]) -> RowLayout:
 
 def _check_parts(parts: Sequence[tuple[str, int, int]]) -> None:
     """Check that the parts of a row have names and lie one behind the other."""
+    if len(parts) > MOST_PARTS:
+        raise ValueError(f"a row would have {len(parts)} parts")
     if len({name for name, _, _ in parts}) != len(parts):
         raise ValueError("two parts of a row have the same name")
     end = 0

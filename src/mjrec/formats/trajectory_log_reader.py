@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import array
 import bisect
-import io
 import math
 import os
 import zlib
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from ..errors import ClosedError
 from ..json_text import loads
 from .json_fields import field, json_object, list_of, mapping, unreadable
+from .regular_files import open_regular
 from .trajectory import Array, ModelChange
 from .trajectory_layout import (
     array_from_json,
@@ -55,6 +55,7 @@ _KINDS = frozenset((HEADER, STEP, FRAME, CHANGE, FACTS))
 
 # What is read at once while looking through a log.
 _WINDOW = 1 << 20
+# Of all facts together: they are kept in memory.
 _LONGEST_JSON = 1 << 26
 
 
@@ -69,10 +70,7 @@ class TrajectoryLogReader(TrajectoryReader):
         self.path = path
         self.dropped = 0
         with unreadable(path):
-            # Opening a pipe would wait for ever.
-            if path.exists() and not path.is_file():
-                raise ValueError("it is not a regular file")
-            self._file = io.FileIO(path, "r")
+            self._file = open_regular(path)
             try:
                 self._look_through()
             except BaseException:
@@ -87,7 +85,9 @@ class TrajectoryLogReader(TrajectoryReader):
         window = _Window(self._file.fileno())
         _check_first_line(bytes(window.read(0, FIRST_LINE_SIZE)))
         records = _records(window)
-        self._facts, rows = _header(window, next(records, None))
+        first = next(records, None)
+        self._facts, rows = _header(window, first)
+        self._json_length = 0 if first is None else first.length
         self.header = header_from_json(self._facts, rows)
         self._prepare()
         for record in records:
@@ -132,6 +132,9 @@ class TrajectoryLogReader(TrajectoryReader):
         if record.kind == CHANGE:
             self._changes.append(record)
         elif record.kind == FACTS:
+            self._json_length += record.length
+            if self._json_length > _LONGEST_JSON:
+                raise ValueError("its facts are too long")
             self._facts.update(_object(window, record))
         return record.kind != HEADER
 
@@ -353,12 +356,16 @@ def _parse_change(payload: bytes) -> ModelChange:
     if len(payload) < CHANGE_PREFIX.size:
         raise ValueError("a change of the model is damaged")
     step, table_size = CHANGE_PREFIX.unpack_from(payload)
+    if step < 0:
+        raise ValueError("a change of the model is of no step")
     offset = CHANGE_PREFIX.size + table_size
     if offset > len(payload):
         raise ValueError("a change of the model is damaged")
     table = list_of(_named_array)(_parse_table(payload[CHANGE_PREFIX.size : offset]))
     if offset + sum(kind.size for _, kind in table) != len(payload):
         raise ValueError("a change of the model has another size than its fields")
+    if len({name for name, _ in table}) != len(table):
+        raise ValueError("a change of the model has two fields of the same name")
     fields: dict[str, NDArray[Any]] = {}
     for name, kind in table:
         count = math.prod(kind.shape)
