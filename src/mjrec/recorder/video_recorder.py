@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import tempfile
@@ -17,6 +18,8 @@ from ..atomic_files import write_text
 from ..blank_frames import BlankFrames
 from ..errors import InvalidArgument, InvalidFrame
 from ..formats.asciicast import AsciicastWriter, text_of_frame
+from ..formats.ffmpeg import ffmpeg_executable
+from ..formats.unfinished_video import VideoNote, note_path, write_note
 from ..formats.video_metadata import StepRuns, file_facts, timing_facts
 from ..formats.video_writer import VideoWriter
 from ..frames import Frame, check_frame
@@ -57,7 +60,8 @@ class VideoRecorder:
     Images become an mp4 (`VideoWriter` says which), text becomes an asciicast of
     version 1 (`.json`). The rate is real time: the simulated time between the first
     two captures where `env` is a MuJoCo environment, else what `env` declares. `close`
-    finishes the file and writes `<path without extension>.meta.json`.
+    finishes the file and writes `<path without extension>.meta.json`. Until then a
+    hidden note beside the unfinished mp4 says what it is, for `mjrec.recover`.
 
     A frame that is none (None, or another size or type than the first) stops the
     video: what came before it stays as a playable file, `broken` is set, and one
@@ -132,6 +136,7 @@ class VideoRecorder:
         self._take = text_of_frame if self.ansi_mode else self._checked_frame
         self._size: tuple[int, int] | None = None
         self._writer: VideoWriter | AsciicastWriter | None = None
+        self._is_noted = False
         # Frames wait here until the second capture tells the rate.
         self._waiting: list[Any] = []
         self._captures = 0
@@ -266,6 +271,7 @@ class VideoRecorder:
         self._waiting.clear()
         if self._writer is not None:
             self._writer.abort()
+        self._forget_note()
 
     def _path_of(
         self,
@@ -297,7 +303,7 @@ class VideoRecorder:
 
     def _add(self, frame: Any) -> None:
         if self._writer is not None:
-            self._writer.write(frame)
+            self._write(self._writer, frame)
         elif self.ansi_mode:
             self._waiting.append(frame)
         else:
@@ -319,6 +325,7 @@ class VideoRecorder:
             self._steps = StepRuns([self._first[0]], stride=self._stride)
             if self._writer is None:
                 self._open_writer(rate / self._stride)
+            self._note_rest()
 
     def _settle_rate(self, step: int, frames: int) -> None:
         """Measure the time of a step, from the first two pictures that there are."""
@@ -333,6 +340,7 @@ class VideoRecorder:
             self._timestep = _time_of_a_step(self._first, (step, self._clock()))
             if self._writer is None:
                 self._open_writer(self._real_time(frames))
+            self._note_rest()
 
     def _real_time(self, frames: int) -> Fraction:
         if self._timestep is not None and frames:
@@ -352,8 +360,46 @@ class VideoRecorder:
                 self.path, fps=rate, frame_hashes=self._frame_hashes
             )
         for frame in self._waiting:
-            self._writer.write(frame)
+            self._write(self._writer, frame)
         self._waiting.clear()
+
+    def _write(self, writer: VideoWriter | AsciicastWriter, frame: Any) -> None:
+        # The note is there before the file that it is about.
+        if not self._is_noted and isinstance(writer, VideoWriter):
+            self._note(writer, {})
+        writer.write(frame)
+
+    def _note(self, writer: VideoWriter, facts: Mapping[str, Any]) -> None:
+        """Write down what the unfinished file is, for whoever finds it."""
+        assert self._size is not None
+        self._is_noted = True
+        timestep = self._timestep
+        write_note(
+            VideoNote(
+                video=writer.unfinished(*self._size),
+                metadata={**self.metadata, **facts},
+                timing={
+                    "timestep": None if timestep is None else str(timestep),
+                    "stride": self._stride,
+                    "frames_per_step": self._frames_per_capture,
+                },
+                ffmpeg_size=Path(ffmpeg_executable()).stat().st_size,
+            )
+        )
+
+    def _note_rest(self) -> None:
+        """Complete the note by what the second picture has told."""
+        if not isinstance(self._writer, VideoWriter) or self._writer.frame_count == 0:
+            return
+        facts: Mapping[str, Any] = {}
+        # They are for the metadata in the end; a note is no reason to stop.
+        with contextlib.suppress(Exception):
+            facts = self._facts() if self._facts else {}
+        self._note(self._writer, facts)
+
+    def _forget_note(self) -> None:
+        if self._is_noted and self.path is not None:
+            note_path(Path(self.path)).unlink(missing_ok=True)
 
     def _break(self, reason: str) -> None:
         self.broken = True
@@ -392,6 +438,7 @@ class VideoRecorder:
             self.metadata["broken"] = True
         assert self.metadata_path is not None
         write_text(Path(self.metadata_path), json_text.dumps(self.metadata))
+        self._forget_note()
 
     def _description(self) -> dict[str, Any]:
         description = timing_facts(
