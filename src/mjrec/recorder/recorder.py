@@ -494,7 +494,7 @@ class Recorder:
         self.video_recorder = recorder = VideoRecorder(
             self._subject.pictures,
             base_path=self._video_path(episode_id),
-            metadata={"episode_id": episode_id},
+            metadata={"episode_id": episode_id, **self._live_video_facts()},
             enabled=enabled,
             fps=self._options.fps,
             max_fps=self._options.max_fps,
@@ -772,18 +772,7 @@ class Recorder:
         if "complete" not in recorder.metadata:
             # Else an end that was interrupted is taken up again.
             recorder.metadata.update(complete=complete, **facts)
-        if self._choice.reason is not None:
-            recorder.metadata["recording_reason"] = self._choice.reason
-        recorder.metadata.update(
-            length=stats.steps,
-            reward=stats.rewards,
-            type=stats.episode_type,
-            env_id=self._env_info["env_id"],
-            seed=self._episode_start.get("seed"),
-            options=self._episode_start.get("options"),
-            recording=LIVE,
-            versions=dict(versions()),
-        )
+        recorder.metadata.update(length=stats.steps, reward=stats.rewards)
         try:
             recorder.close()
         except Error as error:
@@ -792,6 +781,19 @@ class Recorder:
         finally:
             if recorder.closed:
                 self._videos.add_live(recorder)
+
+    def _live_video_facts(self) -> dict[str, Any]:
+        """Return what is known of a live video from its episode's beginning."""
+        reason = self._choice.reason
+        return {
+            **({} if reason is None else {"recording_reason": reason}),
+            "type": self.stats_recorder.episode_type,
+            "env_id": self._env_info["env_id"],
+            "seed": self._episode_start.get("seed"),
+            "options": self._episode_start.get("options"),
+            "recording": LIVE,
+            "versions": dict(versions()),
+        }
 
     def _flush(self) -> None:
         try:
