@@ -107,6 +107,19 @@ def read(path: Path) -> TrajectoryContent:
         return reader.content()
 
 
+def killed(content: TrajectoryContent) -> TrajectoryContent:
+    """Add what is said of an episode whose log does not say how it ended."""
+    facts = {
+        **content.header.facts,
+        "complete": False,
+        "reason": "killed",
+        "length": len(content.rewards),
+        "reward": float(sum(content.rewards.tolist())),
+    }
+    header = dataclasses.replace(content.header, facts=facts)
+    return dataclasses.replace(content, header=header)
+
+
 def assert_same(one: TrajectoryContent, other: TrajectoryContent) -> None:
     """Check that two are equal bit for bit."""
     for field in dataclasses.fields(TrajectoryContent):
@@ -164,7 +177,7 @@ def test_an_episode_killed_at_its_beginning_is_finished(log: Path) -> None:
     TrajectoryLogWriter(log, HEADER).close()
     content = read(log)
     assert content.states.shape == (0, 3)
-    assert_same(read(finish_trajectory(log)), content)
+    assert_same(read(finish_trajectory(log)), killed(content))
 
 
 def test_a_torn_log_is_finished_and_says_what_it_lacks(log: Path) -> None:
@@ -173,7 +186,16 @@ def test_a_torn_log_is_finished_and_says_what_it_lacks(log: Path) -> None:
     os.truncate(log, log.stat().st_size - 120)
     content = read(log)
     assert content.dropped > 0
-    assert_same(read(finish_trajectory(log)), content)
+    assert_same(read(finish_trajectory(log)), killed(content))
+
+
+def test_whoever_knows_more_of_an_end_than_the_log_is_believed(log: Path) -> None:
+    """A journal may have the episode whose log lacks the end."""
+    write(log)
+    os.truncate(log, log.stat().st_size - 120)
+    facts = {"complete": True, "truncated": True, "seed": 8}
+    known = read(finish_trajectory(log, facts=facts)).header.facts
+    assert {key: known[key] for key in facts} == facts
 
 
 def test_ranges_of_snapshots_are_packed_rows(log: Path) -> None:

@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ..errors import DirectoryNotWritable, InvalidArgument, UnreadableFile
 from .json_fields import unreadable
@@ -59,11 +62,16 @@ def find_trajectory(
     return log if is_log else None
 
 
-def finish_trajectory(log: Path) -> Path:
+def finish_trajectory(log: Path, *, facts: Mapping[str, Any] | None = None) -> Path:
     """Make the HDF5 file of an ended log, and remove the log.
 
-    It may be killed at any point and run again, and two may do it at the same time:
-    the log is there until the file is.
+    A log that does not say how its episode ended is that of a process that was killed,
+    and the file says so. This may be killed at any point and run again, and two may do
+    it at the same time: the log is there until the file is.
+
+    Args:
+        log: its path.
+        facts: what else is known of the episode, and counts more than the log.
 
     Returns:
         The path of the HDF5 file.
@@ -80,7 +88,7 @@ def finish_trajectory(log: Path) -> Path:
         )
     finished = log.with_suffix(_FINISHED)
     if not _is_whole(finished):
-        _convert(log, finished)
+        _convert(log, finished, facts or {})
     try:
         log.unlink(missing_ok=True)
     except OSError as error:
@@ -88,14 +96,35 @@ def finish_trajectory(log: Path) -> Path:
     return finished
 
 
-def _convert(log: Path, finished: Path) -> None:
+def _convert(log: Path, finished: Path, facts: Mapping[str, Any]) -> None:
     try:
         with TrajectoryLogReader(log) as reader:
+            known = {**reader.header.facts, **_how_it_ended(reader), **facts}
+            reader.header = dataclasses.replace(reader.header, facts=known)
             write_hdf5(reader, finished)
     except UnreadableFile:
         # Somebody else may have done it and removed the log meanwhile.
         if not _is_whole(finished):
             raise
+
+
+def _how_it_ended(reader: TrajectoryLogReader) -> dict[str, Any]:
+    """Return what there is to say where nobody could say it."""
+    if "complete" in reader.header.facts:
+        return {}
+    known: dict[str, Any] = {
+        "complete": False,
+        "reason": "killed",
+        "length": reader.step_count,
+        # One after the other, as the monitor adds them up.
+        "reward": float(sum(reader.rewards.tolist())),
+    }
+    video = reader.header.facts.get("video")
+    is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"
+    if is_deferred and not reader.frame_count:
+        # So that nobody waits for a video of nothing.
+        known["broken_reason"] = "the process was killed before its first frame"
+    return known
 
 
 def _is_whole(path: Path) -> bool:
