@@ -346,6 +346,23 @@ def test_ctrl_c_keeps_what_is_done(
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.parametrize("again_at", [(), ("--fps", "30")])
+def test_strict_fails_where_nothing_is_to_be_seen(
+    again_at: tuple[str, ...], tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """The videos are there, also in the manifest, and none is pending any more."""
+    painter.plain = True
+    write_finished(tmp_path, 0)
+    manifest = write_pending_manifest(tmp_path, 0)
+    status, out, _ = mjrec(tmp_path, "--strict", *again_at)
+    assert status == 1
+    assert "1 video rendered, with nothing to be seen:" in out
+    assert "all 5 frames are of a single colour" in out
+    assert len(list(tmp_path.glob("*.mp4"))) == 1
+    content = json.loads(manifest.read_text())
+    assert len(content["mjrec"]["pending"]) == bool(again_at)
+
+
 def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path: Path) -> None:
     """With workers and OpenGL; two commands at once share the work."""
     env = gymnasium.make(

@@ -14,7 +14,7 @@ import pytest
 from recordings import frames_of
 from trajectories_by_hand import Painter, grey, write_finished, write_log
 
-from mjrec import InvalidFrame, Monitor, NoPictures, UnreadableFile
+from mjrec import BlankVideo, InvalidFrame, Monitor, NoPictures, UnreadableFile
 from mjrec.formats.video_metadata import metadata_path
 from mjrec.rendering.videos import render_video, video_path
 from mjrec.rendering.views import View
@@ -250,3 +250,27 @@ def test_frames_are_counted(tmp_path: Path) -> None:
         on_frame=lambda: calls.append(grey(0)),
     )
     assert len(calls) == 5
+
+
+def test_a_video_that_shows_nothing_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In its metadata and in the log."""
+    file = render_video(write_finished(tmp_path), workers=Painter(plain=True))
+    assert file is not None
+    assert metadata_of(file.path)["suspect_constant"] is True
+    assert f"{STEM}.mp4 may show nothing: all 5 frames are of a single" in caplog.text
+
+
+def test_with_strict_that_is_an_error(
+    tmp_path: Path, names: Callable[[Path], list[str]]
+) -> None:
+    """The video and its metadata are kept."""
+    trajectory = write_finished(tmp_path)
+    with pytest.raises(BlankVideo, match="single colour"):
+        render_video(trajectory, workers=Painter(plain=True), strict=True)
+    assert len(frames_of(tmp_path / f"{STEM}.mp4")) == 5
+    assert metadata_of(tmp_path / f"{STEM}.mp4")["suspect_constant"] is True
+    out = tmp_path / "other.mp4"
+    assert render_video(trajectory, workers=Painter(), out=out, strict=True) is not None
+    assert not {"suspect_black", "suspect_constant"} & set(metadata_of(out))

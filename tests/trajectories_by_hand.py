@@ -2,7 +2,7 @@
 """Directories with trajectories in them, written without a simulation.
 
 Frame k of one is a grey picture of brightness `grey(k)`, which `Painter` draws from
-its snapshots.
+its snapshots, with a white pixel in a corner.
 """
 
 from __future__ import annotations
@@ -34,12 +34,20 @@ def grey(frame: int) -> int:
 
 
 class Painter:
-    """Draws pictures of trajectories of this module, as `DrawingWorkers` would."""
+    """Draws pictures of trajectories of this module, as `DrawingWorkers` would.
+
+    Args:
+        size: of the pictures.
+        plain: whether to leave the white pixel out.
+    """
 
     gl_strings = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
 
-    def __init__(self, size: tuple[int, int] = (16, 24)) -> None:
+    def __init__(
+        self, size: tuple[int, int] = (16, 24), *, plain: bool = False
+    ) -> None:
         self.size = size
+        self.plain = plain
         self.asked: list[tuple[Path, list[int], View]] = []
 
     def frames(
@@ -48,9 +56,15 @@ class Painter:
         self.asked.append((trajectory, list(indices), view or View()))
         with open_trajectory(trajectory) as reader:
             shown = [int(reader.snapshots(i, i + 1)[0, 0]) for i in indices]
-        return (np.full((*self.size, 3), value, np.uint8) for value in shown)
+        return map(self._picture, shown)
 
     def close(self) -> None: ...
+
+    def _picture(self, brightness: int) -> Any:
+        picture = np.full((*self.size, 3), brightness, np.uint8)
+        if not self.plain:
+            picture[-1, -1] = 255
+        return picture
 
 
 def write_log(

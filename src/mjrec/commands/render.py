@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -42,6 +42,8 @@ class _Report:
     # Each with the number of its frames.
     videos: dict[str, int] = field(default_factory=dict)
     trajectories: list[str] = field(default_factory=list)
+    # Those that are there, and show nothing.
+    blank: dict[str, str] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
     elsewhere: list[str] = field(default_factory=list)
     interrupted: bool = False
@@ -55,12 +57,14 @@ class _Report:
     def add(self, outcome: Outcome) -> None:
         """Add what became of one."""
         self.directory = outcome.directory
-        if outcome.failure is not None:
+        if outcome.is_video:
+            self.videos[outcome.name] = outcome.frame_count
+            if outcome.failure is not None:
+                self.blank[outcome.name] = outcome.failure
+        elif outcome.failure is not None:
             self.failures[outcome.name] = outcome.failure
         elif outcome.is_elsewhere:
             self.elsewhere.append(outcome.name)
-        elif outcome.is_video:
-            self.videos[outcome.name] = outcome.frame_count
         else:
             self.trajectories.append(outcome.name)
 
@@ -69,7 +73,7 @@ class _Report:
         """The command's."""
         if self.interrupted:
             return _INTERRUPTED
-        return _FAILED if self.failures else 0
+        return _FAILED if self.failures or self.blank else 0
 
 
 @flowing_help
@@ -86,6 +90,7 @@ def render(
     fps: float | None = None,
     out: Path | None = None,
     workers: int | None = None,
+    strict: bool = False,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Render the pending videos of a directory, or recorded episodes again.
@@ -111,6 +116,8 @@ def render(
         out: the file to write, for one episode; its ending says which kind.
         workers: how many processes draw; one for each CPU that is free, if it is not
             given.
+        strict: fail where a video shows nothing: black, of one colour, or without any
+            movement; it is kept.
         as_json: print one JSON object at the end, and nothing else.
     """
     height, width = size_of(size)
@@ -137,11 +144,16 @@ def render(
                 variant,
                 workers=workers or usable_cpus(),
                 out=out,
+                strict=strict,
                 on_progress=progress.show,
             )
         else:
             outcomes = finish_pending(
-                directory, keys, workers=workers, on_progress=progress.show
+                directory,
+                keys,
+                workers=workers,
+                strict=strict,
+                on_progress=progress.show,
             )
         report = _collect(outcomes, directory, console)
     if report.is_empty and (episode is not None or not target.is_dir()):
@@ -240,12 +252,17 @@ def _print_summary(report: _Report, console: rich.console.Console) -> None:
     if report.elsewhere:
         what = _count(len(report.elsewhere), "video")
         _print(console, f"{what} left to another process, which is rendering now.")
-    if report.failures:
-        _print(
-            console, f"{_count(len(report.failures), 'video')} could not be rendered:"
-        )
-    for reason in dict.fromkeys(report.failures.values()):
-        names = [name for name, why in report.failures.items() if why == reason]
+    _print_reasons("could not be rendered:", report.failures, console)
+    _print_reasons("rendered, with nothing to be seen:", report.blank, console)
+
+
+def _print_reasons(
+    what: str, failures: Mapping[str, str], console: rich.console.Console
+) -> None:
+    if failures:
+        _print(console, f"{_count(len(failures), 'video')} {what}")
+    for reason in dict.fromkeys(failures.values()):
+        names = [name for name, why in failures.items() if why == reason]
         _print(console, "\n".join(f"  {name}" for name in names))
         _print(console, "\n".join(f"    {line}" for line in reason.splitlines()))
 
@@ -257,6 +274,7 @@ def _print_json(report: _Report) -> None:
             {"name": n, "frame_count": count} for n, count in report.videos.items()
         ],
         "failures": report.failures,
+        "blank": report.blank,
         "elsewhere": report.elsewhere,
         "interrupted": report.interrupted,
     }

@@ -42,6 +42,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     observations: bool = False,
     allow_early_reset: bool | None = None,
     on_error: str = "raise",
+    strict: bool = False,
     env_id: str | None = None,
 ) -> GymnasiumMonitor | DmEnvMonitor:
     """Record what happens to an environment into a monitor directory.
@@ -108,6 +109,10 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             the log says so once, and the manifest lists under `mjrec.faults` which
             episodes lack what. What the environment itself raises is raised in any
             case, and so is wrong use, a step before the first reset for instance.
+        strict: whether a video that shows nothing (all frames black, of one colour
+            each, or all the same) is an error, `BlankVideo` as its episode ends or, of
+            a deferred one, `RenderError` in `close`. The video is kept in any case, its
+            metadata has `suspect_black` or `suspect_constant`, and the log a warning.
         env_id: the environment's name in the recordings. None is the name in its
             spec; dm_env environments have none, so theirs is worth giving, as
             `dm_control/<domain>-<task>`.
@@ -147,6 +152,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             trajectory_callable=trajectory_callable,
             observations=observations,
             on_error=on_error,
+            strict=strict,
             allow_early_reset=(
                 monitor.allows_early_reset
                 if allow_early_reset is None

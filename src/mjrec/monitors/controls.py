@@ -197,7 +197,7 @@ class MonitorControls:
                 random_state=scenes.random_state,
             ),
             options=options,
-            rendering=_rendering(options.workers) if choice.mode == DEFERRED else None,
+            rendering=_rendering(options) if choice.mode == DEFERRED else None,
             finish_log=_finish_log,
         )
         self._guard = ExitGuard(
@@ -222,10 +222,12 @@ class MonitorControls:
             self._guard.run_first_at_exit()
 
 
-def _rendering(workers: int | None) -> Callable[[Path], Rendering] | None:
-    if workers == 0:
+def _rendering(options: RecorderOptions) -> Callable[[Path], Rendering] | None:
+    if options.workers == 0:
         return None
-    return functools.partial(RenderService, workers=workers)
+    return functools.partial(
+        RenderService, workers=options.workers, strict=options.strict
+    )
 
 
 def _note_last_error(recorder: Recorder) -> None:

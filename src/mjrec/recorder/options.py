@@ -53,16 +53,18 @@ class RecorderOptions:
     observations: bool = False
     allow_early_reset: bool = False
     on_error: str = RAISE
+    strict: bool = False
 
     def __post_init__(self) -> None:
         type_of_mode(self.mode)
         for name in ("fps", "max_fps"):
             if getattr(self, name) is not None:
                 to_rate(getattr(self, name), name=name)
-        if not isinstance(self.observations, bool):
-            raise InvalidArgument(
-                f"observations must be True or False, got {self.observations!r}."
-            )
+        for name in ("observations", "strict"):
+            if not isinstance(getattr(self, name), bool):
+                raise InvalidArgument(
+                    f"{name} must be True or False, got {getattr(self, name)!r}."
+                )
         check_quality(self.quality)
         if self.render not in (None, DEFERRED, LIVE, OFF):
             raise InvalidArgument(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 
-from ..errors import Error, InvalidArgument
+from ..errors import BlankVideo, Error, InvalidArgument
 from ..rates import to_rate
 from .outcomes import Outcome
 from .pending import EpisodeKey
@@ -81,6 +81,7 @@ def render_again(
     *,
     workers: int,
     out: Path | None = None,
+    strict: bool = False,
     on_progress: Callable[[Progress], object] = lambda _: None,
 ) -> Iterator[Outcome]:
     """Render recorded episodes another way, and yield what became of each.
@@ -94,6 +95,7 @@ def render_again(
         workers: how many processes draw.
         out: the video, where there is one trajectory only; `Variant.name_for` beside
             each trajectory, if None.
+        strict: whether a video that shows nothing is a failure, though it is there.
         on_progress: called after every frame, and when a video is over.
 
     Raises:
@@ -113,7 +115,12 @@ def render_again(
     with DrawingWorkers(workers) as crew:
         for place, (trajectory, video) in enumerate(zip(paths, outs, strict=True), 1):
             outcome = _render(
-                trajectory, variant, video, workers=crew, on_frame=count_frame
+                trajectory,
+                variant,
+                video,
+                workers=crew,
+                strict=strict,
+                on_frame=count_frame,
             )
             # Also the frames that were not drawn: nobody waits for them any more.
             now = replace(now, videos_done=place, frames_done=sum(counts[:place]))
@@ -127,6 +134,7 @@ def _render(
     video: Path,
     *,
     workers: DrawingWorkers,
+    strict: bool,
     on_frame: Callable[[], object],
 ) -> Outcome:
     """Render one, and return what became of it."""
@@ -139,7 +147,12 @@ def _render(
             max_fps=variant.max_fps,
             fps=variant.fps,
             out=video,
+            strict=strict,
             on_frame=on_frame,
+        )
+    except BlankVideo as error:
+        return replace(
+            outcome, is_video=True, frame_count=error.frame_count, failure=str(error)
         )
     except (Error, OSError) as error:
         return replace(outcome, failure=str(error))

@@ -15,8 +15,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from ..errors import Error, GLError
+from ..errors import BlankVideo, Error, GLError
 from ..formats.trajectory_file import finish_trajectory
+from ..formats.video_writer import VideoFile
 from .crew import Crew
 from .outcomes import Outcome
 from .pending import EpisodeKey, PendingEpisode, claim, look_at
@@ -34,6 +35,7 @@ def finish_pending(
     keys: Iterable[EpisodeKey],
     *,
     workers: int | None,
+    strict: bool = False,
     on_progress: Callable[[Progress], object] = lambda _: None,
 ) -> Iterator[Outcome]:
     """Finish what is pending of some episodes, and yield what became of each.
@@ -46,13 +48,14 @@ def finish_pending(
         directory: the monitor directory.
         keys: which episodes.
         workers: how many processes draw; None is one for each free CPU.
+        strict: whether a video that shows nothing is a failure.
         on_progress: called after every frame, and when an episode is over.
 
     Raises:
         UnreadableFile: a manifest is damaged.
     """
     with EpisodeFinisher(
-        directory, workers=workers, on_progress=on_progress
+        directory, workers=workers, strict=strict, on_progress=on_progress
     ) as finisher:
         for key in keys:
             finisher.add(key)
@@ -68,12 +71,14 @@ class EpisodeFinisher:
     Args:
         directory: the monitor directory.
         workers: how many processes draw; None is one for each free CPU.
-        on_progress: called after every frame, and when an episode is over. It may add
-            episodes.
+        strict: whether a video that shows nothing is a failure, though it is there.
+        on_progress: see below.
         wait: called with seconds to wait while no CPU is free.
 
     Attributes:
         progress: how far it is.
+        on_progress: called after every frame, and when an episode is over. It may add
+            episodes.
     """
 
     def __init__(
@@ -81,12 +86,14 @@ class EpisodeFinisher:
         directory: Path,
         *,
         workers: int | None,
+        strict: bool = False,
         on_progress: Callable[[Progress], object] = lambda _: None,
         wait: Callable[[float], object] = time.sleep,
     ) -> None:
         self.progress = Progress()
+        self.on_progress = on_progress
         self._directory = directory
-        self._on_progress = on_progress
+        self._strict = strict
         self._crew = Crew(directory, workers=workers, wait=wait)
         # None stands for one that could not be read when it was added.
         self._waiting: dict[EpisodeKey, PendingEpisode | None] = {}
@@ -155,7 +162,7 @@ class EpisodeFinisher:
     def _count(self, **more: int) -> None:
         now = {name: getattr(self.progress, name) + more[name] for name in more}
         self.progress = replace(self.progress, **now)
-        self._on_progress(self.progress)
+        self.on_progress(self.progress)
 
     def _finish(self, key: EpisodeKey) -> Outcome:
         nothing = Outcome(name=key.video_name, directory=self._directory)
@@ -181,34 +188,43 @@ class EpisodeFinisher:
             path = finish_trajectory(path)
         outcome = Outcome(name=path.name, directory=self._directory)
         if episode.video is not None:
-            frame_count = self._render(path)
-            outcome = replace(
-                outcome,
-                name=episode.video.name,
-                is_video=frame_count > 0,
-                frame_count=frame_count,
-            )
+            outcome = replace(outcome, name=episode.video.name)
+            outcome = self._rendered(path, outcome)
         if not episode.is_kept:
             for suffix in (".log", ".h5"):
                 path.with_suffix(suffix).unlink(missing_ok=True)
         update_manifest(self._directory, episode.key.infix)
         return outcome
 
-    def _render(self, trajectory: Path) -> int:
-        """Render the video of a trajectory, and return how many frames it has."""
+    def _rendered(self, trajectory: Path, outcome: Outcome) -> Outcome:
+        """Render the video of a trajectory, and return what became of it."""
+        try:
+            file = self._render(trajectory)
+        except BlankVideo as error:
+            # It is as much of a video as there will ever be.
+            return replace(
+                outcome,
+                is_video=True,
+                frame_count=error.frame_count,
+                failure=str(error),
+            )
+        frame_count = 0 if file is None else file.frame_count
+        return replace(outcome, is_video=frame_count > 0, frame_count=frame_count)
+
+    def _render(self, trajectory: Path) -> VideoFile | None:
         if self._gl_failure is not None:
             # The same for all of them, after a second of trying each.
             raise self._gl_failure
         try:
-            file = render_video(
+            return render_video(
                 trajectory,
                 workers=self._crew.at_work(),
+                strict=self._strict,
                 on_frame=lambda: self._count(frames_done=1),
             )
         except GLError as error:
             self._gl_failure = error
             raise
-        return 0 if file is None else file.frame_count
 
 
 def _has_model(episode: PendingEpisode | None) -> bool:

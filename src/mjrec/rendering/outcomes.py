@@ -18,7 +18,8 @@ class Outcome:
         directory: where it is, or was to be.
         is_video: a video was rendered.
         frame_count: how many frames it has.
-        failure: why it could not be done; None where it was, or needed nothing.
+        failure: why it could not be done; None where it was, or needed nothing. Of a
+            video that was rendered: that it shows nothing.
         is_elsewhere: another process is at it.
     """
 

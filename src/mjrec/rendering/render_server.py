@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A process that finishes episodes beside a simulation.
 
-`python -m mjrec.rendering.render_server DIRECTORY --workers N|auto`. On its standard
-input it is told the base name of one ended trajectory a line, and at last
+`python -m mjrec.rendering.render_server DIRECTORY --workers N|auto [--strict]`. On its
+standard input it is told the base name of one ended trajectory a line, and at last
 `that was all`. On its standard output it says one JSON object a line::
 
     {"progress": {"videos_done": 0, "videos": 2, "frames_done": 40, "frames": 2002}}
@@ -57,6 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("directory", type=Path)
     parser.add_argument("--workers", required=True)
+    parser.add_argument("--strict", action="store_true")
     arguments = parser.parse_args(argv)
     workers = None if arguments.workers == "auto" else int(arguments.workers)
     signal.signal(signal.SIGTERM, _stop)
@@ -64,7 +65,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     answers = _Answers(take_standard_output())
     logging.getLogger().addHandler(_ToSimulation(answers))
     try:
-        _Service(arguments.directory, workers, _Inbox(), answers).run()
+        finisher = EpisodeFinisher(
+            arguments.directory, workers=workers, strict=arguments.strict
+        )
+        _Service(finisher, _Inbox(), answers).run()
     except _Stopped:
         return 0
     answers.flush()
@@ -82,16 +86,15 @@ class _Service:
     """Does what the inbox says, and tells what came of it."""
 
     def __init__(
-        self, directory: Path, workers: int | None, inbox: _Inbox, answers: _Answers
+        self, finisher: EpisodeFinisher, inbox: _Inbox, answers: _Answers
     ) -> None:
         self._inbox = inbox
         self._answers = answers
         self._last_report = 0.0
         # By which names they were given.
         self._names: dict[EpisodeKey, str] = {}
-        self._finisher = EpisodeFinisher(
-            directory, workers=workers, on_progress=self._look_up
-        )
+        self._finisher = finisher
+        finisher.on_progress = self._look_up
 
     def run(self) -> None:
         """Return when everything is done."""

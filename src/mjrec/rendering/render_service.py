@@ -16,7 +16,7 @@ import signal
 import subprocess
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -53,6 +53,8 @@ class RenderService:
         directory: the monitor directory.
         workers: how many processes draw; None is one for each CPU that can be used,
             shared by all who render into the directory.
+        strict: whether a video that shows nothing counts as one that could not be
+            rendered, though it is there.
 
     Raises:
         InvalidArgument: `workers` is no number of processes.
@@ -62,9 +64,11 @@ class RenderService:
             without a video, that of the trajectory.
     """
 
-    def __init__(self, directory: Path, *, workers: int | None) -> None:
+    def __init__(
+        self, directory: Path, *, workers: int | None, strict: bool = False
+    ) -> None:
         self._directory = Path(directory).absolute()
-        self._workers = check_workers(workers)
+        self._arguments = _arguments(self._directory, check_workers(workers), strict)
         self._process_id = os.getpid()
         self._server: _Server | None = None
         # A dictionary for its order.
@@ -135,7 +139,7 @@ class RenderService:
     def _say(self, name: str) -> None:
         try:
             if self._server is None:
-                self._server = _Server(self._directory, self._workers)
+                self._server = _Server(self._arguments)
             self._server.say(name)
         except OSError as error:
             self._note_death(f"it could not be started: {error}")
@@ -201,14 +205,14 @@ class _Server:
         OSError: it could not be started.
     """
 
-    def __init__(self, directory: Path, workers: int | None) -> None:
+    def __init__(self, arguments: Sequence[str]) -> None:
         self._stderr = _scratch_file()
         self._unsaid = b""
         self._unread = b""
         self._ended = False
         self.all_said = False
         try:
-            self._process = _start(directory, workers, self._stderr)
+            self._process = _start(arguments, self._stderr)
         except BaseException:
             if self._stderr is not None:
                 self._stderr.close()
@@ -310,16 +314,16 @@ class _Server:
         return self._stderr.read().decode(errors="replace").strip()
 
 
+def _arguments(directory: Path, workers: int | None, strict: bool) -> list[str]:
+    arguments = [str(directory), "--workers", str(workers or "auto")]
+    return [*arguments, "--strict"] if strict else arguments
+
+
 def _start(
-    directory: Path, workers: int | None, stderr: IO[bytes] | None
+    arguments: Sequence[str], stderr: IO[bytes] | None
 ) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [
-            *python_command(_MODULE),
-            str(directory),
-            "--workers",
-            "auto" if workers is None else str(workers),
-        ],
+        [*python_command(_MODULE), *arguments],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=stderr or subprocess.DEVNULL,

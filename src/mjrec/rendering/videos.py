@@ -7,6 +7,8 @@ of workers. The metadata comes last: where it is, the video is there and whole.
 
 from __future__ import annotations
 
+import logging
+import signal
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -14,7 +16,8 @@ from typing import Any
 
 from .. import json_text
 from ..atomic_files import write_text
-from ..errors import NoPictures, UnreadableFile
+from ..blank_frames import BlankFrames
+from ..errors import EncoderError, NoPictures, UnreadableFile
 from ..formats.monitor_directory import Infix, episode_of, infix_of, video_prefix
 from ..formats.trajectory_reader import TrajectoryReader
 from ..formats.video_metadata import (
@@ -40,6 +43,8 @@ from .workers import DrawingWorkers
 
 __all__ = ["render_video", "video_path"]
 
+logger = logging.getLogger(__name__)
+
 # Of an episode that ended before its second step: any is as good.
 _RATE_OF_ONE_FRAME = Fraction(30)
 
@@ -52,12 +57,14 @@ def render_video(
     max_fps: float | Fraction | None = None,
     fps: float | Fraction | None = None,
     out: Path | None = None,
+    strict: bool = False,
     on_frame: Callable[[], object] = lambda: None,
 ) -> VideoFile | None:
     """Render the video of a trajectory, with its frame hashes and its metadata.
 
     All three have temporary names until they are whole. Those that are there are
-    replaced. If it fails or is interrupted, nothing is left.
+    replaced. If it fails or is interrupted, nothing is left. An encoder that is killed
+    or hangs is given a second try.
 
     Args:
         trajectory: the file, finished or not.
@@ -68,7 +75,8 @@ def render_video(
         fps: frames per second of the file. If None, a second of the video is as much
             simulated time as when the episode was recorded.
         out: the video; what the trajectory says, in its own directory, if None.
-        on_frame: called after every frame.
+        strict: whether a video that shows nothing is an error; else it is a warning.
+        on_frame: called after every frame, once for each.
 
     Returns:
         What was written; None where the trajectory says that it broke before there was
@@ -77,6 +85,8 @@ def render_video(
     Raises:
         NoPictures: it has no frames.
         UnreadableFile: it is damaged.
+        BlankVideo: `strict`, and the video shows nothing. It is there and stays.
+        FileNotWritten: the disk is full.
         Error: its frames cannot be drawn or encoded.
     """
     view = view or View()
@@ -97,24 +107,28 @@ def render_video(
         steps = reader.frame_steps[chosen.indices].tolist()
         episode = _episode_facts(reader)
     rate = _usual_fps(facts, chosen) if fps is None else to_rate(fps)
-    frames = workers.frames(trajectory, chosen.indices, view)
-    file = _write_video(out, frames, fps=rate, on_frame=on_frame)
-    _write_metadata(
+    file, blank = _write_video(
         out,
-        {
-            **episode,
-            **timing_facts(
-                StepRuns(steps, stride=stride),
-                fps=file.fps,
-                timestep=_fraction(facts.get("timestep")),
-                stride=stride,
-            ),
-            **file_facts(file),
-            **_picture_facts(facts, view),
-            **workers.gl_strings,
-            **broken,
-        },
+        lambda: workers.frames(trajectory, chosen.indices, view),
+        fps=rate,
+        on_frame=on_frame,
     )
+    metadata = {
+        **episode,
+        **timing_facts(
+            StepRuns(steps, stride=stride),
+            fps=file.fps,
+            timestep=_fraction(facts.get("timestep")),
+            stride=stride,
+        ),
+        **file_facts(file),
+        **blank.facts(),
+        **_picture_facts(facts, view),
+        **workers.gl_strings,
+        **broken,
+    }
+    _complete(file, metadata)
+    blank.judge(out, strict=strict)
     return file
 
 
@@ -145,16 +159,49 @@ def _usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:
 
 def _write_video(
     out: Path,
-    frames: Iterable[Frame],
+    draw: Callable[[], Iterable[Frame]],
     *,
     fps: Fraction,
     on_frame: Callable[[], object],
-) -> VideoFile:
+) -> tuple[VideoFile, BlankFrames]:
+    """Write the frames, a second time where the encoder was ended from outside."""
+    most = 0
+
+    def tell(number: int) -> None:
+        nonlocal most
+        if number > most:
+            most = number
+            on_frame()
+
+    try:
+        return _encode(out, draw(), fps=fps, tell=tell)
+    except EncoderError as error:
+        if not _was_ended(error):
+            raise
+        logger.warning("The video %s is begun anew: %s", out.name, error)
+    return _encode(out, draw(), fps=fps, tell=tell)
+
+
+def _was_ended(error: EncoderError) -> bool:
+    """Tell whether ffmpeg was killed: by whoever lacked memory, or for hanging."""
+    # At a limit on the size of files it would die once more.
+    return (error.returncode or 0) < 0 and error.returncode != -signal.SIGXFSZ
+
+
+def _encode(
+    out: Path,
+    frames: Iterable[Frame],
+    *,
+    fps: Fraction,
+    tell: Callable[[int], object],
+) -> tuple[VideoFile, BlankFrames]:
+    blank = BlankFrames()
     writer = VideoWriter(out, fps=fps, frame_hashes=True)
     try:
-        for frame in frames:
+        for number, frame in enumerate(frames, 1):
             writer.write(frame)
-            on_frame()
+            blank.add(frame)
+            tell(number)
         # An older video's would not be true of this one.
         metadata_path(out).unlink(missing_ok=True)
         writer.close()
@@ -163,7 +210,18 @@ def _write_video(
         writer.abort()
         raise
     assert writer.result is not None
-    return writer.result
+    return writer.result, blank
+
+
+def _complete(file: VideoFile, metadata: Mapping[str, Any]) -> None:
+    """Write the metadata; without it there is no video, and nothing stays."""
+    try:
+        _write_metadata(file.path, metadata)
+    except BaseException:
+        if not metadata_path(file.path).exists():
+            for path in filter(None, (file.path, file.frame_hash_path)):
+                path.unlink(missing_ok=True)
+        raise
 
 
 def _episode_facts(reader: TrajectoryReader) -> dict[str, Any]:
