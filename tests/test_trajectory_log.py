@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 import resource
@@ -10,6 +11,8 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
+import time
 import tracemalloc
 import zlib
 from collections.abc import Callable, Iterator
@@ -302,14 +305,76 @@ def test_a_moment_that_finds_no_room_was_not_added(path: Path) -> None:
     check(read(path), rows)
 
 
-def test_a_flush_is_due_after_a_second(
+def wait_until(condition: Callable[[], object], seconds: float = 1.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_rows_are_there_within_a_second_though_none_follows(path: Path) -> None:
+    """A simulation that hangs after its third step loses nothing by that."""
+    writer = write(path, 3)
+    writer.seal_row()
+    wait_until(path.exists)
+    check(read(path), 3)
+    write_step(writer, 4)
+    writer.seal_row()
+    wait_until(lambda: read(path).states.shape[0] == 5)
+    writer.close()
+    check(read(path), 4)
+
+
+def test_a_row_that_is_being_filled_is_not_written(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is written within a second; the next row after it brings the rest."""
+    """Whoever fills it says when it is whole."""
+    writer = write(path, 3)
+    writer.step_row(4, 0, False, False)
+    now = time.monotonic()
+    monkeypatch.setattr(trajectory_log, "monotonic", lambda: now + 10)
+    writer.flush_if_due()
+    assert not path.exists()
+    writer.withdraw_row()
+    writer.flush_if_due()
+    check(read(path), 3)
+    writer.close()
+
+
+def test_looking_after_writers_ends_with_the_last_of_them(path: Path) -> None:
+    """No thread stays; one that was dropped without a close is none of them."""
+    write(path, 1)
+    names = lambda: [t.name for t in threading.enumerate()]  # noqa: E731
+    assert "mjrec-flushing" in names()
+    gc.collect()
+    wait_until(lambda: "mjrec-flushing" not in names(), seconds=5)
+
+
+def test_a_forked_child_can_close_what_is_being_flushed(path: Path) -> None:
+    """Another thread held the lock when it was forked, and is not there."""
+    writer = write(path, 1)
+    with writer._lock:
+        child = os.fork()
+        if child == 0:
+            threading.Thread(target=writer.close).start()
+            writer.close()
+            os._exit(0)
+    end = time.monotonic() + 20
+    while os.waitpid(child, os.WNOHANG) == (0, 0):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    writer.close()
+    check(read(path), 1)
+
+
+def test_a_flush_is_due_before_a_second_is_over(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is written before; the next row after it brings the rest."""
     now = 100.0
     monkeypatch.setattr(trajectory_log, "monotonic", lambda: now)
     writer = write(path, 2)
-    now += 0.9
+    now += 0.7
     write_step(writer, 3)
     assert not path.exists()
     now += 0.2

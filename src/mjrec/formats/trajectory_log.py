@@ -15,6 +15,7 @@ import errno
 import json
 import os
 import struct
+import threading
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -31,6 +32,7 @@ from ..errors import (
     InvalidArgument,
 )
 from ..json_text import dumps
+from .timely_flushing import flush_in_time
 from .trajectory import (
     FORMAT_VERSION,
     Array,
@@ -89,7 +91,8 @@ _Bytes = bytes | bytearray | memoryview
 # Half as expensive as a file object, in an episode of twenty steps.
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
-_FLUSH_SECONDS = 1.0
+# With the rounds of `timely_flushing` less than a second.
+_FLUSH_SECONDS = 0.75
 _BLOCK_BYTES = 1 << 18
 _MOST_BLOCK_BYTES = 1 << 21
 _MOST_ROWS = 512
@@ -141,12 +144,13 @@ class RowBlocks:
 class TrajectoryLogWriter:
     """Writes the log of one episode.
 
-    The file appears with the first flush: when a block of rows is full, at the first
-    row more than a second after the last flush, at `flush`, or at `close`. A file of
-    that name that is there already was left by a reset that another reset replaced,
-    and is removed. What was flushed survives the death of the process.
+    The file appears with the first flush: when a block of rows is full, within a second
+    of a row, at `flush`, or at `close`. A file of that name that is there already was
+    left by a reset that another reset replaced, and is removed. What was flushed
+    survives the death of the process.
 
-    One thread uses it. A process forked from this one cannot: it can only `close`,
+    One thread uses it, and another flushes what that one leaves too long. A process
+    forked from this one cannot: it can only `close`,
     which writes nothing there.
 
     Args:
@@ -174,9 +178,11 @@ class TrajectoryLogWriter:
         self._steps = blocks.steps
         self._frames = blocks.frames
         self._process_id = os.getpid()
+        self._lock = threading.RLock()
         self._descriptor: int | None = None
         self._is_there = False
         self._tail = _Tail(0, _beginning(header.facts, blocks.layout_text))
+        flush_in_time(self)
 
     @property
     def closed(self) -> bool:
@@ -196,27 +202,29 @@ class TrajectoryLogWriter:
 
         Returns:
             State, action and observation, one behind the other, as bytes. All of it
-            is to be filled before anything else is asked of this writer, or
-            `withdraw_row` called: what it holds now is some earlier row.
+            is to be filled before anything else is asked of this writer, and then
+            `seal_row` called, or `withdraw_row`: what it holds now is some earlier
+            row.
 
         Raises:
             FileNotWritten: the disk is full; nothing was added.
             ClosedError: after `close` or `discard`.
         """
-        tail = self._tail
-        index = tail.steps
-        block = self._steps
-        if index == block.capacity or monotonic() >= tail.due:
-            self.flush()
+        with self._lock:
             tail = self._tail
-            index = 0
-        row = block.rows[index] if index < len(block.rows) else block.next_row()
-        STEP_PREFIX.pack_into(
-            block.memory, block.starts[index], step, reward, terminated, truncated
-        )
-        tail.last = STEP
-        tail.steps = index + 1
-        return row
+            index = tail.steps
+            block = self._steps
+            if index == block.capacity or monotonic() >= tail.due:
+                self.flush()
+                tail = self._tail
+                index = 0
+            row = block.rows[index] if index < len(block.rows) else block.next_row()
+            STEP_PREFIX.pack_into(
+                block.memory, block.starts[index], step, reward, terminated, truncated
+            )
+            tail.last = STEP
+            tail.steps = index + 1
+            return row
 
     def frame_row(self, step: int) -> NDArray[np.uint8]:
         """Add the row of a video frame, and return the part that the caller fills.
@@ -231,18 +239,19 @@ class TrajectoryLogWriter:
             FileNotWritten: the disk is full; nothing was added.
             ClosedError: after `close` or `discard`.
         """
-        tail = self._tail
-        index = tail.frames
-        block = self._frames
-        if index == block.capacity or tail is _CLOSED:
-            self.flush()
+        with self._lock:
             tail = self._tail
-            index = 0
-        row = block.rows[index] if index < len(block.rows) else block.next_row()
-        FRAME_PREFIX.pack_into(block.memory, block.starts[index], step)
-        tail.last = FRAME
-        tail.frames = index + 1
-        return row
+            index = tail.frames
+            block = self._frames
+            if index == block.capacity or tail is _CLOSED:
+                self.flush()
+                tail = self._tail
+                index = 0
+            row = block.rows[index] if index < len(block.rows) else block.next_row()
+            FRAME_PREFIX.pack_into(block.memory, block.starts[index], step)
+            tail.last = FRAME
+            tail.frames = index + 1
+            return row
 
     def add_moment(
         self,
@@ -267,44 +276,52 @@ class TrajectoryLogWriter:
             FileNotWritten: the disk is full; nothing was added.
             ClosedError: after `close` or `discard`.
         """
-        tail = self._tail
-        at, frame_at = tail.steps, tail.frames
-        steps, frames = self._steps, self._frames
-        if (
-            at == steps.capacity
-            or frame_at == frames.capacity
-            or monotonic() >= tail.due
-        ):
-            self.flush()
+        with self._lock:
             tail = self._tail
-            at = frame_at = 0
-        if at == len(steps.rows):
-            steps.next_row()
-        if frame_at == len(frames.rows):
-            frames.next_row()
-        start = steps.starts[at]
-        STEP_PREFIX.pack_into(steps.memory, start, step, reward, terminated, truncated)
-        start += STEP_PREFIX.size
-        steps.memory[start : start + len(row)] = row
-        start = frames.starts[frame_at]
-        FRAME_PREFIX.pack_into(frames.memory, start, step)
-        start += FRAME_PREFIX.size
-        frames.memory[start : start + len(snapshot)] = snapshot
-        tail.steps = at + 1
-        tail.frames = frame_at + 1
-        tail.last = b""
+            at, frame_at = tail.steps, tail.frames
+            steps, frames = self._steps, self._frames
+            if (
+                at == steps.capacity
+                or frame_at == frames.capacity
+                or monotonic() >= tail.due
+            ):
+                self.flush()
+                tail = self._tail
+                at = frame_at = 0
+            if at == len(steps.rows):
+                steps.next_row()
+            if frame_at == len(frames.rows):
+                frames.next_row()
+            start = steps.starts[at]
+            STEP_PREFIX.pack_into(
+                steps.memory, start, step, reward, terminated, truncated
+            )
+            start += STEP_PREFIX.size
+            steps.memory[start : start + len(row)] = row
+            start = frames.starts[frame_at]
+            FRAME_PREFIX.pack_into(frames.memory, start, step)
+            start += FRAME_PREFIX.size
+            frames.memory[start : start + len(snapshot)] = snapshot
+            tail.steps = at + 1
+            tail.frames = frame_at + 1
+            tail.last = b""
 
     def withdraw_row(self) -> None:
         """Take back the row that was given out last, because it could not be filled.
 
         Does nothing where that was done already, or the row was written.
         """
-        tail = self._tail
-        last, tail.last = tail.last, b""
-        if last == STEP:
-            tail.steps -= 1
-        elif last == FRAME:
-            tail.frames -= 1
+        with self._lock:
+            tail = self._tail
+            last, tail.last = tail.last, b""
+            if last == STEP:
+                tail.steps -= 1
+            elif last == FRAME:
+                tail.frames -= 1
+
+    def seal_row(self) -> None:
+        """Say that the row that was given out last is filled, and may be written."""
+        self._tail.last = b""
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Add to the facts of the header; of a key that is there, the newest counts.
@@ -313,7 +330,9 @@ class TrajectoryLogWriter:
             ClosedError: after `close` or `discard`.
         """
         self._check_open()
-        self._tail.facts += _record(FACTS, _json(facts))
+        record = _record(FACTS, _json(facts))
+        with self._lock:
+            self._tail.facts += record
 
     def add_model_change(self, change: ModelChange) -> None:
         """Note what is other in the model from a step on.
@@ -325,10 +344,12 @@ class TrajectoryLogWriter:
             ClosedError: after `close` or `discard`.
         """
         self._check_open()
-        tail = self._tail
-        tail.changes += _record(CHANGE, *_change_parts(change))
-        if len(tail.changes) > _MOST_PENDING_BYTES:
-            self.flush()
+        record = _record(CHANGE, *_change_parts(change))
+        with self._lock:
+            tail = self._tail
+            tail.changes += record
+            if len(tail.changes) > _MOST_PENDING_BYTES:
+                self.flush()
 
     def flush(self) -> None:
         """Hand everything to the operating system.
@@ -338,22 +359,42 @@ class TrajectoryLogWriter:
                 long as before, everything is kept, and another call tries again.
             ClosedError: after `close` or `discard`, or in a forked process.
         """
-        self._check_open()
-        self._check_process()
-        tail = self._tail
-        # In this order: a frame is never there without the model that it shows and
-        # the step that it shows the end of, nor the end of the episode without all.
-        parts: list[_Bytes] = [
-            tail.beginning,
-            tail.changes,
-            self._steps.finished(tail.steps),
-            self._frames.finished(tail.frames),
-            tail.facts,
-        ]
-        size = self._write([part for part in parts if part], tail.offset)
-        # One assignment: after Ctrl-C anywhere before it, the same bytes are written
-        # to the same place again; after it, none of them.
-        self._tail = _Tail(tail.offset + size)
+        with self._lock:
+            self._check_open()
+            self._check_process()
+            tail = self._tail
+            # In this order: a frame is never there without the model that it shows and
+            # the step that it shows the end of, nor the end of the episode without all.
+            parts: list[_Bytes] = [
+                tail.beginning,
+                tail.changes,
+                self._steps.finished(tail.steps),
+                self._frames.finished(tail.frames),
+                tail.facts,
+            ]
+            size = self._write([part for part in parts if part], tail.offset)
+            # One assignment: after Ctrl-C anywhere before it, the same bytes are
+            # written to the same place again; after it, none of them.
+            self._tail = _Tail(tail.offset + size)
+
+    def flush_if_due(self) -> None:
+        """Flush what has waited for long enough, on whichever thread.
+
+        Not in the midst of a row. On a full disk it does nothing: whoever writes will
+        find out.
+        """
+        if monotonic() < self._tail.due:
+            return
+        with self._lock:
+            tail = self._tail
+            if tail.last or tail is _CLOSED or monotonic() < tail.due:
+                return
+            with contextlib.suppress(FileNotWritten):
+                self.flush()
+
+    def renew_lock(self) -> None:
+        """Make a new lock, in a forked child: another thread may have held the old."""
+        self._lock = threading.RLock()
 
     def close(self) -> None:
         """Write everything and close the file. Idempotent.
@@ -363,15 +404,17 @@ class TrajectoryLogWriter:
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
         """
-        if self.closed:
-            return
-        if os.getpid() == self._process_id:
-            self.flush()
-        self._let_go()
+        with self._lock:
+            if self.closed:
+                return
+            if os.getpid() == self._process_id:
+                self.flush()
+            self._let_go()
 
     def abandon(self) -> None:
         """Close the file without writing what is not there yet. Idempotent."""
-        self._let_go()
+        with self._lock:
+            self._let_go()
 
     def discard(self) -> None:
         """Leave nothing, whether it was closed or not. Idempotent.
@@ -379,7 +422,7 @@ class TrajectoryLogWriter:
         Raises:
             DirectoryNotWritable: the file cannot be removed.
         """
-        self._let_go()
+        self.abandon()
         if self._is_there and os.getpid() == self._process_id:
             try:
                 self.path.unlink(missing_ok=True)
@@ -440,6 +483,7 @@ class TrajectoryLogWriter:
         if not self.closed:
             self._tail = _CLOSED
             self.blocks.free = True
+            flush_in_time(self, is_open=False)
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
             os.close(descriptor)

@@ -199,6 +199,7 @@ class TrajectoryRecorder:
             # Whatever was raised: a row that is half of an earlier one, or missing,
             # would be the end of the log.
             row.data[:] = b"".join((state, *self._behind_state))
+            log.seal_row()
         if number == 1:
             self._settle_pace(log)
         if has_picture and (is_last or number % self._stride == 0):
@@ -225,6 +226,7 @@ class TrajectoryRecorder:
             except BaseException:
                 log.withdraw_row()
                 raise
+            log.seal_row()
             self._last_frame = number
             self.frame_count += 1
         if changed:
@@ -292,8 +294,10 @@ class TrajectoryRecorder:
         no_action = bytes(0 if self._action is None else self._action.size)
         row = log.step_row(0, 0.0, False, False)
         row.data[:] = b"".join((self._first_state, no_action, self._first_observation))
+        log.seal_row()
         if self._takes_frames:
             log.frame_row(0)[:] = self._first_snapshot
+            log.seal_row()
             self._last_frame = 0
             self.frame_count = 1
 

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flushing in time, also where nobody writes any more.
+
+A writer that flushes when something is added keeps what was added last to itself for
+as long as the next step takes: a simulation that hangs would lose it. One thread of
+this process looks after all writers that are open, and ends with the last of them.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import weakref
+from typing import Protocol
+
+__all__ = ["Flushed", "flush_in_time"]
+
+_SECONDS = 0.2
+
+
+class Flushed(Protocol):
+    """What is looked after."""
+
+    def flush_if_due(self) -> None:
+        """Flush, if it is time to. Called on another thread; raises nothing."""
+
+    def renew_lock(self) -> None:
+        """Make a new lock, in a forked child: another thread may have held the old."""
+
+
+class _Watch:
+    """The writers that are open, and the thread that looks after them."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.writers: weakref.WeakSet[Flushed] = weakref.WeakSet()
+        self.is_kept = False
+
+    def add(self, writer: Flushed) -> None:
+        with self.lock:
+            self.writers.add(writer)
+            if not self.is_kept:
+                self.is_kept = True
+                name = "mjrec-flushing"
+                threading.Thread(target=self._keep, name=name, daemon=True).start()
+
+    def discard(self, writer: Flushed) -> None:
+        with self.lock:
+            self.writers.discard(writer)
+
+    def _keep(self) -> None:
+        while True:
+            time.sleep(_SECONDS)
+            with self.lock:
+                writers = list(self.writers)
+                if not writers:
+                    self.is_kept = False
+                    return
+            for writer in writers:
+                writer.flush_if_due()
+            # Or the last one would live until the next round.
+            del writers
+            writer = None  # type: ignore[assignment]
+
+
+_watch = _Watch()
+
+
+def flush_in_time(writer: Flushed, *, is_open: bool = True) -> None:
+    """Look after `writer`, which is not kept alive by it; or no longer."""
+    if is_open:
+        _watch.add(writer)
+    else:
+        _watch.discard(writer)
+
+
+def _start_anew() -> None:
+    # The thread is the parent's, and so may be the locks.
+    global _watch
+    writers = list(_watch.writers)
+    _watch = _Watch()
+    for writer in writers:
+        writer.renew_lock()
+
+
+os.register_at_fork(after_in_child=_start_anew)
