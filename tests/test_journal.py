@@ -19,6 +19,7 @@ from pathlib import Path
 import pytest
 
 from mjrec.errors import ClosedError, UnreadableFile
+from mjrec.formats import journal
 from mjrec.formats.journal import (
     JournalEntry,
     JournalReader,
@@ -239,6 +240,18 @@ def test_a_missing_journal_is_an_error(path: Path) -> None:
     """There is one kind of error for what cannot be read."""
     with pytest.raises(UnreadableFile, match="No such file"):
         list(read_journal(path))
+
+
+def test_a_disk_that_fails_while_it_is_read_is_an_error(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is one kind of error for that too."""
+    # A file that can be opened, and of which no byte can be read.
+    memory = Path("/proc/self/mem")
+    monkeypatch.setattr(journal, "open_regular", lambda _: memory.open("rb"))
+    for read in (count_lines, lambda path: list(read_journal(path))):
+        with pytest.raises(UnreadableFile, match="Input/output error"):
+            read(path)
 
 
 def test_reading_streams(path: Path) -> None:

@@ -247,7 +247,7 @@ def test_sources_are_in_the_order_of_their_manifests(tmp_path: Path) -> None:
     """Be they there or not: each keeps its place in every list."""
     last = write_saved(tmp_path, "2.7", 3)
     first = write_saved(tmp_path, "0.7", 2)
-    middle = write_journal(tmp_path, "1.7", 1)
+    middle = write_journal(tmp_path, "10.7", 1)
     results = load(tmp_path)
     assert results["manifests"] == [str(first), str(middle), str(last)]
     assert results["data_sources"] == [1, 0, 2]
@@ -255,14 +255,14 @@ def test_sources_are_in_the_order_of_their_manifests(tmp_path: Path) -> None:
 
 
 def test_a_closed_monitors_journal_is_not_looked_into(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For the statistics; there may be a million lines of it."""
     write_saved(tmp_path, "0.7", 1, 2)
     journal = write_journal(tmp_path, "0.7", 1)
     journal.write_bytes(journal.read_bytes() + b"damaged\n")
+    monkeypatch.delattr("mjrec.results.sources.JournalReader")
     assert load(tmp_path)["episode_lengths"] == [11, 12]
-    assert not caplog.records
 
 
 @pytest.mark.parametrize("witness", ["journal", "lock", "log", "metadata"])
@@ -344,6 +344,28 @@ def test_statistics_stand_in_for_a_journal_that_cannot_be_read(
     assert load(tmp_path)["episode_lengths"] == [11, 12]
     assert "1000 lines" not in caplog.text
     assert [e.length for e in mjrec.iter_episodes(tmp_path)] == [11, 12]
+
+
+def test_a_journal_that_cannot_be_read_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With statistics beside it in a warning, once; without them in the error."""
+    details = {"first_episode_id": 1, "next_episode_id": 3}
+    manifest = write_saved(tmp_path, "0.7", 1, 2, details=details)
+    (tmp_path / "openaigym.trajectory.0.7.episode000001.h5").touch()
+    journal = tmp_path / "openaigym.episodes.0.7.jsonl"
+    # Nothing outside of the directory is read for it.
+    journal.symlink_to("/proc/self/status")
+    assert load(tmp_path)["episode_lengths"] == [11, 12]
+    (record,) = caplog.records
+    assert f"{journal}: it is a link" in record.getMessage()
+    assert [e.length for e in mjrec.iter_episodes(tmp_path)] == [11, 12]
+    assert len(caplog.records) == 2
+    manifest.unlink()
+    only(tmp_path, "*.stats.json").unlink()
+    for read in (mjrec.load_results, lambda path: list(mjrec.iter_episodes(path))):
+        with pytest.raises(UnreadableFile, match="out of its directory"):
+            read(tmp_path)
 
 
 def numbers(directory: Path) -> list[tuple[int, int | None]]:

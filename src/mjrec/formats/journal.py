@@ -29,7 +29,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from ..errors import ClosedError
 from ..json_text import dumps
@@ -44,6 +44,7 @@ from .json_fields import (
     text,
     unreadable,
 )
+from .regular_files import open_regular
 
 __all__ = [
     "MOST_EPISODES",
@@ -320,14 +321,12 @@ def count_lines(path: Path) -> int:
         return count
 
 
-def _opened(path: Path) -> io.BufferedReader:
+def _opened(path: Path) -> BinaryIO:
     with unreadable(path):
-        if path.exists() and not path.is_file():
-            raise ValueError("it is not a regular file")
-        return path.open("rb")
+        return open_regular(path)
 
 
-def _lines(path: Path, file: io.BufferedReader) -> Iterator[bytes]:
+def _lines(path: Path, file: BinaryIO) -> Iterator[bytes]:
     while True:
         # Disks fail while they are read, too.
         with unreadable(path):
