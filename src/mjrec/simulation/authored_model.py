@@ -17,16 +17,18 @@ from __future__ import annotations
 import io
 import json
 import logging
+import math
 import os
 import posixpath
 import re
+import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 from xml.etree import ElementTree
 
 import mujoco
@@ -34,6 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UnreadableFile
+from ..formats.regular_files import open_regular
+from ..json_text import loads
 from .model_differences import differing_fields
 from .model_fields import apply_fields
 
@@ -57,6 +61,9 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 # Attributes of MJCF that say where the files are.
 _DIRECTORIES = ("assetdir", "meshdir", "texturedir")
 _XML_ELEMENTS = ("include", "model")
+
+# Of a directory and a file, each of which is looked at.
+_MOST_COMBINATIONS = 100_000
 
 # The files are compiled so many directories below an empty one: a `..` too many
 # leads to nothing.
@@ -117,6 +124,9 @@ def write_authored(
     with zipfile.ZipFile(path, "w") as archive:
         for name in sorted(members):
             archive.writestr(_member(name), members[name])
+    # What is written is what a reader will accept.
+    with path.open("rb") as file:
+        _read_members(file, limit)
 
 
 def read_authored(path: Path, *, limit: int) -> mujoco.MjModel:
@@ -130,14 +140,15 @@ def read_authored(path: Path, *, limit: int) -> mujoco.MjModel:
         UnreadableFile: it is damaged or dangerous, or this MuJoCo refuses it.
     """
     try:
-        members = _read_members(path, limit)
-        contents = json.loads(members.pop(_CONTENTS, b"null"))
+        with open_regular(path) as file:
+            members = _read_members(file, limit)
+        contents = loads(members.pop(_CONTENTS, b"null"))
         if not isinstance(contents, dict) or contents.get("format") != _FORMAT:
             raise ValueError("it holds no model of a format that this mjrec knows")
         sources = _below(_SOURCE, members)
         model = compile_authored(AuthoredModel(contents["main"], sources))
         apply_fields(model, dict(_fields(members)))
-    except (*_DAMAGE, KeyError, TypeError, ValueError, mujoco.FatalError) as error:
+    except (*_REFUSALS, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise UnreadableFile(path, reason.rstrip(".")) from error
     return model
@@ -229,6 +240,9 @@ def _check_references(authored: AuthoredModel) -> None:
         raise ValueError(f"{authored.main} is not MJCF")
     documents = _documents(authored)
     directories = _all_directories(documents.values())
+    assets = sum(len(document.assets) for document in documents.values())
+    if len(directories) * assets > _MOST_COMBINATIONS:
+        raise ValueError("it names more files and directories than any model")
     for name, document in documents.items():
         for base in {PurePosixPath(name).parent, PurePosixPath(authored.main).parent}:
             for reference in document.xml:
@@ -240,16 +254,19 @@ def _check_references(authored: AuthoredModel) -> None:
 
 def _documents(authored: AuthoredModel) -> dict[str, _Document]:
     """Return all files that may be read as MJCF, whatever they are called."""
+    by_base_name: dict[str, list[str]] = {}
+    for name in authored.files:
+        by_base_name.setdefault(PurePosixPath(name).name, []).append(name)
     documents: dict[str, _Document] = {}
     waiting = [authored.main]
     while waiting:
         name = waiting.pop()
-        if name in documents:
-            continue
         documents[name] = _document(name, authored.files[name])
         # Wherever they are: MuJoCo's rules for it have changed.
-        wanted = {PurePosixPath(reference).name for reference in documents[name].xml}
-        waiting += [n for n in authored.files if PurePosixPath(n).name in wanted]
+        for reference in documents[name].xml:
+            # Taken out, so that nothing is looked at twice, however often it is named.
+            found = by_base_name.pop(PurePosixPath(reference).name, [])
+            waiting += [other for other in found if other not in documents]
     return documents
 
 
@@ -308,8 +325,19 @@ def _npy(value: NDArray[Any]) -> bytes:
 
 def _fields(members: Mapping[str, bytes]) -> Iterator[tuple[str, NDArray[Any]]]:
     for name, content in _below(_FIELDS, members).items():
-        value = np.load(io.BytesIO(content), allow_pickle=False)
-        yield name.removesuffix(".npy"), value
+        yield name.removesuffix(".npy"), _array(content)
+
+
+def _array(content: bytes) -> NDArray[Any]:
+    file = io.BytesIO(content)
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError("a field in it is not stored as a plain array")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    # NumPy asks for as much memory as the header says, whatever follows it.
+    if dtype.hasobject or dtype.itemsize * math.prod(shape) > len(content):
+        raise ValueError("a field in it is not stored as a plain array")
+    file.seek(0)
+    return np.asarray(np.load(file, allow_pickle=False))
 
 
 def _below(prefix: str, members: Mapping[str, bytes]) -> dict[str, bytes]:
@@ -328,24 +356,70 @@ def _member(name: str) -> zipfile.ZipInfo:
     return member
 
 
-# What zipfile raises for damage, encryption and methods that it does not know.
+# What zipfile raises for damage, encryption and what it does not know.
 _DAMAGE = (
-    OSError,
     EOFError,
+    IndexError,
     RuntimeError,
-    NotImplementedError,
+    struct.error,
     zlib.error,
     zipfile.BadZipFile,
+    zipfile.LargeZipFile,
 )
 
+# The end of a zip: signature, two numbers of disks, two of members, size and offset of
+# their list, length of a comment. Before it stands, in large ones, another such thing.
+_END = struct.Struct("<4s4H2IH")
+_END64_SIZE = 20
+# Some ten thousand members.
+_LONGEST_DIRECTORY = 1 << 20
 
-def _read_members(path: Path, limit: int) -> dict[str, bytes]:
-    with zipfile.ZipFile(path) as archive:
-        members = [member for member in archive.infolist() if not member.is_dir()]
-        total = sum(member.file_size for member in members)
-        if total > limit:
-            raise ValueError(f"its content is {total} bytes, and no model needs that")
-        return {member.filename: _read_member(archive, member) for member in members}
+# What packs more than a hundredfold is small, or made to fill the memory.
+_ALWAYS_FINE = 1 << 26
+_MOST_EXPANSION = 100
+
+# What MuJoCo raises where memory does not suffice is a RuntimeError.
+_REFUSALS = (KeyError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
+
+
+def _read_members(file: BinaryIO, limit: int) -> dict[str, bytes]:
+    size = file.seek(0, os.SEEK_END)
+    _check_directory_size(file, size)
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = [member for member in archive.infolist() if not member.is_dir()]
+            _check_members(members, min(limit, _ALWAYS_FINE + _MOST_EXPANSION * size))
+            return {m.filename: _read_member(archive, m) for m in members}
+    except _DAMAGE as error:
+        raise ValueError(f"it is damaged ({error})") from error
+
+
+def _check_directory_size(file: BinaryIO, size: int) -> None:
+    """Raise ValueError where the list of a zip's members is long, or hard to find.
+
+    zipfile makes an object of half a kilobyte of each, before anybody can ask how many
+    there are; and looks for the list in more than one place.
+    """
+    if size < _END.size:
+        raise ValueError("it is no zip file")
+    file.seek(max(0, size - _END64_SIZE - _END.size))
+    ending = file.read()
+    signature, *_, length, _, comment = _END.unpack(ending[-_END.size :])
+    if signature != b"PK\5\6" or comment:
+        raise ValueError("it does not end as a zip file does")
+    if length > _LONGEST_DIRECTORY or ending.startswith(b"PK\6\7"):
+        raise ValueError("it holds more files than any model")
+
+
+def _check_members(members: Sequence[zipfile.ZipInfo], limit: int) -> None:
+    total = sum(member.file_size for member in members)
+    if total > limit:
+        raise ValueError(f"its content is {total} bytes, and no model needs that")
+    if len({member.filename for member in members}) < len(members):
+        raise ValueError("two files in it have the same name")
+    for member in members:
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ValueError(f"{member.filename!r:.200} in it is packed in another way")
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:

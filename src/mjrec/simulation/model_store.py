@@ -21,7 +21,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import mujoco
 import numpy as np
@@ -29,15 +29,17 @@ from numpy.typing import NDArray
 
 from ..atomic_files import replacing
 from ..errors import FileNotWritten, UnreadableFile
+from ..formats.json_fields import unreadable
 from ..formats.monitor_directory import FILE_PREFIX
+from ..formats.regular_files import open_regular
 from ..worker_thread import WorkerThread
 from .authored_model import (
     AuthoredModel,
     authored_from_file,
-    read_authored,
     with_embedded_files,
     write_authored,
 )
+from .source_compiler import compile_within
 
 __all__ = ["AuthoredModel", "ModelStore", "authored_from_file", "load_model"]
 
@@ -51,7 +53,12 @@ _CHUNK = 1 << 20
 # Nothing that was recorded comes near; a file that claims more is made to hurt.
 _LARGEST = 1 << 31
 
-_NAME = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(mjb\.gz|zip)")
+# What is mostly zeros packs a thousandfold. So may a small model; a large one of which
+# so little is left is made to fill the memory.
+_ALWAYS_FINE = 1 << 28
+_MOST_EXPANSION = 100
+
+_NAME = re.compile(r"openaigym\.model\.(?P<digits>[0-9a-f]{16})\.(mjb\.gz|zip)")
 
 
 @dataclass(frozen=True)
@@ -144,7 +151,9 @@ class ModelStore:
             return
         try:
             with replacing(path) as temporary:
-                _write_gzip(temporary, job.compiled)
+                _write_gzip(temporary, job.compiled, _LEVEL)
+                if not _can_hold(temporary, len(job.compiled)):
+                    _write_gzip(temporary, job.compiled, 0)
         except OSError as error:
             self._note_failure(path, error)
 
@@ -191,8 +200,8 @@ def load_model(directory: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:
                 raise
             logger.warning("%s It is compiled from %s again.", error, source.name)
     if source is not None and source.exists():
-        limit = _source_limit(_recorded_size(source, facts))
-        return read_authored(source, limit=limit)
+        size = _recorded_size(source, facts)
+        return compile_within(source, limit=_source_limit(size), compiled_size=size)
     raise _not_loadable(directory, facts, is_same_version=is_same_version)
 
 
@@ -225,12 +234,17 @@ def _compiled(model: mujoco.MjModel) -> NDArray[np.uint8]:
     return buffer
 
 
-def _write_gzip(path: Path, content: NDArray[np.uint8]) -> None:
+def _can_hold(path: Path, size: int) -> bool:
+    """Tell whether a packed file is large enough to be trusted to hold so much."""
+    return size <= max(_ALWAYS_FINE, _MOST_EXPANSION * path.stat().st_size)
+
+
+def _write_gzip(path: Path, content: NDArray[np.uint8], level: int) -> None:
     # No name and no time in it: the same model makes the same file.
     with (
         path.open("wb") as file,
         gzip.GzipFile(
-            filename="", mode="wb", compresslevel=_LEVEL, fileobj=file, mtime=0
+            filename="", mode="wb", compresslevel=level, fileobj=file, mtime=0
         ) as stream,
     ):
         # In pieces: the interpreter's lock is let go while each is compressed.
@@ -243,7 +257,8 @@ def _path(directory: Path, name: object) -> Path | None:
         return None
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise UnreadableFile(
-            directory, f"a recording in it calls a model {name!r}, which is no name"
+            directory,
+            f"a recording in it calls a model {name!r:.200}, which is no name",
         )
     return directory / name
 
@@ -251,7 +266,9 @@ def _path(directory: Path, name: object) -> Path | None:
 def _load_compiled(path: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:
     content = _read_gzip(path, _recorded_size(path, facts))
     # MuJoCo trusts the sizes and addresses in such a file.
-    if hashlib.sha256(content).hexdigest() != facts.get("sha256"):
+    digest = hashlib.sha256(content).hexdigest()
+    name = _NAME.fullmatch(path.name)
+    if digest != facts.get("sha256") or name is None or name["digits"] != digest[:16]:
         raise UnreadableFile(path, "its content is not what was recorded")
     try:
         return _loaded(content)
@@ -261,8 +278,8 @@ def _load_compiled(path: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:
 
 def _recorded_size(path: Path, facts: Mapping[str, Any]) -> int:
     size = facts.get("bytes")
-    if not isinstance(size, int) or not 0 < size <= _LARGEST:
-        raise UnreadableFile(path, f"its recorded size is {size!r}")
+    if type(size) is not int or not 0 < size <= _LARGEST:
+        raise UnreadableFile(path, f"its recorded size is {size!r:.80}")
     return size
 
 
@@ -273,16 +290,37 @@ def _source_limit(compiled_size: int) -> int:
 
 def _read_gzip(path: Path, size: int) -> bytes:
     """Return the `size` bytes that the file holds, and never read more."""
-    try:
-        with gzip.open(path) as stream:
-            content = stream.read(size)
-            rest = stream.read(1)
-    except (OSError, EOFError, zlib.error) as error:
-        raise UnreadableFile(path, error) from error
-    if rest or len(content) < size:
-        there = "more" if rest else f"{len(content)} bytes"
-        raise UnreadableFile(path, f"it holds {there}, not the recorded {size} bytes")
-    return content
+    with unreadable(path), open_regular(path) as file:
+        if not _can_hold(path, size):
+            raise ValueError(f"it is too small to hold the recorded {size} bytes")
+        try:
+            content = _unpacked(file, size)
+        except zlib.error as error:
+            raise ValueError(f"it is damaged ({error})") from error
+        if len(content) != size or file.read(1):
+            there = "more" if len(content) >= size else f"{len(content)} bytes"
+            raise ValueError(f"it holds {there}, not the recorded {size} bytes")
+        return content
+
+
+def _unpacked(file: BinaryIO, size: int) -> bytes:
+    """Return what one gzip stream holds, and at most a byte more than `size`.
+
+    Not with the module `gzip`, which goes through a header of any length, and through
+    any number of empty streams, byte by byte in Python.
+    """
+    stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+    pieces: list[bytes] = []
+    left = size + 1
+    while left and not stream.eof:
+        packed = file.read(_CHUNK)
+        if not packed:
+            raise ValueError("it was cut off")
+        pieces.append(stream.decompress(packed, left))
+        left -= len(pieces[-1])
+    if stream.unused_data:
+        raise ValueError("something follows after its end")
+    return b"".join(pieces)
 
 
 def _loaded(content: bytes) -> mujoco.MjModel:
