@@ -6,7 +6,6 @@ from __future__ import annotations
 import gc
 import os
 import random
-import resource
 import signal
 import struct
 import subprocess
@@ -15,12 +14,12 @@ import threading
 import time
 import tracemalloc
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disk import file_size_limit
 
 import mjrec.formats.trajectory_log as trajectory_log
 from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
@@ -107,17 +106,6 @@ def check(content: TrajectoryContent, steps: int, *, every: int = 1) -> None:
     frames = range(0, steps + 1, every)
     assert content.frame_steps.tolist() == list(frames)
     assert content.snapshots.tobytes() == b"".join(frame_bytes(k) for k in frames)
-
-
-@contextmanager
-def file_size_limit(size: int) -> Iterator[None]:
-    """Stand in for a full disk, for any user (nobody may write beyond `size`)."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_everything_comes_back_bit_for_bit(path: Path) -> None:

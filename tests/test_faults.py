@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording that fails: the simulation stops, or goes on, as the user wants."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from full_disk import file_size_limit
+from recordings import frames_in, journal_of, manifest_of, metadata_of, stats_of
+
+import mjrec
+from mjrec import EncoderError, FileNotWritten, InvalidArgument, Monitor, RenderError
+
+Pendulum = Callable[..., Any]
+
+
+@pytest.fixture
+def pendulum(tmp_path: Path) -> Pendulum:
+    """Make monitored pendulums that stay up for eight steps."""
+
+    def make(**options: Any) -> Any:
+        env = gymnasium.make(
+            "InvertedPendulum-v5",
+            render_mode="rgb_array",
+            height=32,
+            width=48,
+            max_episode_steps=8,
+        )
+        return Monitor(env, tmp_path / "run", lambda _: True, **options)
+
+    return make
+
+
+def run(monitor: Any, steps: int = 8) -> None:
+    """Take the first steps of an episode."""
+    monitor.reset(seed=0)
+    go_on(monitor, steps)
+
+
+def go_on(monitor: Any, steps: int) -> None:
+    """Take some more."""
+    for _ in range(steps):
+        monitor.step(monitor.action_space.sample() * 0)
+
+
+def faults_of(directory: Path) -> list[tuple[int | None, str]]:
+    found = manifest_of(directory)["mjrec"]["faults"]
+    assert all(fault["reason"] for fault in found)
+    return [(fault["episode_id"], fault["what"]) for fault in found]
+
+
+def test_a_run_without_faults_says_so(pendulum: Pendulum, tmp_path: Path) -> None:
+    """With an empty list."""
+    with pendulum(render="live", on_error="warn") as monitor:
+        run(monitor)
+    assert faults_of(tmp_path / "run") == []
+
+
+@pytest.mark.parametrize("value", ["ignore", None, True])
+def test_on_error_is_one_of_two(value: Any, pendulum: Pendulum) -> None:
+    """Nothing else, and the message says what there is."""
+    with pytest.raises(InvalidArgument, match='"raise", or "warn"'):
+        pendulum(on_error=value)
+
+
+def test_dead_encoder(
+    pendulum: Pendulum,
+    tmp_path: Path,
+    kill_ffmpeg: Callable[[], int],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The episode's statistics are there, and the next has its video."""
+    monitor = pendulum(render="live", on_error="warn")
+    run(monitor, 4)
+    assert kill_ffmpeg() == 1
+    go_on(monitor, 4)
+    run(monitor)
+    monitor.close()
+    assert faults_of(tmp_path / "run") == [(0, "video")]
+    assert metadata_of(tmp_path / "run", 0)["broken"] is True
+    assert len(frames_in(tmp_path / "run", 1)) == 9
+    assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8]
+    assert [r.levelno for r in caplog.records if "not whole" in r.message] == [
+        logging.WARNING
+    ]
+
+
+def test_dead_encoder_is_an_error_by_default(
+    pendulum: Pendulum, kill_ffmpeg: Callable[[], int]
+) -> None:
+    """And the monitor goes on all the same, for whoever catches it."""
+    monitor = pendulum(render="live")
+    run(monitor, 4)
+    assert kill_ffmpeg() == 1
+    with pytest.raises(EncoderError):
+        go_on(monitor, 4)
+    monitor.close()
+
+
+def test_environment_that_cannot_be_drawn_any_more(
+    pendulum: Pendulum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What its render() raises ends the video, not the simulation."""
+    monitor = pendulum(render="live", on_error="warn")
+    run(monitor, 4)
+
+    def broken(*_: object) -> None:
+        raise RuntimeError("the window is gone")
+
+    monkeypatch.setattr(monitor.unwrapped, "render", broken)
+    go_on(monitor, 4)
+    monitor.close()
+    assert faults_of(tmp_path / "run") == [(0, "video")]
+    metadata = metadata_of(tmp_path / "run", 0)
+    assert metadata["broken_reason"] == "the window is gone"
+    assert len(frames_in(tmp_path / "run", 0)) == 5
+
+
+@pytest.mark.parametrize("on_error", ["raise", "warn"])
+def test_full_disk_while_an_episode_is_recorded(
+    on_error: str, pendulum: Pendulum, tmp_path: Path
+) -> None:
+    """Its trajectory ends there; what was recorded before is whole."""
+    monitor = pendulum(workers=0, on_error=on_error)
+    run(monitor)
+    with file_size_limit(200):
+        if on_error == "raise":
+            with pytest.raises(FileNotWritten, match="episode000001"):
+                run(monitor)
+        else:
+            run(monitor)
+    run(monitor)
+    monitor.close()
+    assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8, 8]
+    if on_error == "warn":
+        assert (1, "trajectory") in faults_of(tmp_path / "run")
+    whole = mjrec.load_trajectory(next((tmp_path / "run").glob("*episode000002.h5")))
+    assert len(whole.rewards) == 8
+
+
+@pytest.mark.parametrize("on_error", ["raise", "warn"])
+def test_full_disk_at_the_journal(
+    on_error: str, pendulum: Pendulum, tmp_path: Path
+) -> None:
+    """The statistics come from memory at the close; the journal has whole lines."""
+    monitor = pendulum(render="off", trajectory_callable=False, on_error=on_error)
+    run(monitor)
+    size = sum(p.stat().st_size for p in (tmp_path / "run").glob("*.jsonl"))
+    with file_size_limit(size + 20):
+        if on_error == "raise":
+            with pytest.raises(OSError, match="episodes"):
+                run(monitor)
+        else:
+            run(monitor)
+    run(monitor)
+    monitor.close()
+    assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8, 8]
+    assert [entry["episode_id"] for entry in journal_of(tmp_path / "run")] == [0, 2]
+    if on_error == "warn":
+        assert faults_of(tmp_path / "run") == [(1, "journal")]
+
+
+@pytest.mark.parametrize("render", ["live", "deferred"])
+def test_directory_that_is_removed_during_the_run(
+    render: str, pendulum: Pendulum, tmp_path: Path
+) -> None:
+    """The simulation goes on to its end, and closing says what is lost, once."""
+    monitor = pendulum(render=render, workers=0, on_error="warn")
+    run(monitor)
+    shutil.rmtree(tmp_path / "run")
+    run(monitor)
+    run(monitor, 3)
+    monitor.close()
+    assert monitor.stats_recorder.episode_lengths == [8, 8]
+    assert not (tmp_path / "run").exists()
+
+
+def test_directory_that_is_removed_is_an_error_by_default(
+    pendulum: Pendulum, tmp_path: Path
+) -> None:
+    """At the first thing that cannot be written, which it names."""
+    monitor = pendulum(workers=0)
+    run(monitor)
+    shutil.rmtree(tmp_path / "run")
+    with pytest.raises(FileNotWritten, match="episode000001"):
+        run(monitor)
+    with pytest.raises(FileNotWritten):
+        monitor.close()
+    (tmp_path / "run").mkdir()
+    monitor.close()
+    assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8]
+
+
+@pytest.mark.parametrize("on_error", ["raise", "warn"])
+def test_videos_that_cannot_be_rendered(
+    on_error: str,
+    pendulum: Pendulum,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """They stay pending, and the trajectories are there."""
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
+    monitor = pendulum(workers=1, on_error=on_error)
+    run(monitor)
+    if on_error == "raise":
+        with pytest.raises(RenderError):
+            monitor.close()
+    else:
+        monitor.close()
+        assert "could not be rendered" in caplog.text
+    details = manifest_of(tmp_path / "run")["mjrec"]
+    assert [pending["episode_id"] for pending in details["pending"]] == [0]
+    assert list((tmp_path / "run").glob("*.h5"))
+
+
+def test_wrong_use_is_an_error_in_any_case(pendulum: Pendulum) -> None:
+    """A step before the first reset is nothing to go on from."""
+    monitor = pendulum(render="off", on_error="warn")
+    with pytest.raises(mjrec.ResetNeeded):
+        monitor.step(0)
+    monitor.close()
+
+
+def test_faults_are_plain_json(pendulum: Pendulum, tmp_path: Path) -> None:
+    """As everything in the manifest."""
+    with pendulum(render="off", on_error="warn") as monitor:
+        run(monitor)
+        with file_size_limit(0):
+            run(monitor)
+    text = next((tmp_path / "run").glob("*.manifest.json")).read_text()
+    assert json.loads(text)["mjrec"]["faults"]
