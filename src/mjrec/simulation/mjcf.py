@@ -35,9 +35,13 @@ def load_mjcf(path: Path) -> mujoco.MjModel:
     Raises:
         UnreadableFile: it is not there, or MuJoCo refuses it, with MuJoCo's reason.
     """
+    if path.exists() and not path.is_file():
+        # Opening a pipe would wait for ever.
+        raise UnreadableFile(path, "it is not a regular file")
     try:
         return mujoco.MjModel.from_xml_path(str(path))
-    except (ValueError, mujoco.FatalError) as error:
+    # Where memory does not suffice it is a RuntimeError.
+    except (RuntimeError, ValueError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise UnreadableFile(path, reason.rstrip(".")) from error
 

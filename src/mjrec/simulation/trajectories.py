@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnknownName, UnreadableFile
-from ..formats.monitor_directory import iter_monitor_files
-from ..formats.trajectory import ModelChange
+from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..formats.trajectory_file import TrajectoryReader, open_trajectory
 
 if TYPE_CHECKING:
@@ -25,6 +25,12 @@ if TYPE_CHECKING:
 __all__ = ["Trajectory", "load_trajectory"]
 
 _SHOWN = 10
+
+# What is read into memory: anything that is as small as this, or no more than so many
+# times as large as its file. A robot that stands still packs so well; a file that is
+# made to fill the memory packs a thousandfold.
+_ALWAYS_FINE = 1 << 31
+_MOST_EXPANSION = 64
 
 
 def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
@@ -40,6 +46,10 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         InvalidArgument: it is a directory; the trajectories in it are named.
     """
     path = Path(path)
+    if path.is_symlink() and infix_of(path.name) is None:
+        # The user's own name for a file, `latest.h5`; a link that bears the name of a
+        # monitor's file was put there by whoever made the directory.
+        path = Path(os.path.realpath(path))
     if path.is_dir():
         raise InvalidArgument(_what_is_in(path))
     with open_trajectory(path) as reader:
@@ -90,6 +100,7 @@ class Trajectory:
 
     def __init__(self, reader: TrajectoryReader) -> None:
         count, row_count = reader.step_count, reader.row_count
+        _check_size(reader)
         self.path = reader.path
         self.facts = reader.header.facts
         self.states = reader.states(0, row_count)
@@ -195,10 +206,17 @@ class Trajectory:
             raise UnreadableFile(
                 self.path, "it was recorded without a MuJoCo simulation to be seen"
             )
+        if not isinstance(stored, Mapping):
+            raise UnreadableFile(self.path, "what it says of its model is no object")
         model = load_model(self.path.parent, stored)
-        for change in self._model_changes:
-            if change.step <= step:
-                apply_fields(model, change.fields)
+        try:
+            # One at a time: there may be thousands, and each as large as a texture.
+            with open_trajectory(self.path) as reader:
+                for change in reader.iter_model_changes():
+                    if change.step <= step:
+                        apply_fields(model, change.fields)
+        except InvalidArgument as error:
+            raise UnreadableFile(self.path, error) from error
         return model
 
     def set_state(self, data: mujoco.MjData, step: int) -> None:
@@ -218,11 +236,6 @@ class Trajectory:
         row = self.states[self._step(step)]
         set_state(data.model, data, self._header.state, row)
 
-    @functools.cached_property
-    def _model_changes(self) -> tuple[ModelChange, ...]:
-        with open_trajectory(self.path) as reader:
-            return reader.model_changes
-
     def _step(self, step: int) -> int:
         count = len(self.states)
         if isinstance(step, bool) or not isinstance(step, int | np.integer):
@@ -233,6 +246,19 @@ class Trajectory:
                 f"state {step}."
             )
         return step % count
+
+
+def _check_size(reader: TrajectoryReader) -> None:
+    header = reader.header
+    arrays = [array for array in (header.action, header.observation) if array]
+    row = 8 * header.state_length + sum(array.size for array in arrays)
+    needed = row * reader.row_count + header.snapshot.size * reader.frame_count
+    if needed > max(_ALWAYS_FINE, _MOST_EXPANSION * reader.path.stat().st_size):
+        raise UnreadableFile(
+            reader.path,
+            f"it claims to hold {needed / 2**30:.0f} GiB, which is far more than its "
+            "size; if that is true, read it in parts, with h5py",
+        )
 
 
 def _what_is_in(directory: Path) -> str:
