@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many monitors record into one directory at once."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from recordings import frames_of
+
+import mjrec
+from mjrec import Monitor, NotPicklable
+
+WRITERS = 8
+EPISODES = 3
+STEPS = 4
+
+# Records as in a container: every process there has the same number. It begins when
+# the others do.
+PROGRAM = """
+import sys, gymnasium, mjrec
+env = gymnasium.make("InvertedPendulum-v5", width=32, height=32, max_episode_steps=4)
+print("ready", flush=True)
+sys.stdin.readline()
+with mjrec.Monitor(env, sys.argv[1], lambda _: True, resume=True, uid="7",
+                   workers=0) as env:
+    for seed in range(3):
+        env.reset(seed=seed)
+        for _ in range(4):
+            env.step(env.action_space.sample() * 0)
+"""
+
+
+def check(directory: Path) -> None:
+    """Check that there is everything of everyone, and nothing twice."""
+    infixes = {path.name.split(".")[2] for path in directory.glob("*.jsonl")}
+    assert len(infixes) == WRITERS
+    results = mjrec.load_results(directory)
+    assert results is not None
+    assert results["episode_lengths"] == [STEPS] * (WRITERS * EPISODES)
+    assert len(list(directory.glob("*.manifest.json"))) == WRITERS
+    assert not list(directory.glob("*.part*"))
+
+
+def test_eight_processes_with_the_same_number(tmp_path: Path) -> None:
+    """As in eight containers: no file is overwritten, and all results are merged."""
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
+    processes = [
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(WRITERS)
+    ]
+    for process in processes:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+    for process in processes:
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+    for process in processes:
+        process.communicate(timeout=120)
+        assert process.returncode == 0
+    check(tmp_path)
+    trajectories = list(tmp_path.glob("*.h5"))
+    assert len(trajectories) == WRITERS * EPISODES
+    # Stored once, though all of them have it.
+    assert len(list(tmp_path.glob("*.mjb.gz"))) == 1
+
+
+def test_eight_threads(tmp_path: Path, make_corridor: Callable[..., Any]) -> None:
+    """Each with a monitor of its own, and an encoder at work in each."""
+    errors: list[BaseException] = []
+    barrier = threading.Barrier(WRITERS)
+
+    def record() -> None:
+        try:
+            env = make_corridor(STEPS, size=(16, 16))
+            barrier.wait(30)
+            with Monitor(env, tmp_path, lambda _: True, resume=True) as monitor:
+                for _ in range(EPISODES):
+                    monitor.reset()
+                    for _ in range(STEPS):
+                        monitor.step(0)
+        except BaseException as error:
+            errors.append(error)
+            raise
+
+    threads = [threading.Thread(target=record) for _ in range(WRITERS)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert errors == []
+    check(tmp_path)
+    videos = list(tmp_path.glob("*.mp4"))
+    assert len(videos) == WRITERS * EPISODES
+    assert {len(frames_of(video)) for video in videos} == {STEPS + 1}
+
+
+@pytest.mark.parametrize("send", [pickle.dumps, copy.copy, copy.deepcopy])
+def test_a_monitor_is_not_sent_to_another_process(
+    send: Callable[[Any], Any], tmp_path: Path
+) -> None:
+    """The error says where to make it instead."""
+    with Monitor(
+        gymnasium.make("InvertedPendulum-v5"), tmp_path, video_callable=False
+    ) as monitor:
+        with pytest.raises(NotPicklable, match="inside the function") as caught:
+            send(monitor)
+        assert isinstance(caught.value, TypeError)
