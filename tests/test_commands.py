@@ -409,6 +409,26 @@ def test_ctrl_c_keeps_everything_so_far(tmp_path: Path) -> None:
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
+@pytest.mark.parametrize(
+    ("signum", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_being_told_to_end_keeps_everything_so_far(
+    signum: signal.Signals, status: int, tmp_path: Path
+) -> None:
+    """As a scheduler does at a time limit: files are closed, the rest is said."""
+    process = _start(tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    assert b"episode 0" in process.stdout.readline()
+    process.send_signal(signum)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == status
+    assert b"Traceback" not in errors
+    results = results_of(tmp_path)
+    assert set(results["episode_lengths"]) == {20}
+    if not videos_in(tmp_path):
+        assert f"pending: mjrec render {tmp_path}".encode() in errors
+
+
 def test_terminal_shows_a_bar(tmp_path: Path) -> None:
     """On a terminal there is a progress bar with episodes and steps."""
     reader, terminal = pty.openpty()

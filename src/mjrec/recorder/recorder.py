@@ -26,6 +26,7 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.trajectory_log import RowBlocks
+from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
 from .deferred_video import DeferredVideo
@@ -51,7 +52,6 @@ __all__ = ["EpisodePictures", "Recorder", "Rendering", "Subject"]
 logger = logging.getLogger(__name__)
 
 _FORMAT_VERSION = 1
-_GYM_VERSION = "mjrec-1"
 
 
 class EpisodePictures(PictureSource, Protocol):
@@ -146,7 +146,7 @@ class Recorder:
         self._subject = subject
         self._states = subject.states
         self._options = options
-        self._env_info = {"gym_version": _GYM_VERSION, "env_id": subject.env_id}
+        self._env_info = {"gym_version": GYM_VERSION, "env_id": subject.env_id}
         self._pid = os.getpid()
         self._is_forked = False
         _recorders.add(self)
@@ -167,7 +167,9 @@ class Recorder:
         self._rendering = rendering(self.directory) if rendering else None
         self._next_episode_id = self._place.first_episode_id
         self._episode_start: dict[str, Any] = {}
-        self._journal = JournalWriter(self.directory / journal_name(self._place.infix))
+        self._journal = JournalWriter(
+            self.directory / journal_name(self._place.infix), env_info=self._env_info
+        )
         self.stats_recorder = StatsRecorder(
             str(self.directory),
             stats_prefix(self._place.infix),

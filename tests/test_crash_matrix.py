@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""However a recording process ends, at whatever moment: what was complete is there.
+
+Each case ends a child process in one way at a random moment (seeded), and then loads,
+recovers and renders what it left. A sample of them is tried here; `MJREC_TEST_ALL=1`
+tries all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from recordings import frames_of
+
+import mjrec
+from mjrec.rendering.finishing import finish_pending
+from mjrec.rendering.pending import recorded_episodes
+
+ALL = bool(os.environ.get("MJREC_TEST_ALL"))
+MOMENTS = 20 if ALL else 1
+# From the moment in which the child has begun to record.
+LONGEST = 1.5
+
+# Records one short episode after the other, and says which are over. What it is told
+# to do to itself comes at any moment, between any two instructions.
+PROGRAM = """
+import json, os, signal, sys, threading
+import gymnasium, numpy, mjrec
+
+directory, render, way, delay = sys.argv[1:4] + [float(sys.argv[4])]
+if way == "SIGTERM":
+    mjrec.exit_on_signals()
+env = gymnasium.make(
+    "InvertedPendulum-v5", render_mode="rgb_array", width=32, height=32
+)
+env = mjrec.Monitor(env, directory, lambda episode: episode % 3 == 0, render=render,
+                    workers=1, trajectory_callable=True, quality="full")
+
+def crash(*_):
+    raise RuntimeError("crashed")
+
+env.reset(seed=0)
+print("begun", flush=True)
+if way == "exception":
+    signal.signal(signal.SIGALRM, crash)
+    signal.setitimer(signal.ITIMER_REAL, delay)
+if way == "_exit":
+    threading.Timer(delay, os._exit, (3,)).start()
+generator = numpy.random.default_rng(0)
+while True:
+    episode, rewards, done = env.episode_id - 1, [], False
+    while not done:
+        _, reward, terminated, truncated, _ = env.step(generator.uniform(-1, 1, 1))
+        rewards.append(float(reward))
+        done = terminated or truncated
+    # What is said is true: the line is there before anybody else can read it.
+    os.write(1, (json.dumps([episode, rewards]) + "\\n").encode())
+    env.reset()
+"""
+
+WAYS = {
+    "SIGKILL": ("killed", -signal.SIGKILL),
+    "SIGTERM": ("interrupt", 143),
+    "SIGINT": ("interrupt", -signal.SIGINT),
+    "exception": ("exception", 1),
+    "_exit": ("killed", 3),
+}
+
+
+@dataclass(frozen=True)
+class Crash:
+    """What is known of a process that has ended.
+
+    Attributes:
+        rewards: of the episodes that it said were over, by their numbers.
+        reason: why its last episode ended.
+    """
+
+    rewards: dict[int, list[float]]
+    reason: str
+
+
+def crash(directory: Path, render: str, way: str, delay: float) -> Crash:
+    """Record until the process ends in that way."""
+    with subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(directory), render, way, str(delay)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == b"begun\n"
+        if way.startswith("SIG"):
+            time.sleep(delay)
+            process.send_signal(signal.Signals[way])
+        output, errors = process.communicate(timeout=60)
+    reason, status = WAYS[way]
+    assert process.returncode == status, errors.decode()
+    lines = [json.loads(line) for line in output.splitlines()]
+    return Crash(dict(lines), reason)
+
+
+def check_statistics(directory: Path, crashed: Crash) -> None:
+    """Every episode that was over is counted; at most one that nobody heard of."""
+    results = mjrec.load_results(directory)
+    lengths = [] if results is None else results["episode_lengths"]
+    assert len(crashed.rewards) <= len(lengths) <= len(crashed.rewards) + 1
+    for episode, rewards in crashed.rewards.items():
+        assert lengths[episode] == len(rewards)
+        assert results["episode_rewards"][episode] == pytest.approx(sum(rewards))
+
+
+def check_trajectories(directory: Path, crashed: Crash) -> None:
+    """All of them, bit for bit; the one that was running says why it is not whole."""
+    for episode, rewards in crashed.rewards.items():
+        [path] = directory.glob(f"*.episode{episode:06d}.h5")
+        trajectory = mjrec.load_trajectory(path)
+        assert trajectory.rewards.tolist() == rewards
+        assert trajectory.facts["complete"] is True
+    for path in directory.glob(f"*.episode{len(crashed.rewards):06d}.h5"):
+        facts = mjrec.load_trajectory(path).facts
+        if not facts["complete"]:
+            assert facts["reason"] == crashed.reason
+
+
+def check_videos(directory: Path, crashed: Crash) -> None:
+    """Of all scheduled episodes, with every frame."""
+    for episode, rewards in crashed.rewards.items():
+        videos = list(directory.glob(f"*.video{episode:06d}.mp4"))
+        if episode % 3:
+            assert videos == []
+            continue
+        assert len(frames_of(videos[0])) == len(rewards) + 1
+        metadata = _metadata(directory, episode)
+        assert metadata["complete"] is True
+    for path in directory.glob(f"*.video{len(crashed.rewards):06d}.meta.json"):
+        metadata = json.loads(path.read_text())
+        if not metadata["complete"]:
+            assert metadata["reason"] == crashed.reason
+
+
+def check_nothing_is_half(directory: Path) -> None:
+    """No hidden file is left, no log, and whatever is there can be read."""
+    hidden = [p.name for p in directory.glob(".*") if not p.name.endswith(".lock")]
+    assert hidden == []
+    assert list(directory.glob("*.log")) == []
+    for path in directory.glob("*.json"):
+        json.loads(path.read_text())
+
+
+def _metadata(directory: Path, episode: int) -> dict[str, Any]:
+    [path] = directory.glob(f"*.video{episode:06d}.meta.json")
+    return dict(json.loads(path.read_text()))
+
+
+@pytest.mark.parametrize("moment", range(MOMENTS))
+@pytest.mark.parametrize("render", ["live", "deferred"])
+@pytest.mark.parametrize("way", WAYS)
+def test_what_was_complete_is_there(
+    way: str, render: str, moment: int, tmp_path: Path
+) -> None:
+    """Loaded, recovered, rendered and compared."""
+    delay = random.Random(f"{way} {render} {moment}").uniform(0, LONGEST)
+    crashed = crash(tmp_path, render, way, delay)
+    check_statistics(tmp_path, crashed)
+    mjrec.recover(tmp_path)
+    assert not mjrec.recover(tmp_path), "something was left to recover"
+    for outcome in finish_pending(tmp_path, recorded_episodes(tmp_path), workers=1):
+        assert not outcome.failure
+    check_statistics(tmp_path, crashed)
+    check_trajectories(tmp_path, crashed)
+    check_videos(tmp_path, crashed)
+    check_nothing_is_half(tmp_path)

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A thousand recorded episodes leave the process as it was."""
+
+from __future__ import annotations
+
+import gc
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from processes import children
+
+from mjrec import Monitor, load_results
+
+EPISODES = 1000
+# Until all code is loaded, and all memory that is used again has been used.
+WARM_UP = 200
+# Of statistics, which grow by some hundred bytes an episode, and of Python's arenas.
+MOST_GROWTH = 4 << 20
+
+
+@dataclass(frozen=True)
+class Held:
+    """What this process holds.
+
+    Attributes:
+        memory: resident, in bytes.
+        files: what its descriptors refer to.
+        threads: the names of its threads.
+        children: the numbers of its processes.
+    """
+
+    memory: int
+    files: list[str]
+    threads: list[str]
+    children: set[int]
+
+
+def held() -> Held:
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return Held(
+        memory=pages * os.sysconf("SC_PAGE_SIZE"),
+        files=sorted(_file(fd) for fd in Path("/proc/self/fd").iterdir()),
+        # One comes and goes with the episodes.
+        threads=sorted(
+            {thread.name for thread in threading.enumerate()} - {"mjrec-flushing"}
+        ),
+        children=children(),
+    )
+
+
+def _file(descriptor: Path) -> str:
+    try:
+        # Pipes and sockets have numbers of their own.
+        return str(descriptor.readlink()).split(":")[0]
+    except FileNotFoundError:  # of the listing itself
+        return ""
+
+
+def run(monitor: Any, episodes: int) -> None:
+    for seed in range(episodes):
+        monitor.reset(seed=seed)
+        for _ in range(3):
+            monitor.step(monitor.action_space.sample() * 0)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_recorded_episodes_leave_nothing(workers: int, tmp_path: Path) -> None:
+    """Memory, files, threads and processes; each episode with its trajectory."""
+    env = gymnasium.make(
+        "InvertedPendulum-v5", width=32, height=32, max_episode_steps=3
+    )
+    before = held()
+    monitor = Monitor(
+        env,
+        tmp_path,
+        # Some videos, so that there are workers and encoders to be left behind.
+        lambda episode: episode % 200 == 0,
+        trajectory_callable=True,
+        workers=workers,
+    )
+    run(monitor, WARM_UP)
+    warm = held()
+    run(monitor, EPISODES - WARM_UP)
+    late = held()
+    assert late.memory - warm.memory < MOST_GROWTH
+    assert late.files == warm.files
+    assert late.threads == warm.threads
+    monitor.close()
+    after = held()
+    assert after.files == before.files
+    assert after.children == before.children
+    assert after.threads == before.threads
+    results = load_results(tmp_path)
+    assert results is not None
+    assert results["episode_lengths"] == [3] * EPISODES
+    assert len(list(tmp_path.glob("*.h5"))) == EPISODES
+    assert len(list(tmp_path.glob("*.mp4"))) == (EPISODES // 200 if workers else 0)
+
+
+def test_live_episodes_leave_nothing(
+    tmp_path: Path, make_corridor: Callable[..., Any]
+) -> None:
+    """Each has an encoder of its own; all 1000 of them with MJREC_TEST_ALL=1."""
+    count = EPISODES if os.environ.get("MJREC_TEST_ALL") else 60
+    before = held()
+    monitor = Monitor(make_corridor(3, size=(16, 16)), tmp_path, lambda _: True)
+    run(monitor, count // 3)
+    warm = held()
+    run(monitor, count - count // 3)
+    late = held()
+    assert late.memory - warm.memory < MOST_GROWTH
+    assert (late.files, late.threads) == (warm.files, warm.threads)
+    assert late.children == warm.children
+    monitor.close()
+    after = held()
+    assert (after.files, after.threads) == (before.files, before.threads)
+    assert after.children == before.children
+    assert len(list(tmp_path.glob("*.mp4"))) == count
