@@ -25,6 +25,7 @@ ROWS = (
     {"simulation"},
     {"recorder"},
     {"rendering"},
+    {"recovery"},
     {"environments"},
     {"monitors"},
     {"sessions", "machine_report"},

@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from .monitors.gymnasium_monitor import GymnasiumMonitor as GymnasiumMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
+    from .recovery import Recovery as Recovery
+    from .recovery import recover as recover
     from .rendering.pictures import render as render
     from .rendering.pictures import render_states as render_states
     from .results import Episode as Episode
@@ -69,6 +71,7 @@ _LAZY = {
     "Episode": "results",
     "GymnasiumMonitor": "monitors.gymnasium_monitor",
     "Monitor": "monitors",
+    "Recovery": "recovery",
     "StatsRecorder": "recorder.stats_recorder",
     "Terminated": "signals",
     "Trajectory": "simulation.trajectories",
@@ -84,6 +87,7 @@ _LAZY = {
     "load_results": "results",
     "load_trajectory": "simulation.trajectories",
     "merge_stats_files": "results",
+    "recover": "recovery",
     "render": "rendering.pictures",
     "render_states": "rendering.pictures",
     "save_video": "formats.frames_to_videos",
@@ -117,6 +121,7 @@ __all__ = [
     "NotPicklable",
     "PicturesDiffer",
     "PolicyError",
+    "Recovery",
     "RenderError",
     "ResetNeeded",
     "ResetNotAllowed",
@@ -137,6 +142,7 @@ __all__ = [
     "load_results",
     "load_trajectory",
     "merge_stats_files",
+    "recover",
     "render",
     "render_states",
     "save_video",

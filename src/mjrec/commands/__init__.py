@@ -16,6 +16,7 @@ from ..signals import exiting_on_signals
 from .doctor import doctor
 from .list_episodes import list_episodes
 from .record import record
+from .recover import recover
 from .render import render
 
 __all__ = ["main"]
@@ -23,6 +24,7 @@ __all__ = ["main"]
 _COMMANDS: dict[str, Callable[..., int]] = {
     "record": record,
     "render": render,
+    "recover": recover,
     "list": list_episodes,
     "doctor": doctor,
 }

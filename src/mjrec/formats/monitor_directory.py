@@ -13,6 +13,7 @@
     ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
     ├── openaigym.trajectory.<infix>.episode000027.log  a recorded episode in flight
     ├── openaigym.trajectory.<infix>.episode000027.h5   ... and finished
+    ├── openaigym.trajectory.<infix>.episode000027.log.damaged  that nobody can read
     ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
     ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
     ├── .openaigym.<infix>.lock                         while its monitor is open
@@ -77,7 +78,7 @@ _PATTERNS = (
     re.compile(rf"openaigym\.episode_batch\.{_INFIX_PART}\.stats\.json~*"),
     re.compile(rf"openaigym\.episodes\.{_INFIX_PART}\.jsonl"),
     re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
-    re.compile(rf"{_TRAJECTORY}\.(log|h5)"),
+    re.compile(rf"{_TRAJECTORY}\.(log|h5|log\.damaged)"),
     re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
 )
 _HIDDEN = (

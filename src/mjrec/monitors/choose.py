@@ -3,20 +3,25 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable
 from fractions import Fraction
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
+from ..recovery import recover
 
 if TYPE_CHECKING:
     from .dm_env_monitor import DmEnvMonitor
     from .gymnasium_monitor import GymnasiumMonitor
 
 __all__ = ["Monitor"]
+
+logger = logging.getLogger(__name__)
 
 
 # The positional arguments are gym's, in gym's order.
@@ -69,10 +74,11 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             for none.
         force: delete the monitor files that are in the directory. It wins over
             `resume`.
-        resume: add to the recordings that are there; episodes are numbered on from
-            the highest number of the monitors that closed or died (with `uid`: of
-            those with this `uid`). Monitors that share a directory at the same time
-            each need it; they number independently.
+        resume: add to the recordings that are there. What killed monitors have left
+            is put in order first, as `mjrec.recover` does. Episodes are numbered on
+            from the highest number of the monitors that closed or died (with `uid`:
+            of those with this `uid`). Monitors that share a directory at the same
+            time each need it; they number independently.
         write_upon_reset: write statistics and manifest at every reset, not only at
             the end. The journal, with a line for each completed episode, is written
             as the episodes end in any case.
@@ -134,6 +140,8 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     When it raises, `env` is as it was, and no file is left.
     """
     monitor = _monitor_class(env)
+    if resume and not force:
+        _recover(directory)
     return monitor(
         env,
         directory,
@@ -164,6 +172,16 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
         width=width,
         env_id=env_id,
     )
+
+
+def _recover(directory: str | os.PathLike[str]) -> None:
+    """Put in order what killed monitors have left in a directory that is resumed."""
+    if Path(directory).is_dir():
+        recovery = recover(directory)
+        if recovery.failures:
+            logger.warning("%s", recovery)
+        elif recovery:
+            logger.info("%s", recovery)
 
 
 def _monitor_class(env: Any) -> type[GymnasiumMonitor] | type[DmEnvMonitor]:

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec recover`: what killed processes have left in a directory, in order."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import rich.console
+import tyro
+
+from .. import json_text
+from ..recovery import RecoveredFile, Recovery
+from ..recovery import recover as recover_directory
+from .help_text import flowing_help
+
+__all__ = ["recover"]
+
+_FAILED = 1
+
+
+@flowing_help
+def recover(
+    directory: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")],
+    /,
+    *,
+    timeout: float = 5.0,
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """Put a directory in order whose recording, or rendering, was killed.
+
+    Videos that were recorded live get their names, logs become trajectories, and
+    statistics and manifest are made of the journal. What was cut off is marked
+    incomplete. Files of processes that are alive are left alone. Videos that were to
+    be rendered later stay pending: mjrec render DIR.
+
+    Args:
+        directory: the monitor directory.
+        timeout: how many seconds to wait for encoders that have outlived the process
+            that recorded, and are finishing their files.
+        as_json: print one JSON object, instead of text.
+    """
+    recovery = recover_directory(directory, timeout=timeout)
+    if as_json:
+        sys.stdout.write(json_text.dumps(_fields(recovery)) + "\n")
+    else:
+        # Names must survive copying, so no line is folded.
+        rich.console.Console().print(
+            str(recovery), highlight=False, markup=False, soft_wrap=True
+        )
+    return _FAILED if recovery.failures else 0
+
+
+def _fields(recovery: Recovery) -> dict[str, object]:
+    return {
+        "directory": str(recovery.directory),
+        "files": _listed(recovery.files),
+        "failures": _listed(recovery.failures),
+        "open_monitors": list(recovery.open_monitors),
+    }
+
+
+def _listed(files: tuple[RecoveredFile, ...]) -> list[dict[str, str]]:
+    return [{"name": file.name, "what": file.what} for file in files]

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Videos that were recorded live when their process was killed.
+
+The encoder goes on to the end of what it was given, and finishes its hidden file. A
+note beside it says what it is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from .. import json_text
+from ..atomic_files import write_text
+from ..errors import EncoderError, Error, MissingDependency, UnreadableFile
+from ..formats.ffmpeg import ffmpeg_executable, ffmpeg_sha256, ffmpeg_version
+from ..formats.locks import is_locked
+from ..formats.monitor_directory import episode_of
+from ..formats.unfinished_video import UnfinishedVideo, VideoFile, VideoNote, read_note
+from ..formats.video_metadata import StepRuns, file_facts, metadata_path, timing_facts
+from .known_episodes import KnownEpisodes
+from .report import RecoveredFile
+
+__all__ = ["finish_video"]
+
+_MOMENT = 0.05
+
+
+def finish_video(
+    note_file: Path, known: KnownEpisodes, *, is_over: Callable[[], bool]
+) -> RecoveredFile | None:
+    """Give a live video its name and its metadata, as far as it goes.
+
+    A file that cannot be decoded keeps its hidden name, and the metadata says that the
+    video broke, and why.
+
+    Args:
+        note_file: the note beside it.
+        known: what is known of the monitor's episodes.
+        is_over: tells whether not to wait any longer for its encoder.
+
+    Returns:
+        What became of it; None where only the note was left.
+
+    Raises:
+        Error: its encoder is still at it, or the files cannot be written.
+    """
+    try:
+        note = read_note(note_file)
+    except UnreadableFile:
+        # Whoever writes a note writes it before there is a video.
+        note_file.unlink(missing_ok=True)
+        return None
+    video = note.video
+    _wait_for_encoder(video, is_over)
+    if metadata_path(video.path).exists() or not _is_begun(video):
+        _forget(note_file, video)
+        return None
+    try:
+        file = video.check()
+        if not file.frame_count:
+            raise Error(f"{video.temporary.name} holds no frame.")
+    except MissingDependency:
+        raise
+    except Error as error:
+        return _give_up(note_file, note, known, error)
+    video.rename(file, cut=True)
+    file = dataclasses.replace(file, encoder=_encoder(note))
+    metadata = _metadata(note, file, known)
+    _write_metadata(video.path, metadata)
+    _forget(note_file, video)
+    frames = f"{file.frame_count} {'frame' if file.frame_count == 1 else 'frames'}"
+    ending = "" if metadata["complete"] else f", incomplete: {metadata['reason']}"
+    return RecoveredFile(video.path.name, frames + ending)
+
+
+def _wait_for_encoder(video: UnfinishedVideo, is_over: Callable[[], bool]) -> None:
+    while is_locked(video.temporary):
+        if is_over():
+            raise Error(
+                f"The encoder of {video.path.name} is still finishing its file. To "
+                f"wait longer: mjrec recover --timeout 60 {video.path.parent}"
+            )
+        time.sleep(_MOMENT)
+
+
+def _is_begun(video: UnfinishedVideo) -> bool:
+    """Tell whether there is a file that anything was written into."""
+    for path in (video.temporary, video.path):
+        # A link may lead anywhere.
+        if path.is_file() and not path.is_symlink():
+            return path.stat().st_size > 0
+    return False
+
+
+def _forget(note_file: Path, video: UnfinishedVideo) -> None:
+    """Remove what is not needed any more; the note last, which says what it was."""
+    video.temporary.unlink(missing_ok=True)
+    if video.hashes is not None:
+        video.hashes.unlink(missing_ok=True)
+    note_file.unlink(missing_ok=True)
+
+
+def _give_up(
+    note_file: Path, note: VideoNote, known: KnownEpisodes, error: Error
+) -> RecoveredFile:
+    video = note.video
+    said = error.stderr.strip().splitlines() if isinstance(error, EncoderError) else []
+    why = said[-1] if said else str(error)
+    reason = (
+        "the recording process was killed, and its encoder before it had finished the "
+        f"file: {why}"
+    )
+    number = episode_of(video.path.name)
+    ending = _how_it_ended(number, known) or {"complete": False, "reason": "killed"}
+    _write_metadata(
+        video.path,
+        {
+            **note.metadata,
+            **ending,
+            **_sums(number, known),
+            "empty": True,
+            "broken": True,
+            "broken_reason": reason,
+            "recovered": True,
+        },
+    )
+    if note.video.hashes is not None:
+        note.video.hashes.unlink(missing_ok=True)
+    return RecoveredFile(
+        video.path.name, f"broken ({why}); its data is in {video.temporary.name}"
+    )
+
+
+def _metadata(
+    note: VideoNote, file: VideoFile, known: KnownEpisodes
+) -> Mapping[str, Any]:
+    number = episode_of(note.video.path.name)
+    timestep, stride = note.timing["timestep"], note.timing["stride"]
+    sums = _sums(number, known)
+    ending = _how_it_ended(number, known)
+    length: Any = sums.get("length")
+    steps: Iterable[int]
+    if ending is not None and _is_whole(note, file, length):
+        # The last step is always among them.
+        steps = itertools.chain(range(0, length, stride), [length])
+    else:
+        # The last frames were on their way to the encoder.
+        ending = {"complete": False, "reason": "killed"}
+        steps = range(0, file.frame_count * stride, stride)
+    timing = timing_facts(
+        StepRuns(steps, stride=stride),
+        fps=file.fps,
+        timestep=timestep,
+        stride=stride,
+        frames_per_step=note.timing["frames_per_step"],
+    )
+    if note.timing["frames_per_step"] != 1:
+        # How many frames each step gave is not known.
+        timing.update(frame_count=file.frame_count, frame_steps=None)
+    return {
+        **note.metadata,
+        **ending,
+        **sums,
+        **timing,
+        **file_facts(file),
+        "recovered": True,
+    }
+
+
+def _is_whole(note: VideoNote, file: VideoFile, length: Any) -> bool:
+    """Tell whether a file has all the frames of an episode of some length."""
+    if not isinstance(length, int) or note.timing["frames_per_step"] != 1:
+        return False
+    return file.frame_count == len(range(0, length, note.timing["stride"])) + 1
+
+
+def _how_it_ended(
+    episode_id: int | None, known: KnownEpisodes
+) -> dict[str, Any] | None:
+    """Return what is known of an episode's end; None where it was cut off."""
+    facts = _facts(episode_id, known)
+    if "complete" in facts and facts.get("reason") != "killed":
+        keys = ("complete", "terminated", "truncated", "reason", "exception")
+        return {key: facts[key] for key in keys if key in facts}
+    entry = None if episode_id is None else known.entry(episode_id)
+    if entry is None:
+        return None
+    return {
+        "complete": True,
+        "terminated": entry.terminated,
+        "truncated": entry.truncated,
+    }
+
+
+def _sums(episode_id: int | None, known: KnownEpisodes) -> dict[str, Any]:
+    """Return length and reward of the episode, as far as they are known."""
+    entry = None if episode_id is None else known.entry(episode_id)
+    if entry is not None:
+        return {"length": entry.length, "reward": entry.reward}
+    facts = _facts(episode_id, known)
+    return {key: facts[key] for key in ("length", "reward") if key in facts}
+
+
+def _facts(episode_id: int | None, known: KnownEpisodes) -> Mapping[str, Any]:
+    try:
+        return {} if episode_id is None else known.facts(episode_id)
+    except UnreadableFile:
+        # Its trajectory is damaged, which is told elsewhere.
+        return {}
+
+
+def _encoder(note: VideoNote) -> dict[str, Any]:
+    encoder = dict(note.video.encoder)
+    is_same = (
+        Path(ffmpeg_executable()).stat().st_size == note.ffmpeg_size
+        and ffmpeg_version() == encoder["version"]
+    )
+    encoder["sha256"] = ffmpeg_sha256() if is_same else None
+    return encoder
+
+
+def _write_metadata(video: Path, metadata: Mapping[str, Any]) -> None:
+    write_text(metadata_path(video), json_text.dumps(metadata))

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Looking for what killed processes have left in a directory.
+
+Only names and locks are looked at, and the episodes of journals counted: it is done at
+each `resume`, in the process of the simulation.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import UnreadableFile
+from ..formats.locks import is_locked
+from ..formats.monitor_directory import (
+    Infix,
+    infix_of,
+    iter_monitor_files,
+    lock_name,
+    video_prefix,
+)
+from ..formats.unfinished_video import note_path
+from ..formats.video_metadata import is_broken, metadata_path
+from ..results.monitor_files import MonitorFiles
+from ..results.sources import MonitorResults
+
+__all__ = ["Remains", "has_work", "is_open", "look_through", "remains_of"]
+
+_PART = re.compile(r"\.(?P<final>openaigym\..+)\.(?:[0-9a-f]{8}|note)\.part")
+_VIDEO_PART = re.compile(
+    r"\.(?P<video>openaigym\.video\..+\.video\d{6,}(?:\.[^/]+)?)"
+    r"\.(?P<kind>mp4|framehash|json|meta\.json)\.[0-9a-f]{8}\.part"
+)
+
+
+@dataclass(frozen=True)
+class Remains:
+    """The files of one monitor, hidden ones too.
+
+    Attributes:
+        directory: where they are.
+        infix: the monitor's.
+        paths: the files, sorted by name.
+    """
+
+    directory: Path
+    infix: Infix
+    paths: tuple[Path, ...]
+
+    @property
+    def files(self) -> MonitorFiles:
+        """The files as results are read from them."""
+        return MonitorFiles(str(self.infix), self.paths)
+
+    @property
+    def lock(self) -> Path:
+        """What the monitor claimed its infix with, be it there or not."""
+        return self.directory / lock_name(self.infix)
+
+    @property
+    def logs(self) -> list[Path]:
+        """The logs of its episodes."""
+        return [path for path in self.paths if path.suffix == ".log"]
+
+    @property
+    def notes(self) -> list[Path]:
+        """The notes of unfinished videos that something can be done about."""
+        return [
+            path
+            for path in self.paths
+            if path.name.endswith(".note.part") and not _is_given_up(path)
+        ]
+
+    @property
+    def leftovers(self) -> list[Path]:
+        """Unfinished files that will never be finished."""
+        kept = {path.name for path in self.paths if path.name.endswith(".note.part")}
+        return [
+            path
+            for path in self.paths
+            if path.suffix == ".part"
+            and path.name not in kept
+            and not _has_note(path, kept)
+            and not self._is_held(path)
+        ]
+
+    def is_own_video(self, part: Path) -> bool:
+        """Tell whether an unfinished file is of a video as it was to be at first."""
+        match = _VIDEO_PART.fullmatch(part.name)
+        return match is not None and match["video"].rpartition(".video")[2].isdigit()
+
+    def _is_held(self, part: Path) -> bool:
+        """Tell whether an unfinished file may be somebody's who is alive."""
+        match = _VIDEO_PART.fullmatch(part.name)
+        if match is None:
+            return False
+        number = int(re.findall(r"\.video(\d{6,})", part.name)[-1])
+        if self.is_own_video(part):
+            renderer = f".{video_prefix(self.infix, number)}.lock"
+            return is_locked(self.directory / renderer)
+        # Of an episode that is rendered once more. Its metadata, which nobody holds,
+        # is there for a moment only.
+        siblings = [
+            path
+            for path in self.paths
+            if path.name.startswith(f".{match['video']}.mp4.")
+        ]
+        return match["kind"] == "meta.json" or any(map(is_locked, siblings))
+
+
+def remains_of(directory: Path) -> list[Remains]:
+    """Return the files of all monitors, those that are open too."""
+    grouped: dict[Infix, list[Path]] = {}
+    for path in iter_monitor_files(directory, hidden=True):
+        part = _PART.fullmatch(path.name)
+        infix = Infix.parse(infix_of(part["final"] if part else path.name) or "")
+        if infix is not None:
+            grouped.setdefault(infix, []).append(path)
+    return [
+        Remains(directory, infix, tuple(grouped[infix]))
+        for infix in sorted(grouped, key=lambda infix: (infix.monitor_id, infix.uid))
+    ]
+
+
+def look_through(directory: Path, infix: Infix) -> Remains:
+    """Return the files of one monitor as they are now."""
+    found = (remains for remains in remains_of(directory) if remains.infix == infix)
+    return next(found, Remains(directory, infix, ()))
+
+
+def is_open(remains: Remains) -> bool:
+    """Tell whether a living process holds the monitor's lock."""
+    return is_locked(remains.lock)
+
+
+def has_work(remains: Remains) -> bool:
+    """Tell whether anything is to be put in order, of a monitor that is not open."""
+    files = remains.files
+    if remains.lock in remains.paths or remains.notes or remains.leftovers:
+        return True
+    if files.manifest is None:
+        # Gym's own never had these, and its manifests cannot be made again.
+        return bool(files.journal or files.trajectories)
+    try:
+        return files.journal is not None and MonitorResults(files).is_behind
+    except UnreadableFile:
+        return True
+
+
+def _is_given_up(note: Path) -> bool:
+    name = note.name.removeprefix(".").removesuffix(".note.part")
+    return is_broken(metadata_path(note.with_name(name)))
+
+
+def _has_note(part: Path, notes: set[str]) -> bool:
+    match = _VIDEO_PART.fullmatch(part.name)
+    if match is None or match["kind"] not in ("mp4", "framehash"):
+        return False
+    return note_path(part.with_name(f"{match['video']}.mp4")).name in notes
