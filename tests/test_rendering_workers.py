@@ -11,7 +11,7 @@ import subprocess
 import sys
 import textwrap
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from mjrec.rendering import worker_process, workers
 from mjrec.rendering.carried_errors import carried, unpacked
 from mjrec.rendering.child_python import environment_of_child
 from mjrec.rendering.views import View
+from mjrec.rendering.worker_process import WorkerProcess
 from mjrec.rendering.workers import DrawingWorkers
 
 
@@ -215,19 +216,140 @@ def test_a_worker_that_dies_twice_is_an_error(
     assert str(ride.path) in str(caught.value)
 
 
-def test_a_worker_that_hangs_is_not_waited_for(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def be_impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[DrawingWorkers], None]:
+    """Let the first worker hang after a moment; the next one gets its time."""
+
+    def shorten(pool: DrawingWorkers) -> None:
+        stacks = WorkerProcess.stacks
+
+        def prolong_and_ask(process: WorkerProcess) -> str:
+            for seat in pool._seats:
+                seat.patience.seconds = 120
+            return stacks(process)
+
+        monkeypatch.setattr(WorkerProcess, "stacks", prolong_and_ask)
+        # It has drawn, the others may only be about to begin.
+        pool._seats[0].patience.seconds = 0.5
+
+    return shorten
+
+
+def test_a_worker_that_always_hangs_is_not_waited_for(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It is ended, and the error says after how long."""
-    monkeypatch.setattr(workers, "_PATIENCE_S", 0.2)
+    """Two are ended. Where nothing was ever drawn, OpenGL is to blame."""
+    monkeypatch.setenv("MJREC_PATIENCE", "0.2")
     use_process(monkeypatch, "import time; time.sleep(100)")
     with (
         new_children() as new,
         DrawingWorkers(1) as pool,
-        pytest.raises(Error, match=r"no picture 0 of .* within 0 seconds"),
+        pytest.raises(GLError, match=r"picture 0 of .* nothing for 0.2 seconds"),
     ):
         pool.frames(ride.path, range(FRAMES))
     assert new == []
+    assert caplog.text.count("A drawing worker hangs") == 2
+
+
+def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
+    ride: Ride,
+    tmp_path: Path,
+    be_impatient: Callable[[DrawingWorkers], None],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Nothing of it is missing or comes twice."""
+    use_process(
+        monkeypatch,
+        f"""
+        import pathlib, threading
+        import mjrec.rendering.worker as worker
+        from mjrec.rendering import drawing
+        draw = drawing.TrajectoryDrawing.draw
+        hung = pathlib.Path({str(tmp_path / "hung")!r})
+        def wait_for_a_driver_that_hangs():
+            hung.touch()
+            lock = threading.Lock()
+            lock.acquire()
+            lock.acquire()
+        def hang_once(self, index, **options):
+            if index == 3 and not hung.exists():
+                wait_for_a_driver_that_hangs()
+            return draw(self, index, **options)
+        drawing.TrajectoryDrawing.draw = hang_once
+        worker.main()
+        """,
+    )
+    with DrawingWorkers(1) as pool:
+        frames = pool.frames(ride.path, range(FRAMES))
+        be_impatient(pool)
+        assert np.array_equal(list(frames), ride.frames)
+    assert "it has drawn nothing for 0.5 seconds" in caplog.text
+    assert "in wait_for_a_driver_that_hangs" in caplog.text
+
+
+def test_a_worker_that_was_stopped_hangs(
+    ride: Ride,
+    be_impatient: Callable[[DrawingWorkers], None],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Of two, the other one draws on; the stopped one can still say where it was."""
+    indices = [number % FRAMES for number in range(40)]
+    with DrawingWorkers(2) as pool:
+        frames = pool.frames(ride.path, indices)
+        drawn = [next(frames)]
+        os.kill(pids(pool)[0], signal.SIGSTOP)
+        be_impatient(pool)
+        drawn += frames
+    assert np.array_equal(drawn, [ride.frames[index] for index in indices])
+    assert caplog.text.count("A drawing worker hangs") == 1
+    assert "in serve" in caplog.text
+
+
+def test_a_slow_worker_does_not_hang(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """However long all takes: the time counts from picture to picture."""
+    use_process(
+        monkeypatch,
+        """
+        import time
+        import mjrec.rendering.worker as worker
+        from mjrec.rendering import drawing
+        draw = drawing.TrajectoryDrawing.draw
+        def slowly(self, index, **options):
+            time.sleep(0.3)
+            return draw(self, index, **options)
+        drawing.TrajectoryDrawing.draw = slowly
+        worker.main()
+        """,
+    )
+    with DrawingWorkers(1) as pool:
+        frames = pool.frames(ride.path, range(FRAMES))
+        pool._seats[0].patience.seconds = 2
+        assert np.array_equal(list(frames), ride.frames)
+    assert not caplog.records
+
+
+def test_a_crash_says_where(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The end of what a worker says has Python's stack."""
+    use_process(
+        monkeypatch,
+        """
+        import os, signal
+        import mjrec.rendering.worker as worker
+        from mjrec.rendering import drawing
+        def crash_in_the_driver(*arguments, **options):
+            os.kill(os.getpid(), signal.SIGSEGV)
+        drawing.TrajectoryDrawing.draw = crash_in_the_driver
+        worker.main()
+        """,
+    )
+    with (
+        DrawingWorkers(1) as pool,
+        pytest.raises(Error, match=r"(?s)SIGSEGV.*in crash_in_the_driver"),
+    ):
+        pool.frames(ride.path, range(FRAMES))
 
 
 def test_a_worker_that_cannot_be_started(

@@ -8,22 +8,29 @@ without a guard would run again), cannot be started from daemonic processes, and
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import json
 import logging
 import os
+import signal
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 __all__ = [
+    "ask_for_stacks",
     "environment_of_child",
     "python_command",
     "said_in",
+    "say_stacks_when_asked",
     "take_standard_output",
 ]
 
 logger = logging.getLogger(__name__)
+
+_STACKS = signal.SIGUSR1
 
 
 def python_command(module: str) -> list[str]:
@@ -60,6 +67,24 @@ def take_standard_output() -> int:
     descriptor = os.dup(sys.stdout.fileno())
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     return descriptor
+
+
+def say_stacks_when_asked() -> None:
+    """Let this process write what its threads are at to the standard error.
+
+    At `ask_for_stacks`, whatever it hangs in, and when it dies of a signal such as
+    SIGSEGV.
+    """
+    faulthandler.enable()
+    faulthandler.register(_STACKS)
+
+
+def ask_for_stacks(pid: int) -> None:
+    """Let a child that hangs say where. One that has not begun yet dies of it."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, _STACKS)
+        # Should it only have been stopped.
+        os.kill(pid, signal.SIGCONT)
 
 
 def said_in(line: bytes) -> dict[str, Any]:

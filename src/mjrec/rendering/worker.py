@@ -34,7 +34,7 @@ from typing import IO, Any
 
 from ..gl import use_gl
 from .carried_errors import carried
-from .child_python import take_standard_output
+from .child_python import say_stacks_when_asked, take_standard_output
 from .frame_ring import FrameRing
 
 __all__ = ["main"]
@@ -44,6 +44,7 @@ _NICE = 10
 
 def main() -> None:
     """Draw until the standard input ends."""
+    say_stacks_when_asked()
     answers = _Answers(os.fdopen(take_standard_output(), "wb"))
     logging.getLogger().addHandler(_ToParent(answers))
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -14,13 +15,21 @@ from collections.abc import Mapping
 from typing import IO, Any
 
 from ..errors import Error
-from .child_python import environment_of_child, python_command, said_in
+from .child_python import (
+    ask_for_stacks,
+    environment_of_child,
+    python_command,
+    said_in,
+)
 from .frame_ring import FrameRing
 
 __all__ = ["WorkerProcess"]
 
 _END_OF_STDERR = 2000
 _SECONDS_TO_DIE = 5.0
+_SECONDS_TO_SAY_STACKS = 5.0
+_SECONDS_BETWEEN_WORDS = 0.3
+_MOST_OF_STACKS = 20_000
 
 
 class WorkerProcess:
@@ -107,6 +116,19 @@ class WorkerProcess:
             self._stderr = (self._stderr + data)[-_END_OF_STDERR:]
         return data is None
 
+    def stacks(self) -> str:
+        """Return what the threads of one that hangs are at, for the log."""
+        self.listen()
+        ask_for_stacks(self.pid)
+        said, patience_s = b"", _SECONDS_TO_SAY_STACKS
+        while len(said) < _MOST_OF_STACKS:
+            ready, _, _ = select.select([self.words], [], [], patience_s)
+            data = self.words.read(1 << 16) if ready else None
+            if not data:
+                break
+            said, patience_s = said + data, _SECONDS_BETWEEN_WORDS
+        return said.decode(errors="replace").strip() or "(it does not say)"
+
     def end(self) -> None:
         """End it at once. Idempotent."""
         _running.discard(self)
@@ -161,7 +183,9 @@ def _end(
         return
     # It has nothing to put in order: no file of it is anybody's.
     process.kill()
-    process.wait()
+    # One whose driver does not return cannot die; nobody waits for that.
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(_SECONDS_TO_DIE)
     for pipe in pipes:
         pipe.close()
 

@@ -7,19 +7,19 @@ import collections
 import logging
 import os
 import selectors
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from ..errors import ClosedError, Error, InvalidArgument
+from ..errors import ClosedError, Error, GLError, InvalidArgument
 from ..frames import Frame
 from ..gl.backends import (
     backend_in_environment,
     environment_for,
     rendering_is_off,
 )
+from ..patience import Patience
 from .carried_errors import unpacked
 from .frame_ring import SLOTS, FrameRing
 from .views import View
@@ -29,8 +29,6 @@ __all__ = ["DrawingWorkers"]
 
 _LOG = logging.getLogger(__name__)
 
-# The GL thread of a worker gives up on its driver after 300 seconds, and says so.
-_PATIENCE_S = 330.0
 # Pictures that a worker draws one after the other before it leaves some out. While one
 # half of its slots is read, the other half is drawn.
 _RUN = SLOTS // 2
@@ -43,7 +41,9 @@ class DrawingWorkers:
     The processes are started as they are needed and stay until `close`, garbage
     collection or the end of this process. Each keeps at most four pictures that have
     not been asked for yet, however many are to come. One that dies is replaced, and
-    what it was drawing is tried once more.
+    what it was drawing is tried once more. One that hangs, having drawn no picture for
+    `patience_s` while one was waited for, is ended and counts as dead; where it hung is
+    in the log.
 
     They use the backend that `MUJOCO_GL` names. Where it names none, or turns rendering
     off (which is for the simulation), the first of them chooses one that works, as
@@ -74,6 +74,7 @@ class DrawingWorkers:
         self._seats = [_Seat() for _ in range(count)]
         self._selector = selectors.DefaultSelector()
         self._gl_strings: dict[str, str] = {}
+        self._has_drawn = False
         self._job: _Job | None = None
         self._jobs = 0
         self._closed = False
@@ -100,7 +101,7 @@ class DrawingWorkers:
             UnreadableFile: of the trajectory or its model.
             InvalidArgument: there is no such frame, no such camera in the model, or a
                 size that the driver cannot draw.
-            GLError: no backend works here.
+            GLError: no backend works here, or all that was tried hangs.
             Error: a worker died twice at one picture; the message names the signal and
                 what the worker said. Errors at later pictures are raised by the
                 iterator, at their places.
@@ -180,7 +181,6 @@ class DrawingWorkers:
         """Wait until a picture is drawn, or raise what there is instead of it."""
         self._check_usable()
         self._listen(0)
-        deadline = time.monotonic() + _PATIENCE_S
         while position not in job.drawn:
             self._check_usable()
             if self._job is not job:
@@ -188,10 +188,20 @@ class DrawingWorkers:
             if position in job.failed:
                 raise job.failed[position]
             self._hand_out(job)
-            if self._listen(max(0.0, deadline - time.monotonic())):
-                deadline = time.monotonic() + _PATIENCE_S
-            elif time.monotonic() >= deadline:
-                self._give_up_on_silent(job, position)
+            self._wait_for_news()
+
+    def _wait_for_news(self) -> None:
+        """Wait until a worker says something; end those that have not for too long."""
+        at_work = [seat for seat in self._seats if seat.owes]
+        if not at_work:
+            raise Error("No drawing worker was free, and none has anything to do.")
+        self._listen(min(seat.patience.begin_slice() for seat in at_work))
+        for seat in at_work:
+            seat.patience.end_slice()
+            if seat.was_heard or not seat.owes:
+                seat.renew()
+            elif seat.patience.is_over:
+                self._end_hanging(seat)
 
     def _hand_out(self, job: _Job) -> None:
         """Order the next pictures from whoever has room and least to do."""
@@ -217,6 +227,8 @@ class DrawingWorkers:
 
     def _order(self, job: _Job, seat: _Seat, count: int) -> None:
         assert seat.process is not None
+        if not seat.owes:
+            seat.renew()
         pictures = []
         for _ in range(count):
             position, slot = job.waiting.popleft(), seat.free.popleft()
@@ -224,10 +236,9 @@ class DrawingWorkers:
             pictures.append([position, job.indices[position], slot])
         seat.process.send(job=job.number, drawing=job.drawing, pictures=pictures)
 
-    def _listen(self, patience_s: float) -> bool:
-        """Take in what the workers say; return whether they said anything."""
-        events = self._selector.select(patience_s)
-        for key, _ in events:
+    def _listen(self, seconds: float) -> None:
+        """Take in what the workers say, waiting so long for it."""
+        for key, _ in self._selector.select(seconds):
             seat: _Seat = key.data
             # Another event may have ended it.
             if seat.process is None:
@@ -236,16 +247,18 @@ class DrawingWorkers:
                 self._take_in(seat, seat.process.receive())
             elif not seat.process.listen():
                 self._selector.unregister(key.fileobj)
-        return bool(events)
 
     def _take_in(self, seat: _Seat, answers: list[dict[str, Any]] | None) -> None:
         if answers is None:
-            self._replace(seat)
+            assert seat.process is not None
+            self._replace(seat, "died", seat.process.last_words())
             return
         for answer in answers:
             if "log" in answer:
                 _LOG.log(answer["log"][0], "%s", answer["log"][1])
-            elif "backend" in answer:
+                continue
+            seat.was_heard = True
+            if "backend" in answer:
                 self._environ = environment_for(answer["backend"], self._environ)
             elif "job" not in answer:
                 self._fail_all(seat, unpacked(answer["error"]))
@@ -266,6 +279,7 @@ class DrawingWorkers:
             job.failed[position] = unpacked(answer["error"])
         else:
             job.drawn[position] = (seat, slot)
+            self._has_drawn = True
 
     def _fail_all(self, seat: _Seat, error: Error) -> None:
         """Note that a worker cannot draw at all; it is not kept."""
@@ -273,38 +287,41 @@ class DrawingWorkers:
             self._job.failed.update(dict.fromkeys(seat.owes, error))
         self._dismiss(seat)
 
-    def _replace(self, seat: _Seat) -> None:
-        """Give what a dead worker owed to others, the first of it just once more."""
-        process = seat.process
-        assert process is not None
-        last_words = process.last_words()
+    def _end_hanging(self, seat: _Seat) -> None:
+        assert seat.process is not None
+        _LOG.error(
+            "A drawing worker hangs: it has drawn nothing for %g seconds, and is "
+            "ended. What its threads were at:\n%s",
+            seat.patience.seconds,
+            seat.process.stacks(),
+        )
+        how = (
+            f"it drew nothing for {seat.patience.seconds:g} seconds and was ended; "
+            "where it hung is in the log"
+        )
+        # Where nothing was ever drawn, it is not for the sake of this picture.
+        kind = Error if self._has_drawn else GLError
+        self._replace(seat, "hung", how, kind=kind)
+
+    def _replace(
+        self, seat: _Seat, what: str, how: str, *, kind: type[Error] = Error
+    ) -> None:
+        """Give what a lost worker owed to others, the first of it just once more."""
         owed = sorted(seat.owes)
         self._dismiss(seat)
         if self._job is None or not owed:
             return
         job, first = self._job, owed[0]
-        job.deaths[first] += 1
-        if job.deaths[first] >= _TRIES:
-            job.failed[first] = Error(
-                f"A worker died while drawing picture {job.indices[first]} of "
-                f"{job}, and so did another one that tried again: {last_words}"
+        job.losses[first] += 1
+        if job.losses[first] >= _TRIES:
+            job.failed[first] = kind(
+                f"A worker {what} while drawing picture {job.indices[first]} of {job}, "
+                f"which was the second try: {how}"
             )
             owed = owed[1:]
         else:
-            _LOG.warning("A drawing worker died and is replaced: %s", last_words)
+            _LOG.warning("A drawing worker %s and is replaced: %s", what, how)
         job.waiting.extendleft(reversed(owed))
-
-    def _give_up_on_silent(self, job: _Job, position: int) -> None:
-        late = (
-            f"A worker gave no picture {job.indices[position]} of {job} within "
-            f"{_PATIENCE_S:.0f} seconds"
-        )
-        seat = next((seat for seat in self._seats if position in seat.owes), None)
-        if seat is None or seat.process is None:
-            raise Error(f"{late}: none was free for it.")
-        last_words = seat.process.last_words()
-        self._dismiss(seat)
-        raise Error(f"{late}, and was ended: {last_words}")
 
     def _give_up(self) -> None:
         """Want nothing more of the job there is."""
@@ -338,7 +355,14 @@ class _Seat:
         self.process: WorkerProcess | None = None
         # The seat's, not the process's: what one has drawn outlives it.
         self.ring = FrameRing()
+        self.patience = Patience()
+        self.was_heard = False
         self.clear()
+
+    def renew(self) -> None:
+        """Begin to count the time without an answer anew."""
+        self.patience.renew()
+        self.was_heard = False
 
     def clear(self) -> None:
         """Forget what was to be drawn."""
@@ -363,7 +387,8 @@ class _Job:
         self.waiting = collections.deque(range(len(indices)))
         self.drawn: dict[int, tuple[_Seat, int]] = {}
         self.failed: dict[int, Error] = {}
-        self.deaths: collections.Counter[int] = collections.Counter()
+        # How often a worker was lost over a picture.
+        self.losses: collections.Counter[int] = collections.Counter()
 
     def __str__(self) -> str:
         return str(self.drawing.get("trajectory", "the given states"))
