@@ -99,7 +99,8 @@ def finish_trajectory(log: Path, *, facts: Mapping[str, Any] | None = None) -> P
 def _convert(log: Path, finished: Path, facts: Mapping[str, Any]) -> None:
     try:
         with TrajectoryLogReader(log) as reader:
-            known = {**reader.header.facts, **_how_it_ended(reader), **facts}
+            known = {**reader.header.facts, **facts}
+            known.update(_how_it_ended(reader, known))
             reader.header = dataclasses.replace(reader.header, facts=known)
             write_hdf5(reader, finished)
     except UnreadableFile:
@@ -108,9 +109,11 @@ def _convert(log: Path, finished: Path, facts: Mapping[str, Any]) -> None:
             raise
 
 
-def _how_it_ended(reader: TrajectoryLogReader) -> dict[str, Any]:
+def _how_it_ended(
+    reader: TrajectoryLogReader, facts: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return what there is to say where nobody could say it."""
-    if "complete" in reader.header.facts:
+    if "complete" in facts:
         return {}
     known: dict[str, Any] = {
         "complete": False,
@@ -119,7 +122,7 @@ def _how_it_ended(reader: TrajectoryLogReader) -> dict[str, Any]:
         # One after the other, as the monitor adds them up.
         "reward": float(sum(reader.rewards.tolist())),
     }
-    video = reader.header.facts.get("video")
+    video = facts.get("video")
     is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"
     if is_deferred and not reader.frame_count:
         # So that nobody waits for a video of nothing.

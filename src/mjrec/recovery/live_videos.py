@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import struct
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -60,10 +61,13 @@ def finish_video(
     if metadata_path(video.path).exists() or not _is_begun(video):
         _forget(note_file, video)
         return None
+    if not _holds_pictures(video):
+        # It was killed before its encoder had been given a frame.
+        _write_metadata(video.path, _metadata_without_video(note, known))
+        _forget(note_file, video)
+        return RecoveredFile(metadata_path(video.path).name, "there was no frame yet")
     try:
         file = video.check()
-        if not file.frame_count:
-            raise Error(f"{video.temporary.name} holds no frame.")
     except MissingDependency:
         raise
     except Error as error:
@@ -97,6 +101,25 @@ def _is_begun(video: UnfinishedVideo) -> bool:
     return False
 
 
+def _holds_pictures(video: UnfinishedVideo) -> bool:
+    """Tell whether the file holds anything besides what every mp4 begins with."""
+    path = video.temporary if video.temporary.exists() else video.path
+    end = path.stat().st_size
+    with path.open("rb") as file:
+        position = 0
+        while position + 8 <= end:
+            file.seek(position)
+            size, kind = struct.unpack(">I4s", file.read(8))
+            if kind not in (b"ftyp", b"moov", b"free", b"mdat"):
+                return True
+            # 0 is to the end, as in one that is not finished, and 1 very large.
+            held = end - position if size == 0 else size
+            if kind == b"mdat" and held != 8:
+                return True
+            position += max(size, 8)
+    return False
+
+
 def _forget(note_file: Path, video: UnfinishedVideo) -> None:
     """Remove what is not needed any more; the note last, which says what it was."""
     video.temporary.unlink(missing_ok=True)
@@ -115,25 +138,25 @@ def _give_up(
         "the recording process was killed, and its encoder before it had finished the "
         f"file: {why}"
     )
-    number = episode_of(video.path.name)
-    ending = _how_it_ended(number, known) or {"complete": False, "reason": "killed"}
-    _write_metadata(
-        video.path,
-        {
-            **note.metadata,
-            **ending,
-            **_sums(number, known),
-            "empty": True,
-            "broken": True,
-            "broken_reason": reason,
-            "recovered": True,
-        },
-    )
+    failure = {"broken": True, "broken_reason": reason}
+    _write_metadata(video.path, {**_metadata_without_video(note, known), **failure})
     if note.video.hashes is not None:
         note.video.hashes.unlink(missing_ok=True)
     return RecoveredFile(
         video.path.name, f"broken ({why}); its data is in {video.temporary.name}"
     )
+
+
+def _metadata_without_video(note: VideoNote, known: KnownEpisodes) -> Mapping[str, Any]:
+    number = episode_of(note.video.path.name)
+    ending = _how_it_ended(number, known) or {"complete": False, "reason": "killed"}
+    return {
+        **note.metadata,
+        **ending,
+        **_sums(number, known),
+        "empty": True,
+        "recovered": True,
+    }
 
 
 def _metadata(

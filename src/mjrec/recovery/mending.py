@@ -23,7 +23,7 @@ from ..rendering.rendered_manifests import update_manifest
 from .known_episodes import KnownEpisodes
 from .live_videos import finish_video
 from .manifests import write_results
-from .remains import Remains, look_through
+from .remains import Remains, look_through, model_leftovers
 from .report import RecoveredFile
 from .unfinished_logs import finish_log_of_dead
 
@@ -72,6 +72,12 @@ class Mending:
             # Whoever rendered meanwhile took the monitor for open.
             update_manifest(self._directory, infix)
 
+    def sweep_models(self) -> None:
+        """Remove unfinished files of models."""
+        for part in model_leftovers(self._directory):
+            with self._noting_failure(part.name):
+                self._remove(part)
+
     def _mend(self, remains: Remains) -> None:
         known = KnownEpisodes(remains)
         for log in remains.logs:
@@ -89,8 +95,11 @@ class Mending:
         for part in remains.leftovers:
             with self._noting_failure(part.name), self._claimed(part) as is_ours:
                 if is_ours:
-                    part.unlink(missing_ok=True)
-                    self._note(RecoveredFile(part.name, "unfinished, removed"))
+                    self._remove(part)
+
+    def _remove(self, part: Path) -> None:
+        part.unlink(missing_ok=True)
+        self._note(RecoveredFile(part.name, "unfinished, removed"))
 
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:

@@ -9,8 +9,8 @@ import os
 from pathlib import Path
 
 from ..errors import DirectoryNotWritable, InvalidArgument
-from ..formats.locks import wait_for_lock
-from .remains import Remains, has_work, is_open, remains_of
+from ..formats.locks import is_locked, wait_for_lock
+from .remains import Remains, has_work, is_open, model_leftovers, remains_of
 from .report import Recovery
 
 __all__ = ["recover"]
@@ -52,7 +52,8 @@ def recover(
     if not path.is_dir():
         raise InvalidArgument(f"There is no directory {path} to recover.")
     dead, open_monitors = _sorted_out(path)
-    if not dead:
+    # Whoever is recovering holds the locks of the dead, who look alive meanwhile.
+    if not (dead or model_leftovers(path) or is_locked(path / _LOCK)):
         return Recovery(path, open_monitors=open_monitors)
     # Not at the top: it loads HDF5, which a simulation that goes on where a closed
     # monitor left off has no use for.
@@ -70,6 +71,7 @@ def recover(
         mending = Mending(path, seconds=seconds)
         for remains in dead:
             mending.mend(remains.infix)
+        mending.sweep_models()
     finally:
         lock.release()
     return Recovery(path, tuple(mending.files), tuple(mending.failures), open_monitors)

@@ -25,9 +25,17 @@ from ..formats.video_metadata import is_broken, metadata_path
 from ..results.monitor_files import MonitorFiles
 from ..results.sources import MonitorResults
 
-__all__ = ["Remains", "has_work", "is_open", "look_through", "remains_of"]
+__all__ = [
+    "Remains",
+    "has_work",
+    "is_open",
+    "look_through",
+    "model_leftovers",
+    "remains_of",
+]
 
 _PART = re.compile(r"\.(?P<final>openaigym\..+)\.(?:[0-9a-f]{8}|note)\.part")
+_MODEL_PART = re.compile(r"\.openaigym\.model\..+\.[0-9a-f]{8}\.part")
 _VIDEO_PART = re.compile(
     r"\.(?P<video>openaigym\.video\..+\.video\d{6,}(?:\.[^/]+)?)"
     r"\.(?P<kind>mp4|framehash|json|meta\.json)\.[0-9a-f]{8}\.part"
@@ -127,6 +135,20 @@ def look_through(directory: Path, infix: Infix) -> Remains:
     """Return the files of one monitor as they are now."""
     found = (remains for remains in remains_of(directory) if remains.infix == infix)
     return next(found, Remains(directory, infix, ()))
+
+
+def model_leftovers(directory: Path) -> list[Path]:
+    """Return the unfinished files of models that nobody will finish.
+
+    They belong to all monitors of a directory, so there are none while one is open.
+    """
+    # In this order: whoever is at one of them has held a lock since before.
+    parts = [
+        path
+        for path in iter_monitor_files(directory, hidden=True)
+        if _MODEL_PART.fullmatch(path.name)
+    ]
+    return [] if parts and any(map(is_open, remains_of(directory))) else parts
 
 
 def is_open(remains: Remains) -> bool:

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec recover`: it says what it did, in text or as JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from trajectories_by_hand import write_log
+
+from mjrec.commands import main
+
+LOG = "openaigym.trajectory.0.7.episode00000"
+
+
+def test_what_was_done_is_listed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A line a file, and nothing the second time."""
+    write_log(tmp_path, 0)
+    write_log(tmp_path, 1, ended=False)
+    assert main(["recover", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"Recovered in {tmp_path}:",
+        f"  {LOG}0.h5: 4 steps",
+        f"  {LOG}1.h5: 4 steps, incomplete: killed",
+        "  openaigym.episode_batch.0.7.stats.json: 0 episodes",
+        "  openaigym.manifest.0.7.manifest.json: 0 videos, 2 pending: mjrec render",
+    ]
+    assert main(["recover", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == f"Nothing to recover in {tmp_path}.\n"
+
+
+def test_what_could_not_be_done_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The exit status says so too."""
+    log = write_log(tmp_path, 0)
+    log.write_bytes(log.read_bytes().replace(b"log 1", b"log 9", 1))
+    assert main(["recover", str(tmp_path)]) == 1
+    said = capsys.readouterr().out
+    assert "Not recovered:\n" in said
+    assert f"  {log.name}: " in said
+
+
+def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the same content."""
+    write_log(tmp_path, 0)
+    assert main(["recover", str(tmp_path), "--timeout", "0", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["directory"] == str(tmp_path)
+    assert content["files"][0] == {"name": f"{LOG}0.h5", "what": "4 steps"}
+    assert (content["failures"], content["open_monitors"]) == ([], [])
+
+
+def test_a_directory_that_is_not_there_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One message, and no traceback."""
+    assert main(["recover", str(tmp_path / "missing")]) == 1
+    assert capsys.readouterr().err.startswith("mjrec: There is no directory")

@@ -1,0 +1,589 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recovering a directory: processes are killed, and nothing of theirs is lost."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recordings import (
+    frames_in,
+    frames_of,
+    journal_of,
+    manifest_of,
+    metadata_of,
+    stats_of,
+    videos_in,
+)
+from trajectories_by_hand import INFIX, write_log
+
+import mjrec
+from mjrec.commands import main
+from mjrec.formats.journal import JournalEntry, JournalWriter
+from mjrec.formats.locks import Lock, try_lock
+from mjrec.formats.monitor_directory import (
+    journal_name,
+    lock_name,
+    video_lock_name,
+    video_prefix,
+)
+from mjrec.formats.trajectory_file import open_trajectory
+
+TESTS = Path(__file__).parent
+
+# A corridor of 12 steps, or a cheetah's 12 steps; what it is told to do comes in words.
+PROGRAM = """
+import os, signal, sys, time
+sys.path.insert(0, sys.argv[3])
+import gymnasium, mjrec
+from conftest import Corridor
+
+def drained(writer):
+    # What was captured has gone to the encoder, all of it.
+    while writer._encoding._encoded < writer.frame_count:
+        time.sleep(0.001)
+
+def monitor(**options):
+    env = Corridor(length=12)
+    return mjrec.Monitor(env, sys.argv[1], lambda episode: True, env_id="Corridor-v0",
+                         **options)
+
+def cheetah(**options):
+    env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=48,
+                         max_episode_steps=12)
+    return mjrec.Monitor(env, sys.argv[1], lambda episode: True, **options)
+
+def run(env, steps=12, reset=True):
+    env.action_space.seed(5)
+    if reset:
+        env.reset(seed=3)
+    for _ in range(steps):
+        env.step(env.action_space.sample())
+
+def die(env=None):
+    if env is not None:
+        drained(env.video_recorder._writer)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+"""
+
+
+@pytest.fixture
+def killed(tmp_path: Path) -> Callable[[str], Path]:
+    """Return a function that runs a program, which kills itself, on a directory."""
+
+    def run(program: str, directory: Path | None = None) -> Path:
+        directory = directory or tmp_path / "run"
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM + program, directory, "", TESTS],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        return directory
+
+    return run
+
+
+def results_of(directory: Path) -> dict[str, Any]:
+    """Return the results but for what says which files they are from."""
+    results = mjrec.load_results(directory)
+    assert results is not None
+    results["videos"] = sorted(results["videos"])
+    return {key: value for key, value in results.items() if key != "manifests"}
+
+
+def done(recovery: mjrec.Recovery) -> dict[str, str]:
+    """Return what became of each file, by the end of its name."""
+    assert not recovery.failures, str(recovery)
+    return {file.name.rpartition(".0.")[2]: file.what for file in recovery.files}
+
+
+def assert_in_order(directory: Path) -> None:
+    """Nothing is left to do, and no old or hidden file is there."""
+    before = {path.name: path.read_bytes() for path in directory.iterdir()}
+    again = mjrec.recover(directory)
+    assert not again
+    assert str(again) == f"Nothing to recover in {directory}."
+    assert {path.name: path.read_bytes() for path in directory.iterdir()} == before
+    assert not [n for n in before if n.startswith(".") or n.endswith(".log")]
+
+
+def expected(frame: int) -> Any:
+    """Return a corridor's picture."""
+    picture = np.zeros((32, 48, 3), np.uint8)
+    picture[:, : 4 * frame + 4] = (200, 40, 10)
+    return picture
+
+
+def test_a_live_video_cut_off_in_mid_episode_is_whole_up_to_there(
+    killed: Callable[[str], Path],
+) -> None:
+    """Every frame that its encoder was given is there, in order, with its hash."""
+    directory = killed("env = monitor()\nrun(env)\nrun(env, 7)\ndie(env)")
+    before = results_of(directory)
+    recovery = mjrec.recover(directory)
+    after = results_of(directory)
+    assert {**after, "videos": after["videos"][:1]} == before
+    assert videos_in(directory) == [0, 1]
+    frames = frames_in(directory, 1)
+    assert len(frames) == 8
+    for number, frame in enumerate(frames):
+        assert abs(frame.astype(int) - expected(number)).mean() < 6
+    metadata = metadata_of(directory, 1)
+    whole = metadata_of(directory, 0)
+    assert (metadata["complete"], metadata["reason"]) == (False, "killed")
+    assert (metadata["frame_count"], metadata["frame_steps"]) == (8, [[0, 7]])
+    assert set(whole) - set(metadata) == {
+        *("length", "reward", "terminated", "truncated")
+    }
+    differs = {key for key in whole if metadata.get(key) != whole[key]}
+    assert differs - {"length", "reward", "terminated", "truncated"} == {
+        *("episode_id", "complete", "frame_count", "frame_steps", "encoder_version"),
+        *("file_sha256", "decoded_sha256"),
+    }
+    hashes = [
+        path.read_text().splitlines() for path in sorted(directory.glob("*.framehash"))
+    ]
+    assert hashes[1] == hashes[0][: len(hashes[1])]
+    assert len(hashes[1]) == 9 + 8
+    assert done(recovery)[f"{_uid(directory)}.video000001.mp4"] == (
+        "8 frames, incomplete: killed"
+    )
+    assert_in_order(directory)
+
+
+def test_what_was_recovered_stands_in_the_manifest(
+    killed: Callable[[str], Path],
+) -> None:
+    """With what can be known of the run; its schedule's name cannot."""
+    directory = killed("env = monitor()\nrun(env)\nrun(env)\nrun(env, 7)\ndie(env)")
+    recovery = mjrec.recover(directory)
+    assert recovery.failures == ()
+    assert stats_of(directory)["episode_lengths"] == [12, 12]
+    assert stats_of(directory)["timestamps"] == [
+        entry["end_time"] for entry in journal_of(directory)
+    ]
+    manifest = manifest_of(directory)
+    assert manifest["env_info"] == {"gym_version": "mjrec-1", "env_id": "Corridor-v0"}
+    assert [video for video, _ in manifest["videos"]] == sorted(
+        path.name for path in directory.glob("*.mp4")
+    )
+    details = manifest["mjrec"]
+    assert details.pop("versions")["mjrec"] == mjrec.__version__
+    assert details == {
+        "format_version": 1,
+        "schedule": {"name": None, "recorded": [0, 1, 2]},
+        "first_episode_id": 0,
+        "next_episode_id": 3,
+        "pending": [],
+        "broken": [],
+        "faults": [],
+        "recovered": True,
+    }
+    assert_in_order(directory)
+
+
+def test_deferred_episodes_become_trajectories_and_stay_pending(
+    killed: Callable[[str], Path],
+) -> None:
+    """The one in flight too, marked as killed; rendered, it shows what was recorded."""
+    directory = killed(
+        "env = cheetah(workers=0)\nrun(env)\nrun(env, 6)\n"
+        "env._recorder._states.finish()\n"
+        "env._recorder._trajectory._log.flush()\ndie()"
+    )
+    before = results_of(directory)
+    mjrec.recover(directory)
+    assert results_of(directory) == before
+    facts = []
+    for path in sorted(directory.glob("*.h5")):
+        with open_trajectory(path) as reader:
+            facts.append({**reader.header.facts, "steps": reader.step_count})
+    assert [f["complete"] for f in facts] == [True, False]
+    assert [f["steps"] for f in facts] == [12, 6]
+    assert (facts[1]["reason"], facts[1]["length"]) == ("killed", 6)
+    pending = manifest_of(directory)["mjrec"]["pending"]
+    assert [entry["episode_id"] for entry in pending] == [0, 1]
+    assert_in_order(directory)
+    assert main(["render", str(directory)]) == 0
+    # Both began alike, and did alike.
+    first, second = frames_in(directory, 0), frames_in(directory, 1)
+    assert (len(first), len(second)) == (13, 7)
+    for one, other in zip(first, second, strict=False):
+        assert abs(one.astype(int) - other).mean() < 3
+    assert metadata_of(directory, 1)["reason"] == "killed"
+    assert manifest_of(directory)["mjrec"]["pending"] == []
+    assert_in_order(directory)
+
+
+def test_a_manifest_that_is_older_than_its_journal_is_brought_up_to_date(
+    killed: Callable[[str], Path],
+) -> None:
+    """What it knew and nothing else says stays."""
+    directory = killed(
+        "env = monitor(write_upon_reset=True)\nrun(env)\nrun(env)\ndie()"
+    )
+    assert stats_of(directory)["episode_lengths"] == [12]
+    start = stats_of(directory)["initial_reset_timestamp"]
+    name = manifest_of(directory)["mjrec"]["schedule"]["name"]
+    mjrec.recover(directory)
+    assert stats_of(directory)["episode_lengths"] == [12, 12]
+    assert stats_of(directory)["initial_reset_timestamp"] == start
+    details = manifest_of(directory)["mjrec"]
+    assert details["schedule"] == {"name": name, "recorded": [0, 1]}
+    assert details["recovered"] is True
+    assert_in_order(directory)
+
+
+def test_only_the_dead_monitors_files_are_touched(
+    killed: Callable[..., Path], corridor: Any, play: Callable[..., None]
+) -> None:
+    """A living one in the same directory goes on as if nothing had been."""
+    directory = killed("env = monitor()\nrun(env)\nrun(env, 5)\ndie(env)")
+    with mjrec.Monitor(
+        corridor, directory, lambda _: True, resume=True, env_id="Corridor-v0"
+    ) as living:
+        # Resuming has recovered the dead one.
+        assert videos_in(directory) == [0, 1]
+        assert living.episode_id == 2
+        play(living, 1)
+        killed("env = monitor(resume=True)\nrun(env, 5)\ndie(env)", directory)
+        own = {
+            path.name: path.read_bytes()
+            for path in directory.iterdir()
+            if living.infix in path.name
+        }
+        recovery = mjrec.recover(directory)
+        assert recovery.files
+        assert recovery.open_monitors == (living.infix,)
+        assert living.infix in str(recovery)
+        assert own == {
+            path.name: path.read_bytes()
+            for path in directory.iterdir()
+            if living.infix in path.name
+        }
+        play(living, 1)
+    assert_in_order(directory)
+
+
+def test_a_live_video_without_a_frame_is_no_broken_one(
+    killed: Callable[[str], Path],
+) -> None:
+    """Its encoder was begun, and had been given nothing when all was over."""
+    directory = killed(
+        "import mjrec.formats.video_writer as v\n"
+        "v._Encoding._encode = lambda *_: die()\n"
+        "env = monitor()\nrun(env)\n"
+    )
+    mjrec.recover(directory)
+    assert videos_in(directory) == []
+    metadata = metadata_of(directory, 0)
+    assert metadata["empty"]
+    assert "broken" not in metadata
+    assert manifest_of(directory)["mjrec"]["broken"] == []
+    assert_in_order(directory)
+
+
+def test_an_encoder_that_was_killed_too_is_told(killed: Callable[[str], Path]) -> None:
+    """The video is not there, its metadata says why, and what there is is kept."""
+    directory = killed(
+        "env = monitor()\nrun(env)\nrun(env, 7)\nw = env.video_recorder._writer\n"
+        "drained(w)\nos.kill(w._encoding._process.pid, signal.SIGKILL)\n"
+        "w._encoding.temporary.write_bytes(b'ftyp' + bytes(900))\ndie()"
+    )
+    recovery = mjrec.recover(directory)
+    assert videos_in(directory) == [0]
+    metadata = metadata_of(directory, 1)
+    assert metadata["broken"]
+    assert metadata["empty"]
+    assert "its encoder" in metadata["broken_reason"]
+    assert (metadata["complete"], metadata["reason"]) == (False, "killed")
+    [part] = directory.glob(".*.mp4.????????.part")
+    assert part.name in str(recovery)
+    assert manifest_of(directory)["mjrec"]["broken"] == [
+        f"{video_prefix(_infix(directory), 1)}.meta.json"
+    ]
+    assert not mjrec.recover(directory)
+    assert part.exists()
+
+
+def test_a_slow_encoder_is_waited_for(
+    killed: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """As long as was asked for; then it is told, and the next time it is done."""
+    directory = killed("env = monitor()\nrun(env, 7)\ndie(env)")
+    mjrec.recover(directory)
+    [video] = directory.glob("*.mp4")
+    _undo(directory, video)
+    part = _part_of(directory, video)
+    with _held(part):
+        recovery = mjrec.recover(directory, timeout=0.1)
+        assert [file.name for file in recovery.failures] == [video.name]
+        assert "still finishing" in str(recovery)
+        assert not video.exists()
+        assert part.exists()
+    assert video.name in [file.name for file in mjrec.recover(directory).files]
+    assert frames_of(video)
+    assert_in_order(directory)
+
+
+def test_a_video_that_got_its_name_gets_its_metadata(
+    killed: Callable[[str], Path],
+) -> None:
+    """Its process was killed between the two."""
+    directory = killed(
+        "import mjrec.recorder.video_recorder as v\nv.write_text = lambda *_: die()\n"
+        "env = monitor()\nrun(env)\n"
+    )
+    assert videos_in(directory) == [0]
+    assert not list(directory.glob("*.meta.json"))
+    mjrec.recover(directory)
+    metadata = metadata_of(directory, 0)
+    assert (metadata["complete"], metadata["terminated"]) == (True, True)
+    assert metadata["frame_steps"] == [[0, 12]]
+    assert metadata["length"] == 12
+    assert len(manifest_of(directory)["videos"]) == 1
+    assert_in_order(directory)
+
+
+def test_a_complete_episode_that_the_journal_lacks_is_added(tmp_path: Path) -> None:
+    """The machine failed before the line was on the disk; its trajectory has it all."""
+    facts = {
+        "complete": True,
+        "terminated": True,
+        "truncated": False,
+        "length": 4,
+        "reward": 2.5,
+        "start_time": 10.0,
+        "end_time": 12.0,
+    }
+    write_log(tmp_path, 0, ended=False, **facts)
+    write_log(tmp_path, 1, ended=False, **facts)
+    journal = tmp_path / journal_name(INFIX)
+    writer = JournalWriter(journal)
+    writer.append(JournalEntry(0, 4, 2.5, "t", 10.0, 12.0, 5, None, True, False))
+    writer.close()
+    with journal.open("ab") as file:
+        file.write(b'{"episode_id": 1, "length": 4, "rew')
+    recovery = mjrec.recover(tmp_path)
+    assert recovery.failures == ()
+    assert [e.episode_id for e in mjrec.iter_episodes(tmp_path)] == [0, 1]
+    assert stats_of(tmp_path)["episode_lengths"] == [4, 4]
+    assert_in_order(tmp_path)
+
+
+def test_a_log_whose_episode_is_in_the_journal_is_complete(tmp_path: Path) -> None:
+    """All its rows are there, and its process was killed before the last words."""
+    write_log(tmp_path, 0, steps=4, ended=False)
+    writer = JournalWriter(tmp_path / journal_name(INFIX))
+    writer.append(JournalEntry(0, 4, 2.5, "t", 10.0, 12.0, 5, None, True, False))
+    writer.close()
+    mjrec.recover(tmp_path)
+    [path] = tmp_path.glob("*.h5")
+    with open_trajectory(path) as reader:
+        facts = reader.header.facts
+    assert (facts["complete"], facts["terminated"], facts["reward"]) == (
+        True,
+        True,
+        2.5,
+    )
+    assert "reason" not in facts
+
+
+def test_logs_that_hold_nothing_do_not_come_back(tmp_path: Path) -> None:
+    """An empty one is removed, and one that nobody can read is set aside."""
+    good = write_log(tmp_path, 0)
+    empty, garbage = (Path(str(good).replace("000000", f"00000{n}")) for n in (1, 2))
+    empty.touch()
+    garbage.write_bytes(b"mjrec trajectory log 1" + bytes(200))
+    recovery = mjrec.recover(tmp_path)
+    assert f"{empty.name}: empty, removed" in str(recovery)
+    assert f"{garbage.name}.damaged" in str(recovery)
+    assert not empty.exists()
+    assert garbage.with_name(f"{garbage.name}.damaged").stat().st_size == 222
+    assert_in_order(tmp_path)
+    mjrec.clear_monitor_files(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_log_of_a_newer_version_is_left_as_it_is(tmp_path: Path) -> None:
+    """It is not damaged, and a newer mjrec can recover it."""
+    log = write_log(tmp_path, 0)
+    content = log.read_bytes().replace(b"log 1", b"log 9", 1)
+    log.write_bytes(content)
+    recovery = mjrec.recover(tmp_path)
+    assert [file.name for file in recovery.failures] == [log.name]
+    assert log.read_bytes() == content
+
+
+def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path: Path) -> None:
+    """Those of a living one stay."""
+    write_log(tmp_path, 0)
+    write_log(tmp_path, 1)
+    mjrec.recover(tmp_path)
+    parts = [
+        tmp_path / f".{video_prefix(INFIX, n)}.{kind}.0123abcd.part"
+        for n in (0, 1)
+        for kind in ("mp4", "framehash")
+    ]
+    side = tmp_path / f".{video_prefix(INFIX, 0)}.side.mp4.0123abcd.part"
+    for part in parts:
+        part.touch()
+    renderer = try_lock(tmp_path / video_lock_name(INFIX, 1), "")
+    again = Lock(side, "")
+    assert renderer is not None
+    recovery = mjrec.recover(tmp_path, timeout=0)
+    assert [file.name for file in recovery.files] == [p.name for p in sorted(parts[:2])]
+    assert [part.exists() for part in parts] == [False, False, True, True]
+    assert side.exists()
+    renderer.release()
+    again.let_go()
+    mjrec.recover(tmp_path)
+    assert not any(part.exists() for part in [*parts, side])
+    assert_in_order(tmp_path)
+
+
+def test_unfinished_models_go_when_nobody_records(tmp_path: Path) -> None:
+    """While somebody does, they may be theirs."""
+    part = tmp_path / ".openaigym.model.0123456789abcdef.zip.0123abcd.part"
+    part.touch()
+    lock = Lock(tmp_path / lock_name(INFIX), "")
+    assert not mjrec.recover(tmp_path)
+    lock.let_go()
+    assert mjrec.recover(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_recoveries_at_once_do_the_work_once(
+    killed: Callable[[str], Path],
+) -> None:
+    """The second waits for the first, and finds nothing to do."""
+    directory = killed("env = monitor()\nrun(env)\nrun(env, 5)\ndie(env)")
+    command = [sys.executable, "-m", "mjrec", "recover", str(directory)]
+    both = [
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)
+    ]
+    said = sorted(process.communicate()[0] for process in both)
+    assert [process.returncode for process in both] == [0, 0]
+    assert said[0] == f"Nothing to recover in {directory}.\n"
+    assert said[1].count("video000001.mp4") == 1
+    assert_in_order(directory)
+
+
+def test_a_directory_that_cannot_be_written_to_is_one_error(
+    killed: Callable[[str], Path],
+) -> None:
+    """Nothing is half done."""
+    directory = killed("env = monitor()\nrun(env, 5)\ndie(env)")
+    before = sorted(directory.iterdir())
+    # For root, whom no permission stops, a file stands where the lock belongs.
+    blocker = directory / ".openaigym.recover.lock"
+    blocker.mkdir()
+    try:
+        with pytest.raises(mjrec.DirectoryNotWritable, match=str(directory)):
+            mjrec.recover(directory)
+    finally:
+        blocker.rmdir()
+    assert sorted(directory.iterdir()) == before
+
+
+def test_there_must_be_a_directory(tmp_path: Path) -> None:
+    """And a time to wait that is a number."""
+    with pytest.raises(mjrec.InvalidArgument, match="no directory"):
+        mjrec.recover(tmp_path / "missing")
+    for wrong in (-1, float("nan"), "5", True):
+        with pytest.raises(mjrec.InvalidArgument, match="timeout"):
+            mjrec.recover(tmp_path, timeout=wrong)  # type: ignore[arg-type]  # as said
+
+
+def test_gyms_own_directories_are_left_alone(tmp_path: Path) -> None:
+    """A manifest of gym's cannot be made again, and is not."""
+    names = [
+        "openaigym.video.0.77.video000000.mp4",
+        "openaigym.video.0.77.video000000.meta.json",
+        "openaigym.episode_batch.0.77.stats.json",
+    ]
+    for name in names:
+        (tmp_path / name).write_text("{}")
+    assert not mjrec.recover(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
+
+
+def test_nothing_to_recover_loads_no_hdf5(tmp_path: Path) -> None:
+    """A simulation that goes on where a closed one left off stays small."""
+    code = "import sys, mjrec; mjrec.recover(sys.argv[1]); print('h5py' in sys.modules)"
+    said = subprocess.run(
+        [sys.executable, "-c", code, tmp_path],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert said == "False\n"
+
+
+def _held(path: Path) -> Any:
+    """Hold an existing file locked, as an encoder does."""
+    import contextlib
+    import fcntl
+
+    @contextlib.contextmanager
+    def holding() -> Iterator[None]:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+    return holding()
+
+
+def _undo(directory: Path, video: Path) -> None:
+    """Make a recovered video unfinished again."""
+    metadata = json.loads(video.with_suffix(".meta.json").read_text())
+    video.rename(_part_of(directory, video))
+    video.with_suffix(".meta.json").unlink()
+    encoder = metadata["encoder_version"]
+    note = {
+        "video": {
+            "path": video.name,
+            "temporary": _part_of(directory, video).name,
+            "hashes": None,
+            "height": metadata["height"],
+            "width": metadata["width"],
+            "fps": metadata["fps"],
+            "codec": metadata["codec"],
+            "pixel_format": metadata["pixel_format"],
+            "encoder": {
+                "ffmpeg": encoder["cmdline"][0],
+                "version": encoder["version"],
+                "sha256": None,
+                "arguments": encoder["cmdline"][1:],
+            },
+        },
+        "metadata": {"episode_id": 0},
+        "timing": {"timestep": None, "stride": 1, "frames_per_step": 1},
+        "ffmpeg_size": 1,
+    }
+    (directory / f".{video.name}.note.part").write_text(json.dumps(note))
+
+
+def _part_of(directory: Path, video: Path) -> Path:
+    return directory / f".{video.name}.0123abcd.part"
+
+
+def _infix(directory: Path) -> Any:
+    from mjrec.formats.monitor_directory import Infix, infix_of
+
+    [journal] = directory.glob("openaigym.episodes.*")
+    return Infix.parse(infix_of(journal.name) or "")
+
+
+def _uid(directory: Path) -> str:
+    return str(_infix(directory).uid)
