@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -375,3 +376,48 @@ def test_a_log_beside_its_finished_trajectory_goes(tmp_path: Path) -> None:
     assert not log.exists()
     with open_trajectory(log.with_suffix(".h5")) as reader:
         assert reader.step_count == 4
+
+
+def test_the_manifest_says_why_a_video_is_still_pending(tmp_path: Path) -> None:
+    """What became of the latest try; a try that succeeds takes it away."""
+    good = write_log(tmp_path, 0)
+    content = good.read_bytes()
+    write_pending_manifest(tmp_path, 0)
+    good.write_bytes(b"not a log")
+    [outcome] = finish(tmp_path)
+    [entry] = manifest_in(tmp_path)["mjrec"]["pending"]
+    assert entry["reason"] == outcome.failure
+    assert "Cannot read" in entry["reason"]
+    good.write_bytes(content)
+    assert [outcome.failure for outcome in finish(tmp_path)] == [None]
+    assert manifest_in(tmp_path)["mjrec"]["pending"] == []
+    assert len(manifest_in(tmp_path)["videos"]) == 1
+
+
+def test_a_long_reason_is_cut_in_its_middle(tmp_path: Path) -> None:
+    """Where it begins and ends is what matters."""
+    write_pending_manifest(tmp_path, 0)
+    reason = "It failed. " + 10**4 * "x" + " No space left."
+    update_manifest(tmp_path, INFIX, reasons={f"{VIDEO}.mp4": reason})
+    [entry] = manifest_in(tmp_path)["mjrec"]["pending"]
+    assert len(entry["reason"]) <= 1000
+    assert re.fullmatch(
+        r"It failed\. x+ \[\.\.\.\] x+ No space left\.", entry["reason"]
+    )
+
+
+def test_what_a_killed_renderer_left_goes_with_the_next_try(tmp_path: Path) -> None:
+    """Only that of the same video."""
+    write_finished(tmp_path, 0)
+    others = [
+        f".{VIDEO}.side.mp4.0123abcd.part",
+        ".openaigym.video.0.7.video000001.mp4",
+    ]
+    left = [
+        f".{VIDEO}.{end}.0123abcd.part" for end in ("mp4", "framehash", "meta.json")
+    ]
+    for name in [*others, *left]:
+        (tmp_path / name).touch()
+    assert [outcome.failure for outcome in finish(tmp_path)] == [None]
+    assert all((tmp_path / name).exists() for name in others)
+    assert not any((tmp_path / name).exists() for name in left)

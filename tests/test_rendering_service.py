@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import multiprocessing
 import os
@@ -261,28 +262,131 @@ def test_ctrl_c_in_the_terminal_does_not_reach_the_server(
 
 
 @pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGSEGV])
-def test_a_dead_server_is_one_clear_failure(
+def test_a_second_server_goes_on_for_a_dead_one(
     signum: signal.Signals,
+    recorded: Path,
+    start: Callable[..., RenderService],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Nothing is missing, nothing is left of the first one, and it is told how it died.
+
+    It dies once in the midst of a video, and once before anything has begun.
+    """
+    service = start(recorded)
+    for log in sorted(recorded.glob("*.log")):
+        service.submit(log)
+    [server] = children()
+    if signum == signal.SIGKILL:
+        wait_until(lambda: list(recorded.glob(".*.mp4.*.part")))
+    os.kill(server, signum)
+    service.wait()
+    assert service.failures == {}
+    assert [len(frames_of(video)) for video in recorded.glob("*.mp4")] == [4, 4]
+    assert signum.name in caplog.text
+    assert not list(recorded.glob(".*"))
+    assert not children()
+
+
+def test_servers_that_die_are_one_clear_failure(
     tmp_path: Path,
     start: Callable[..., RenderService],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """It is told how it died; nothing waits for ever, and all stays pending."""
+    """It is told how they died; nothing waits for ever, and all stays pending."""
     service = start()
     logs = [write_log(tmp_path, k, model={"mjb": "none"}) for k in range(2)]
     for log in logs:
         service.submit(log)
-    [server] = children()
-    wait_until(lambda: finished(logs[:1]) or True)
-    os.kill(server, signum)
+    for _ in range(2):
+        [server] = children()
+        os.kill(server, signal.SIGKILL)
+        wait_until(functools.partial(_has_ended, server))
+        later = write_log(tmp_path, 2)
+        service.submit(later)
     service.wait()
-    assert list(service.failures) == [log.name for log in logs]
-    assert signum.name in service.failures[logs[0].name]
-    assert signum.name in caplog.text
-    service.submit(write_log(tmp_path, 2))
+    assert list(service.failures) == [log.name for log in [*logs, later]]
+    assert "killed (SIGKILL)" in service.failures[later.name]
+    assert len(set(service.failures.values())) == 1
+    assert caplog.text.count("SIGKILL") == 2
+    service.submit(write_log(tmp_path, 3))
     service.wait()
-    assert len(service.failures) == 3
+    assert len(service.failures) == 4
     assert not children()
+
+
+def test_a_server_that_hangs_is_ended(
+    tmp_path: Path,
+    start: Callable[..., RenderService],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With its children; the log has its threads' stacks, and another one tries."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\n"
+        "if sys.argv[0] == '-m':\n"
+        "    import os, subprocess, threading\n"
+        "    def wait_for_a_disk_that_does_not_answer(*a, **k):\n"
+        "        child = subprocess.Popen(['sleep', '60'], start_new_session=True)\n"
+        f"        open({str(tmp_path / 'pids')!r}, 'a').write(f'{{child.pid}}\\n')\n"
+        "        threading.Lock().acquire() and threading.Event().wait()\n"
+        "    import mjrec.rendering.finishing as f\n"
+        "    f.finish_trajectory = wait_for_a_disk_that_does_not_answer\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("MJREC_PATIENCE", "0.7")
+    service = start()
+    log = write_log(tmp_path, video=None)
+    service.submit(log)
+    service.wait()
+    assert "hung for 2.1 seconds" in service.failures[log.name]
+    assert "in wait_for_a_disk_that_does_not_answer" in caplog.text
+    assert caplog.text.count("What its threads were at") == 2
+    assert log.exists()
+    pids = [int(pid) for pid in (tmp_path / "pids").read_text().split()]
+    assert len(pids) == 2
+    wait_until(lambda: all(map(_has_ended, pids)))
+    assert not children()
+
+
+def test_a_server_at_work_does_not_hang(
+    tmp_path: Path, start: Callable[..., RenderService], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long it takes for one thing; here, for a log."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\n"
+        "if sys.argv[0] == '-m':\n"
+        "    import time\n"
+        "    import mjrec.rendering.finishing as f\n"
+        "    finish = f.finish_trajectory\n"
+        "    def slowly(log):\n"
+        "        for _ in range(40):\n"
+        "            time.sleep(0.1)\n"
+        "        return finish(log)\n"
+        "    f.finish_trajectory = slowly\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("MJREC_PATIENCE", "0.7")
+    service = start()
+    log = write_log(tmp_path, video=None)
+    service.submit(log)
+    service.wait()
+    assert service.failures == {}
+    assert finished([log]) == [True]
+
+
+def test_what_failed_is_known_after_a_stop(
+    tmp_path: Path, start: Callable[..., RenderService]
+) -> None:
+    """The manifest is to say it, though nobody waits."""
+    service = start()
+    bad = write_log(tmp_path)
+    bad.write_bytes(b"not a log")
+    service.submit(bad)
+    good = write_log(tmp_path, 1, video=None)
+    service.submit(good)
+    wait_until(lambda: finished([good]) == [True])
+    service.stop()
+    assert "Cannot read" in service.failures["openaigym.video.0.7.video000000.mp4"]
 
 
 def test_a_server_that_cannot_start_says_why(
@@ -406,7 +510,7 @@ def test_the_server_ends_with_its_parent(tmp_path: Path) -> None:
         server = int(program.stdout.readline())
         program.kill()
         program.wait()
-        wait_until(lambda: not _is_running(server))
+        wait_until(lambda: _has_ended(server))
         # The child, which has nothing to do with it.
         os.killpg(program.pid, signal.SIGKILL)
     with open_trajectory(next(tmp_path.glob("*.episode*"))) as reader:
@@ -462,10 +566,9 @@ def test_the_simulation_gets_no_thread_and_no_library(tmp_path: Path) -> None:
     assert answer.stdout == "1 []\n"
 
 
-def _is_running(pid: int) -> bool:
+def _has_ended(pid: int) -> bool:
     try:
-        return (
-            Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-        )
+        stat = Path(f"/proc/{pid}/stat").read_text()
     except (FileNotFoundError, ProcessLookupError):
-        return False
+        return True
+    return stat.rpartition(")")[2].split()[0] == "Z"

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+from ..formats.pending_videos import pending_video, with_reason
 from ..formats.video_metadata import is_broken, is_done, metadata_path
 from .deferred_video import DeferredVideo
 from .video_recorder import VideoRecorder
@@ -57,11 +60,20 @@ class EpisodeVideos:
         self._look_for_rendered()
         return list(self._broken)
 
-    def pending(self) -> list[dict[str, Any]]:
-        """Return what is still to be rendered."""
+    def pending(
+        self, reasons: Mapping[str, str] = MappingProxyType({})
+    ) -> list[Mapping[str, Any]]:
+        """Return what is still to be rendered.
+
+        Args:
+            reasons: why rendering has failed, by the names of videos or of logs.
+        """
         self._look_for_rendered()
         return [
-            {"episode_id": episode_id, "trajectory": trajectory, "video": video.name}
+            with_reason(
+                pending_video(episode_id, trajectory=trajectory, video=video.name),
+                reasons,
+            )
             for episode_id, trajectory, video in self._deferred
         ]
 

@@ -7,6 +7,7 @@ as it was, and stops nothing else.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -20,7 +21,7 @@ from ..formats.trajectory_file import finish_trajectory
 from ..formats.video_writer import VideoFile
 from .crew import Crew
 from .outcomes import Outcome
-from .pending import EpisodeKey, PendingEpisode, claim, look_at
+from .pending import EpisodeKey, PendingEpisode, claim, look_at, remove_unfinished
 from .progress import Progress
 from .rendered_manifests import reconcile, update_manifest
 from .videos import render_video
@@ -177,10 +178,19 @@ class EpisodeFinisher:
             finally:
                 lock.release()
         except (Error, OSError) as error:
-            return replace(nothing, failure=str(error))
+            reason = str(error)
         except Exception as error:
             logger.exception("%s cannot be finished.", key.trajectory_name)
-            return replace(nothing, failure=f"{type(error).__name__}: {error}")
+            reason = f"{type(error).__name__}: {error}"
+        self._note_failure(key, reason)
+        return replace(nothing, failure=reason)
+
+    def _note_failure(self, key: EpisodeKey, reason: str) -> None:
+        # Whatever stands in the way of that is told by `reconcile`.
+        with contextlib.suppress(Error, OSError):
+            update_manifest(
+                self._directory, key.infix, reasons={key.video_name: reason}
+            )
 
     def _finish_claimed(self, episode: PendingEpisode) -> Outcome:
         path = episode.trajectory
@@ -189,6 +199,7 @@ class EpisodeFinisher:
         outcome = Outcome(name=path.name, directory=self._directory)
         if episode.video is not None:
             outcome = replace(outcome, name=episode.video.name)
+            remove_unfinished(episode.video)
             outcome = self._rendered(path, outcome)
         if not episode.is_kept:
             for suffix in (".log", ".h5"):

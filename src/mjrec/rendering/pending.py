@@ -10,12 +10,14 @@ left is taken over.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..errors import DirectoryNotWritable
+from ..formats.frame_hashes import frame_hash_path
 from ..formats.locks import Lock, is_locked, try_lock
 from ..formats.monitor_directory import (
     Infix,
@@ -28,11 +30,20 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.trajectory_file import find_trajectory
-from ..formats.video_metadata import is_done
+from ..formats.video_metadata import is_done, metadata_path
 from .recorded_facts import open_for_rendering
 from .videos import video_path
 
-__all__ = ["EpisodeKey", "PendingEpisode", "claim", "look_at", "recorded_episodes"]
+__all__ = [
+    "EpisodeKey",
+    "PendingEpisode",
+    "claim",
+    "look_at",
+    "recorded_episodes",
+    "remove_unfinished",
+]
+
+_PART = re.compile(r"[0-9a-f]{8}\.part", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -152,6 +163,19 @@ def claim(directory: Path, key: EpisodeKey) -> Lock | None:
         return try_lock(path, f"{os.getpid()}\n")
     except OSError as error:
         raise DirectoryNotWritable(directory, error.strerror) from error
+
+
+def remove_unfinished(video: Path) -> None:
+    """Remove what a renderer that was killed has left of a deferred video.
+
+    To be called by who holds the episode's lock, so that nobody else is at it.
+    """
+    ends = (video, frame_hash_path(video), metadata_path(video))
+    for path in video.parent.iterdir():
+        for final in ends:
+            begin = f".{final.name}."
+            if path.name.startswith(begin) and _PART.fullmatch(path.name, len(begin)):
+                path.unlink(missing_ok=True)
 
 
 def _is_open(directory: Path, infix: Infix) -> bool:

@@ -8,6 +8,7 @@ standard input it is told the base name of one ended trajectory a line, and at l
     {"progress": {"videos_done": 0, "videos": 2, "frames_done": 40, "frames": 2002}}
     {"done": "<trajectory>", "name": "<video or trajectory>", "failure": null}
     {"log": [30, "..."]}                                for the simulation's log
+    {"pulse": 12.5}                                     it is at work, once all was said
 
 What libraries print goes to the standard error.
 
@@ -31,7 +32,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .child_python import take_standard_output
+from ..patience import patience_s
+from .child_python import say_stacks_when_asked, take_standard_output
 from .finishing import EpisodeFinisher
 from .pending import EpisodeKey
 from .progress import Progress
@@ -46,6 +48,7 @@ _SECONDS_OF_PATIENCE = 20.0
 _SECONDS_BETWEEN_LOOKS = 0.05
 _SECONDS_TO_LEAVE = 2.0
 _READ_SIZE = 1 << 16
+_LONGEST_BETWEEN_PULSES = 5.0
 
 
 class _Stopped(BaseException):
@@ -61,6 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     workers = None if arguments.workers == "auto" else int(arguments.workers)
     signal.signal(signal.SIGTERM, _stop)
+    say_stacks_when_asked()
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
     answers = _Answers(take_standard_output())
     logging.getLogger().addHandler(_ToSimulation(answers))
@@ -68,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         finisher = EpisodeFinisher(
             arguments.directory, workers=workers, strict=arguments.strict
         )
-        _Service(finisher, _Inbox(), answers).run()
+        _Service(finisher, _Inbox(_Pulse(answers)), answers).run()
     except _Stopped:
         return 0
     answers.flush()
@@ -149,7 +153,8 @@ class _Service:
 class _Inbox:
     """What the simulation says; read on a thread, to notice at once when it ends."""
 
-    def __init__(self) -> None:
+    def __init__(self, pulse: _Pulse) -> None:
+        self._pulse = pulse
         self._names: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._next: collections.deque[str] = collections.deque()
         self._all_said = False
@@ -189,11 +194,38 @@ class _Inbox:
             *lines, unread = (unread + block).split(b"\n")
             for said in map(bytes.decode, lines):
                 self._names.put(None if said == ALL_SAID else said)
+                if said == ALL_SAID:
+                    self._pulse.start()
         # To the main thread, wherever it waits. Should it not come out of that, it is
         # of no use any more.
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(_SECONDS_TO_LEAVE)
         os._exit(1)
+
+
+class _Pulse:
+    """Says that the main thread is at work, to a simulation that waits for it.
+
+    Whatever that thread waits for itself, it looks at again every second. Blocked for
+    good, by a disk that does not answer for example, it uses no CPU.
+    """
+
+    def __init__(self, answers: _Answers) -> None:
+        self._answers = answers
+        self._clock = time.pthread_getcpuclockid(threading.main_thread().ident or 0)
+        self._seconds = min(_LONGEST_BETWEEN_PULSES, patience_s() / 4)
+
+    def start(self) -> None:
+        threading.Thread(target=self._beat, name="mjrec-pulse", daemon=True).start()
+
+    def _beat(self) -> None:
+        before = 0.0
+        while True:
+            now = time.clock_gettime(self._clock)
+            if now > before:
+                self._answers.say_if_heard(pulse=now)
+            before = now
+            time.sleep(self._seconds)
 
 
 class _Answers:
@@ -210,10 +242,18 @@ class _Answers:
             self._unsaid += json.dumps(answer).encode() + b"\n"
             self._send()
 
+    def say_if_heard(self, **answer: Any) -> None:
+        """Say it, unless there is more to say than was taken."""
+        with self._one_at_a_time:
+            self._send()
+            if not self._unsaid:
+                self.say(**answer)
+
     def flush(self) -> None:
         """Wait until all is said."""
-        os.set_blocking(self._descriptor, True)
-        self._send()
+        with self._one_at_a_time:
+            os.set_blocking(self._descriptor, True)
+            self._send()
 
     def _send(self) -> None:
         try:

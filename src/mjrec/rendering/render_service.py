@@ -15,13 +15,20 @@ import select
 import signal
 import subprocess
 import tempfile
+import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 from ..errors import Error
-from .child_python import environment_of_child, python_command, said_in
+from ..patience import Patience, patience_s
+from .child_python import (
+    ask_for_stacks,
+    environment_of_child,
+    python_command,
+    said_in,
+)
 from .cpu_slots import check_workers
 from .progress import Progress
 
@@ -35,8 +42,12 @@ ALL_SAID = "that was all"
 _MODULE = "mjrec.rendering.render_server"
 _READ_SIZE = 1 << 16
 _SECONDS_TO_STOP = 3.0
-_SECONDS_TO_LISTEN = 1.0
 _END_OF_STDERR = 1500
+# What the server waits for itself, it gives up after one patience.
+_PATIENCES = 3
+_LOOKS_FOR_STACKS = 20
+_SECONDS_BETWEEN_LOOKS = 0.1
+_MOST_OF_STACKS = 20_000
 
 # A forked child shares the pipes, which would then never end for the server.
 _services: weakref.WeakSet[RenderService] = weakref.WeakSet()
@@ -45,9 +56,10 @@ _services: weakref.WeakSet[RenderService] = weakref.WeakSet()
 class RenderService:
     """Turns ended trajectories into finished ones and into videos, beside the caller.
 
-    The first trajectory starts the process that does it; one that dies is not started
-    again, and what it did not do is left pending. The service belongs to the process
-    that made it.
+    The first trajectory starts the process that does it. Where that dies, another one
+    goes on with what is left; what that one does not do either is left pending. One
+    that hangs while it is waited for is ended and has died. The service belongs to the
+    process that made it.
 
     Args:
         directory: the monitor directory.
@@ -77,6 +89,8 @@ class RenderService:
         self._late: list[str] = []
         self._progress = Progress()
         self._stopped = False
+        # How the first one went, and how the last.
+        self._first_death: str | None = None
         self._death: str | None = None
         self.failures: dict[str, str] = {}
         _services.add(self)
@@ -117,13 +131,11 @@ class RenderService:
             return
         while (server := self._server) is not None:
             server.say_all_said()
-            while not server.has_ended():
-                on_progress(self._progress)
-                server.wait_for_news(_SECONDS_TO_LISTEN)
-                self._listen(server)
+            self._wait_for_end(server, on_progress)
             on_progress(self._progress)
             server.stop()
-            self._server = None
+            if self._server is server:
+                self._server = None
             while self._late and self._death is None:
                 self._say(self._late.pop(0))
         if self._waiting:
@@ -133,6 +145,9 @@ class RenderService:
         """Stop at once; what is not done stays pending. Idempotent."""
         self._stopped = True
         if self._server is not None and not self._was_forked():
+            # What it has told of failures belongs into the manifest.
+            for message in self._server.messages():
+                self._take(message)
             self._server.stop()
             self._server = None
 
@@ -156,11 +171,52 @@ class RenderService:
     def _was_forked(self) -> bool:
         return os.getpid() != self._process_id
 
-    def _listen(self, server: _Server) -> None:
-        for message in server.messages():
+    def _wait_for_end(
+        self, server: _Server, on_progress: Callable[[Progress], object]
+    ) -> None:
+        patience = Patience(_PATIENCES * patience_s())
+        while not server.has_ended():
+            on_progress(self._progress)
+            server.wait_for_news(patience.begin_slice())
+            patience.end_slice()
+            if self._listen(server):
+                patience.renew()
+            elif patience.is_over:
+                logger.error(
+                    "The process that renders the videos of %s has given no sign of "
+                    "life for %g seconds, and is ended. What its threads were at:\n%s",
+                    self._directory,
+                    patience.seconds,
+                    server.stacks(),
+                )
+                server.end_hanging(patience.seconds)
+
+    def _listen(self, server: _Server) -> bool:
+        """Take what was said; return whether it was anything."""
+        messages = list(server.messages())
+        for message in messages:
             self._take(message)
         if server.has_ended() and len(self._waiting) > len(self._late):
-            self._note_death(server.obituary())
+            self._go_on_without(server)
+        return bool(messages)
+
+    def _go_on_without(self, server: _Server) -> None:
+        """Let another one do what is left, once."""
+        how = server.obituary()
+        if self._first_death is not None:
+            self._note_death(how)
+            return
+        self._first_death = how
+        logger.warning(
+            "The process that renders the videos of %s is gone, and another one goes "
+            "on: %s",
+            self._directory,
+            how,
+        )
+        server.forget()
+        self._server = None
+        for name in [name for name in self._waiting if name not in self._late]:
+            self._say(name)
 
     def _take(self, message: Mapping[str, Any]) -> None:
         if "progress" in message:
@@ -183,10 +239,8 @@ class RenderService:
             )
 
     def _fail_rest(self) -> None:
-        first, *others = self._waiting
-        self.failures[first] = f"the process that renders is gone: {self._death}"
-        for name in others:
-            self.failures[name] = "likewise"
+        reason = f"the process that renders is gone: {self._death}"
+        self.failures.update(dict.fromkeys(self._waiting, reason))
         self._waiting.clear()
 
     def _forget_server(self) -> None:
@@ -210,6 +264,7 @@ class _Server:
         self._unsaid = b""
         self._unread = b""
         self._ended = False
+        self._hung_for: float | None = None
         self.all_said = False
         try:
             self._process = _start(arguments, self._stderr)
@@ -256,6 +311,36 @@ class _Server:
         poll.poll(seconds * 1000)
         self._send()
 
+    def stacks(self) -> str:
+        """Return what the threads of one that hangs are at, for the log."""
+        if self._stderr is None:
+            return "(nobody could hear it)"
+        before = os.fstat(self._stderr.fileno()).st_size
+        ask_for_stacks(self._process.pid)
+        after = before
+        for _ in range(_LOOKS_FOR_STACKS):
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
+            size = os.fstat(self._stderr.fileno()).st_size
+            if size == after > before:
+                break
+            after = size
+        said = os.pread(self._stderr.fileno(), _MOST_OF_STACKS, before)
+        return said.decode(errors="replace").strip() or "(it does not say)"
+
+    def end_hanging(self, seconds: float) -> None:
+        """End it, and say in the obituary that it hung for so long."""
+        self._hung_for = seconds
+        self.kill()
+
+    def kill(self) -> None:
+        """End it at once, with its children, who may hang as well."""
+        if self._process.poll() is None:
+            # Stopped, it starts no other and waits for none: their numbers stay theirs.
+            self._process.send_signal(signal.SIGSTOP)
+            for pid in [*_children(self._process.pid), self._process.pid]:
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.kill(pid, signal.SIGKILL)
+
     def has_ended(self) -> bool:
         """Whether nothing more will come from it."""
         return self._ended
@@ -264,7 +349,11 @@ class _Server:
         """Return how it ended, and its last words."""
         self._end()
         status = self._process.returncode
-        if status < 0:
+        if self._hung_for is not None:
+            how = f"it hung for {self._hung_for:g} seconds and was ended."
+        elif status is None:
+            how = "it cannot be ended."
+        elif status < 0:
             how = f"it was killed ({signal.Signals(-status).name})."
         else:
             how = f"its exit status is {status}."
@@ -302,16 +391,19 @@ class _Server:
         try:
             self._process.wait(_SECONDS_TO_STOP)
         except subprocess.TimeoutExpired:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.wait()
+            self.kill()
+            # One whose disk does not answer cannot die.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_SECONDS_TO_STOP)
 
     def _last_words(self) -> str:
         if self._stderr is None:
             return ""
-        size = self._stderr.seek(0, os.SEEK_END)
-        self._stderr.seek(max(0, size - _END_OF_STDERR))
-        return self._stderr.read().decode(errors="replace").strip()
+        descriptor = self._stderr.fileno()
+        begin = max(0, os.fstat(descriptor).st_size - _END_OF_STDERR)
+        # Not by seeking: the position is the server's too.
+        said = os.pread(descriptor, _END_OF_STDERR, begin)
+        return said.decode(errors="replace").strip()
 
 
 def _arguments(directory: Path, workers: int | None, strict: bool) -> list[str]:
@@ -332,6 +424,14 @@ def _start(
         # Ctrl-C in a terminal is the simulation's to handle.
         start_new_session=True,
     )
+
+
+def _children(pid: int) -> list[int]:
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            found += map(int, task.read_text().split())
+    return found
 
 
 def _scratch_file() -> IO[bytes] | None:

@@ -13,6 +13,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ..errors import DirectoryNotWritable, UnreadableFile
@@ -28,6 +29,7 @@ from ..formats.monitor_directory import (
     manifest_lock_name,
     manifest_name,
 )
+from ..formats.pending_videos import with_reason
 from ..formats.video_metadata import is_broken, is_done, metadata_path
 
 __all__ = ["reconcile", "update_manifest"]
@@ -53,10 +55,21 @@ def reconcile(directory: Path) -> None:
         raise damaged
 
 
-def update_manifest(directory: Path, infix: Infix) -> None:
+def update_manifest(
+    directory: Path,
+    infix: Infix,
+    *,
+    reasons: Mapping[str, str] = MappingProxyType({}),
+) -> None:
     """Move what is there from the pending to the finished videos of a manifest.
 
     Nothing happens while the monitor is open, or where it left no manifest.
+
+    Args:
+        directory: the monitor directory.
+        infix: the monitor's.
+        reasons: why videos are still pending, by their base names: what became of the
+            latest try.
 
     Raises:
         UnreadableFile: the manifest is damaged.
@@ -64,7 +77,7 @@ def update_manifest(directory: Path, infix: Infix) -> None:
         FileNotWritten: the disk is full; the manifest stays as it was.
     """
     path = directory / manifest_name(infix)
-    if not _has_news(path, infix):
+    if not _has_news(path, infix, reasons):
         return
     try:
         lock = wait_for_lock(directory / manifest_lock_name(infix), f"{os.getpid()}\n")
@@ -72,20 +85,22 @@ def update_manifest(directory: Path, infix: Infix) -> None:
         raise DirectoryNotWritable(directory, error.strerror) from error
     try:
         # Once more, because another process may have done it meanwhile.
-        if _has_news(path, infix):
-            write_manifest(path, _updated(read_manifest(path), directory))
+        if _has_news(path, infix, reasons):
+            write_manifest(path, _updated(read_manifest(path), directory, reasons))
     finally:
         lock.release()
 
 
-def _has_news(path: Path, infix: Infix) -> bool:
+def _has_news(path: Path, infix: Infix, reasons: Mapping[str, str]) -> bool:
     if not path.exists() or is_locked(path.with_name(lock_name(infix))):
         return False
     manifest = read_manifest(path)
-    return _updated(manifest, path.parent) != manifest
+    return _updated(manifest, path.parent, reasons) != manifest
 
 
-def _updated(manifest: Manifest, directory: Path) -> Manifest:
+def _updated(
+    manifest: Manifest, directory: Path, reasons: Mapping[str, str]
+) -> Manifest:
     if manifest.mjrec is None:
         return manifest
     pending = manifest.mjrec.get("pending") or []
@@ -94,13 +109,15 @@ def _updated(manifest: Manifest, directory: Path) -> Manifest:
     videos = list(manifest.videos)
     for entry in pending:
         video = _video_of(entry, directory)
-        if video is None or not is_done(video):
+        if video is None:
             waiting.append(entry)
+        elif not is_done(video):
+            waiting.append(with_reason(entry, reasons))
         elif is_broken(metadata_path(video)):
             broken.append(metadata_path(video).name)
         else:
             videos.append((video.name, metadata_path(video).name))
-    if len(waiting) == len(pending):
+    if waiting == list(pending):
         return manifest
     return replace(
         manifest,
