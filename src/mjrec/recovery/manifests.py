@@ -204,11 +204,7 @@ def _manifest(
             finished.append(names)
     first = known.first_episode_id or 0
     pending = [
-        {
-            "episode_id": episode_id,
-            "trajectory": trajectory_prefix(remains.infix, episode_id),
-            "video": f"{video_prefix(remains.infix, episode_id)}.mp4",
-        }
+        _pending(remains, episode_id, old_details)
         for episode_id in sorted(files.trajectories)
         if _is_pending(remains, known, episode_id)
     ]
@@ -240,6 +236,23 @@ def _names_of_video(remains: Remains, episode_id: int) -> tuple[str, str] | None
         if (remains.directory / f"{prefix}{extension}").exists():
             return f"{prefix}{extension}", metadata
     return f"{prefix}.mp4", metadata
+
+
+def _pending(
+    remains: Remains, episode_id: int, old_details: Mapping[str, Any]
+) -> Mapping[str, Any]:
+    """Return how a manifest names a pending video; as it did, if it did."""
+    entry = {
+        "episode_id": episode_id,
+        "trajectory": trajectory_prefix(remains.infix, episode_id),
+        "video": f"{video_prefix(remains.infix, episode_id)}.mp4",
+    }
+    listed = old_details.get("pending")
+    for old in listed if isinstance(listed, list) else ():
+        # It may say more, of a try that has failed.
+        if isinstance(old, Mapping) and entry.items() <= old.items():
+            return old
+    return entry
 
 
 def _is_pending(remains: Remains, known: KnownEpisodes, episode_id: int) -> bool:
