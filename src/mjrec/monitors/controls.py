@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex
+from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVar
 
 from ..environments.scenes import Scenes
 from ..errors import NotPicklable, RenderError
@@ -29,6 +28,8 @@ from .waiting import waiting_display
 __all__ = ["MonitorControls"]
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 class MonitorControls:
@@ -151,13 +152,15 @@ class MonitorControls:
             "lambda: mjrec.Monitor(gymnasium.make(...), directory, resume=True)."
         )
 
-    @contextlib.contextmanager
-    def _noting_errors(self) -> Iterator[None]:
-        """Mark the running episode with what is raised inside."""
+    def _reset_by(self, reset: Callable[[], T]) -> T:
+        """Return what the environment's reset returns; note it where it raises."""
+        recorder = self._recorder
+        recorder.before_reset()
         try:
-            yield
+            with recorder.resetting():
+                return reset()
         except BaseException as error:
-            self._recorder.note_error(error)
+            recorder.note_error(error)
             raise
 
     def _raise_failures(self) -> None:

@@ -80,9 +80,7 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         if self._recorder.closed:
             return self.env.reset(seed=seed, options=options)
-        self._recorder.before_reset()
-        with self._noting_errors(), self._recorder.resetting():
-            result = self.env.reset(seed=seed, options=options)
+        result = self._reset_by(lambda: self.env.reset(seed=seed, options=options))
         self._begin(seed=seed, options=options, observation=result[0])
         return result
 
@@ -122,9 +120,7 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
     def _reset_by_step(
         self, action: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        self._recorder.before_reset()
-        with self._noting_errors(), self._recorder.resetting():
-            result = self.env.step(action)
+        result = self._reset_by(lambda: self.env.step(action))
         self._begin(observation=result[0])
         return result
 
