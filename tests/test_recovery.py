@@ -293,6 +293,31 @@ def test_a_live_video_without_a_frame_is_no_broken_one(
     assert_in_order(directory)
 
 
+def test_a_text_recording_that_was_cut_off_is_finished(
+    killed: Callable[[str], Path],
+) -> None:
+    """It holds every frame, and what a whole one says of them."""
+    directory = killed(
+        "env = mjrec.Monitor(Corridor(12, 'ansi'), sys.argv[1], lambda _: True,\n"
+        "                    env_id='Corridor-v0')\n"
+        "run(env)\nrun(env, 7)\ndie()"
+    )
+    recovery = mjrec.recover(directory)
+    whole, cut = (
+        json.loads(path.read_text())
+        for path in sorted(directory.glob("*.video00000?.json"))
+    )
+    assert cut["stdout"] == whole["stdout"][:8]
+    assert set(cut) == set(whole)
+    metadata, other = metadata_of(directory, 1), metadata_of(directory, 0)
+    assert (metadata["complete"], metadata["reason"]) == (False, "killed")
+    assert (metadata["fps"], metadata["frame_steps"]) == ("10", [[0, 7]])
+    assert metadata["content_type"] == other["content_type"]
+    assert len(manifest_of(directory)["videos"]) == 2
+    assert "8 frames, incomplete: killed" in str(recovery)
+    assert_in_order(directory)
+
+
 def test_an_encoder_that_was_killed_too_is_told(killed: Callable[[str], Path]) -> None:
     """The video is not there, its metadata says why, and what there is is kept."""
     directory = killed(

@@ -18,8 +18,11 @@ from typing import IO
 
 from .. import atomic_files
 from ..errors import ClosedError, DirectoryNotWritable, InvalidFrame
+from ..json_text import loads
+from ..rates import rate_from_timestep
+from .json_fields import unreadable
 
-__all__ = ["AsciicastWriter", "text_of_frame"]
+__all__ = ["AsciicastWriter", "text_of_frame", "unfinished_recording"]
 
 _CLEAR_AND_HOME = "\x1b[2J\x1b[1;1H"
 # Control sequences (colours, cursor) take no room on the screen. ECMA-48, 5.4.
@@ -77,8 +80,10 @@ class AsciicastWriter:
         self._width = max(self._width, *(_columns(line) for line in lines))
         self._height = max(self._height, len(lines))
         event = [self._delay, _CLEAR_AND_HOME + "\r\n".join(lines)]
-        separator = ", " if self.frame_count else ""
+        separator = ",\n" if self.frame_count else ""
         self._body.write(separator + json.dumps(event))
+        # A killed process leaves what is with the operating system.
+        self._body.flush()
         self.frame_count += 1
 
     def close(self) -> None:
@@ -125,6 +130,37 @@ class AsciicastWriter:
             whole.write(json.dumps(header)[:-1] + ', "stdout": [')
             shutil.copyfileobj(body, whole)
             whole.write("]}\n")
+
+
+def unfinished_recording(path: Path) -> tuple[Fraction, list[str]]:
+    """Return the rate and the text frames of a recording that was cut off.
+
+    Args:
+        path: the hidden file that a killed process has left. What was torn at its end
+            is left out.
+
+    Raises:
+        UnreadableFile: it is no such file, or holds no frame.
+    """
+    with unreadable(path):
+        if not path.is_file() or path.is_symlink():
+            raise ValueError("it is not a regular file")
+        frames: list[str] = []
+        delay = 0.0
+        with path.open(encoding="utf-8", errors="replace") as body:
+            for line in body:
+                try:
+                    delay, text = loads(line.rstrip().removesuffix(","))
+                    frames.append(_frame_of(text))
+                except (AttributeError, TypeError, RecursionError, ValueError):
+                    break
+        if not frames or not isinstance(delay, float | int) or not 0 < delay < 1e6:
+            raise ValueError("it holds no text frame")
+        return rate_from_timestep(delay), frames
+
+
+def _frame_of(printed: str) -> str:
+    return printed.removeprefix(_CLEAR_AND_HOME).replace("\r\n", "\n")
 
 
 def _columns(line: str) -> int:

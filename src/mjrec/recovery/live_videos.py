@@ -15,14 +15,13 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from .. import json_text
-from ..atomic_files import write_text
 from ..errors import EncoderError, Error, MissingDependency, UnreadableFile
 from ..formats.ffmpeg import ffmpeg_executable, ffmpeg_sha256, ffmpeg_version
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import episode_of
 from ..formats.unfinished_video import UnfinishedVideo, VideoFile, VideoNote, read_note
 from ..formats.video_metadata import StepRuns, file_facts, metadata_path, timing_facts
+from .cut_off import how_it_ended, sums_of, write_metadata
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
 
@@ -63,7 +62,7 @@ def finish_video(
         return None
     if not _holds_pictures(video):
         # It was killed before its encoder had been given a frame.
-        _write_metadata(video.path, _metadata_without_video(note, known))
+        write_metadata(video.path, _metadata_without_video(note, known))
         _forget(note_file, video)
         return RecoveredFile(metadata_path(video.path).name, "there was no frame yet")
     try:
@@ -75,7 +74,7 @@ def finish_video(
     video.rename(file, cut=True)
     file = dataclasses.replace(file, encoder=_encoder(note))
     metadata = _metadata(note, file, known)
-    _write_metadata(video.path, metadata)
+    write_metadata(video.path, metadata)
     _forget(note_file, video)
     frames = f"{file.frame_count} {'frame' if file.frame_count == 1 else 'frames'}"
     ending = "" if metadata["complete"] else f", incomplete: {metadata['reason']}"
@@ -139,7 +138,7 @@ def _give_up(
         f"file: {why}"
     )
     failure = {"broken": True, "broken_reason": reason}
-    _write_metadata(video.path, {**_metadata_without_video(note, known), **failure})
+    write_metadata(video.path, {**_metadata_without_video(note, known), **failure})
     if note.video.hashes is not None:
         note.video.hashes.unlink(missing_ok=True)
     return RecoveredFile(
@@ -149,11 +148,11 @@ def _give_up(
 
 def _metadata_without_video(note: VideoNote, known: KnownEpisodes) -> Mapping[str, Any]:
     number = episode_of(note.video.path.name)
-    ending = _how_it_ended(number, known) or {"complete": False, "reason": "killed"}
+    ending = how_it_ended(number, known) or {"complete": False, "reason": "killed"}
     return {
         **note.metadata,
         **ending,
-        **_sums(number, known),
+        **sums_of(number, known),
         "empty": True,
         "recovered": True,
     }
@@ -164,8 +163,8 @@ def _metadata(
 ) -> Mapping[str, Any]:
     number = episode_of(note.video.path.name)
     timestep, stride = note.timing["timestep"], note.timing["stride"]
-    sums = _sums(number, known)
-    ending = _how_it_ended(number, known)
+    sums = sums_of(number, known)
+    ending = how_it_ended(number, known)
     length: Any = sums.get("length")
     steps: Iterable[int]
     if ending is not None and _is_whole(note, file, length):
@@ -202,41 +201,6 @@ def _is_whole(note: VideoNote, file: VideoFile, length: Any) -> bool:
     return file.frame_count == len(range(0, length, note.timing["stride"])) + 1
 
 
-def _how_it_ended(
-    episode_id: int | None, known: KnownEpisodes
-) -> dict[str, Any] | None:
-    """Return what is known of an episode's end; None where it was cut off."""
-    facts = _facts(episode_id, known)
-    if "complete" in facts and facts.get("reason") != "killed":
-        keys = ("complete", "terminated", "truncated", "reason", "exception")
-        return {key: facts[key] for key in keys if key in facts}
-    entry = None if episode_id is None else known.entry(episode_id)
-    if entry is None:
-        return None
-    return {
-        "complete": True,
-        "terminated": entry.terminated,
-        "truncated": entry.truncated,
-    }
-
-
-def _sums(episode_id: int | None, known: KnownEpisodes) -> dict[str, Any]:
-    """Return length and reward of the episode, as far as they are known."""
-    entry = None if episode_id is None else known.entry(episode_id)
-    if entry is not None:
-        return {"length": entry.length, "reward": entry.reward}
-    facts = _facts(episode_id, known)
-    return {key: facts[key] for key in ("length", "reward") if key in facts}
-
-
-def _facts(episode_id: int | None, known: KnownEpisodes) -> Mapping[str, Any]:
-    try:
-        return {} if episode_id is None else known.facts(episode_id)
-    except UnreadableFile:
-        # Its trajectory is damaged, which is told elsewhere.
-        return {}
-
-
 def _encoder(note: VideoNote) -> dict[str, Any]:
     encoder = dict(note.video.encoder)
     is_same = (
@@ -245,7 +209,3 @@ def _encoder(note: VideoNote) -> dict[str, Any]:
     )
     encoder["sha256"] = ffmpeg_sha256() if is_same else None
     return encoder
-
-
-def _write_metadata(video: Path, metadata: Mapping[str, Any]) -> None:
-    write_text(metadata_path(video), json_text.dumps(metadata))

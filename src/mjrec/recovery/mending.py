@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..errors import Error
+from ..errors import Error, UnreadableFile
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import Infix
 from ..rendering.pending import EpisodeKey, claim
@@ -25,6 +25,7 @@ from .live_videos import finish_video
 from .manifests import write_results
 from .remains import Remains, look_through, model_leftovers
 from .report import RecoveredFile
+from .text_recordings import finish_text
 from .unfinished_logs import finish_log_of_dead
 
 __all__ = ["Mending"]
@@ -87,6 +88,10 @@ class Mending:
         for note in remains.notes:
             with self._noting_failure(_video_of(note)):
                 self._note(finish_video(note, known, is_over=self._is_over))
+        for text in remains.texts:
+            # Where there is no whole frame, it is swept up.
+            with contextlib.suppress(UnreadableFile):
+                self._note(finish_text(text, remains.infix, known))
         self._sweep(look_through(self._directory, remains.infix))
         for file in write_results(self._directory, remains.infix, known):
             self._note(file)

@@ -81,6 +81,18 @@ class Remains:
         ]
 
     @property
+    def texts(self) -> list[Path]:
+        """The unfinished text recordings, in which there may be frames."""
+        return [
+            path
+            for path in self.paths
+            if (match := _VIDEO_PART.fullmatch(path.name))
+            and match["kind"] == "json"
+            and self.is_own_video(path)
+            and _begins_with_frame(path)
+        ]
+
+    @property
     def leftovers(self) -> list[Path]:
         """Unfinished files that will never be finished."""
         kept = {path.name for path in self.paths if path.name.endswith(".note.part")}
@@ -168,6 +180,12 @@ def has_work(remains: Remains) -> bool:
         return files.journal is not None and MonitorResults(files).is_behind
     except UnreadableFile:
         return True
+
+
+def _begins_with_frame(part: Path) -> bool:
+    """Tell whether a file is the frames of a text recording, not the whole of one."""
+    with part.open("rb") as file:
+        return file.read(1) == b"["
 
 
 def _is_given_up(note: Path) -> bool:

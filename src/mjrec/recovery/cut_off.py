@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the metadata of a recording that was cut off says of its episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .. import json_text
+from ..atomic_files import write_text
+from ..errors import UnreadableFile
+from ..formats.video_metadata import metadata_path
+from .known_episodes import KnownEpisodes
+
+__all__ = ["facts_of", "how_it_ended", "sums_of", "write_metadata"]
+
+
+def how_it_ended(episode_id: int | None, known: KnownEpisodes) -> dict[str, Any] | None:
+    """Return what is known of an episode's end; None where it was cut off."""
+    facts = facts_of(episode_id, known)
+    if "complete" in facts and facts.get("reason") != "killed":
+        keys = ("complete", "terminated", "truncated", "reason", "exception")
+        return {key: facts[key] for key in keys if key in facts}
+    entry = None if episode_id is None else known.entry(episode_id)
+    if entry is None:
+        return None
+    return {
+        "complete": True,
+        "terminated": entry.terminated,
+        "truncated": entry.truncated,
+    }
+
+
+def sums_of(episode_id: int | None, known: KnownEpisodes) -> dict[str, Any]:
+    """Return length and reward of the episode, as far as they are known."""
+    entry = None if episode_id is None else known.entry(episode_id)
+    if entry is not None:
+        return {"length": entry.length, "reward": entry.reward}
+    facts = facts_of(episode_id, known)
+    return {key: facts[key] for key in ("length", "reward") if key in facts}
+
+
+def facts_of(episode_id: int | None, known: KnownEpisodes) -> Mapping[str, Any]:
+    """Return what the episode's trajectory says; nothing where it cannot be read."""
+    try:
+        return {} if episode_id is None else known.facts(episode_id)
+    except UnreadableFile:
+        # Its trajectory is damaged, which is told elsewhere.
+        return {}
+
+
+def write_metadata(video: Path, metadata: Mapping[str, Any]) -> None:
+    """Write the metadata file of a video."""
+    write_text(metadata_path(video), json_text.dumps(metadata))
