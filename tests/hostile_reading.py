@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading files that may crash, hang or eat up whoever reads them.
+
+`Inspector` starts one process, which forks for every file: what a reader does to its
+process, whatever that is, is an outcome. The forks have a gigabyte of memory.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+MEMORY = 1 << 30
+SECONDS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What came of reading a file.
+
+    Attributes:
+        kind: `value`, `refused` (an error of ours), `failed` (another one) or `died`.
+        said: the error's message, or that of another one with where it came from.
+        names: the path in the error.
+        seconds: how long it took.
+    """
+
+    kind: str
+    said: str
+    names: str | None
+    seconds: float
+
+
+class Inspector:
+    """A process that reads files when it is told to."""
+
+    def __enter__(self) -> Self:
+        self._process = subprocess.Popen(
+            [sys.executable, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            text=True,
+        )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._process.communicate()
+
+    def read(self, reader: str, path: Path) -> Outcome:
+        """Return what comes of reading `path` with one of `READERS`."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(f"{json.dumps([reader, str(path)])}\n")
+        self._process.stdin.flush()
+        return Outcome(**json.loads(self._process.stdout.readline()))
+
+    def refuses(self, reader: str, path: Path) -> str:
+        """Check that reading `path` is one error of ours, soon; return its reason."""
+        outcome = self.read(reader, path)
+        assert outcome.kind == "refused", outcome
+        assert outcome.names == str(path), outcome
+        assert outcome.seconds < SECONDS / 2, outcome
+        assert len(outcome.said) < 2000 + len(str(path)), outcome.said[:4000]
+        return outcome.said
+
+
+def _trajectory(path: Path) -> None:
+    from mjrec.formats.trajectory_file import open_trajectory
+
+    with open_trajectory(path) as reader:
+        reader.content()
+
+
+def _arrays(path: Path) -> None:
+    from mjrec import load_trajectory
+
+    for values in vars(load_trajectory(path)).values():
+        str(values)
+
+
+def _rendering(path: Path) -> None:
+    from mjrec.rendering.recorded_facts import open_for_rendering
+
+    open_for_rendering(path).close()
+
+
+def _finish(path: Path) -> None:
+    from mjrec.formats.trajectory_file import finish_trajectory
+
+    finish_trajectory(path)
+
+
+def _manifest(path: Path) -> None:
+    from mjrec.formats.manifest import read_manifest
+
+    read_manifest(path)
+
+
+def _stats(path: Path) -> None:
+    from mjrec.formats.stats_file import read_stats_file
+
+    read_stats_file(path)
+
+
+def _journal(path: Path) -> None:
+    from mjrec.formats.journal import read_journal
+
+    for _ in read_journal(path):
+        pass
+
+
+def _metadata(path: Path) -> None:
+    from mjrec.formats.json_fields import read_object, unreadable
+    from mjrec.formats.video_metadata import is_broken
+
+    is_broken(path)
+    with unreadable(path):
+        read_object(path)
+
+
+def _model(path: Path) -> None:
+    """Read the model of these files that `facts.json` beside them is about."""
+    from mjrec.simulation.model_store import load_model
+
+    load_model(path.parent, json.loads((path.parent / "facts.json").read_text()))
+
+
+def _mjcf(path: Path) -> None:
+    from mjrec.simulation.mjcf import load_mjcf
+
+    load_mjcf(path)
+
+
+def _archive(path: Path) -> None:
+    from mjrec import ArchiveError, UnreadableFile, write_archive
+
+    try:
+        write_archive([(path, path.with_suffix(".meta.json"))], io.BytesIO())
+    except ArchiveError as error:
+        raise UnreadableFile(path, error) from error
+
+
+READERS: dict[str, Callable[[Path], None]] = {
+    "manifest": _manifest,
+    "stats": _stats,
+    "journal": _journal,
+    "metadata": _metadata,
+    "trajectory": _trajectory,
+    "arrays": _arrays,
+    "rendering": _rendering,
+    "finish": _finish,
+    "model": _model,
+    "mjcf": _mjcf,
+    "archive": _archive,
+}
+
+
+def _outcome(reader: str, path: Path) -> dict[str, Any]:
+    from mjrec import Error
+
+    try:
+        READERS[reader](path)
+    except Error as error:
+        names = getattr(error, "path", None)
+        return {"kind": "refused", "said": str(error), "names": names and str(names)}
+    except BaseException:
+        return {"kind": "failed", "said": traceback.format_exc()[-3000:], "names": None}
+    return {"kind": "value", "said": "", "names": None}
+
+
+def _forked(reader: str, path: Path) -> dict[str, Any]:
+    beginning = time.monotonic()
+    incoming, outgoing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.dup2(os.open(os.devnull, os.O_RDWR), 1)
+        signal.alarm(SECONDS)
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        _, most = resource.getrlimit(resource.RLIMIT_AS)
+        room = pages * resource.getpagesize() + MEMORY
+        resource.setrlimit(resource.RLIMIT_AS, (room, most))
+        os.write(outgoing, json.dumps(_outcome(reader, path)).encode())
+        os._exit(0)
+    os.close(outgoing)
+    with os.fdopen(incoming, "rb") as said:
+        text = said.read()
+    _, status = os.waitpid(child, 0)
+    died = {"kind": "died", "said": f"status {status}", "names": None}
+    outcome = json.loads(text) if text else died
+    return {**outcome, "seconds": time.monotonic() - beginning}
+
+
+def main() -> None:
+    """Read what is asked for, until nothing more is."""
+    import h5py  # noqa: F401  once, not in every fork
+    import mujoco  # noqa: F401
+
+    import mjrec.rendering.recorded_facts
+    import mjrec.simulation.model_store  # noqa: F401
+
+    for line in sys.stdin:
+        reader, path = json.loads(line)
+        sys.stdout.write(f"{json.dumps(_forked(reader, Path(path)))}\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

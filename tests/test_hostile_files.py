@@ -1,0 +1,813 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of somebody who means harm: one error, soon, and nothing else is touched."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import hashlib
+import json
+import os
+import re
+import socket
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import mujoco
+import numpy as np
+import pytest
+from hostile_reading import Inspector
+from trajectories_by_hand import write_log
+
+from mjrec import UnreadableFile, load_trajectory
+from mjrec.formats.journal import JournalEntry, JournalWriter
+from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
+from mjrec.formats.monitor_directory import Infix, episode_of, infix_of
+from mjrec.formats.stats_file import StatsFile, write_stats_file
+from mjrec.formats.trajectory import Array, ModelChange, TrajectoryHeader
+from mjrec.formats.trajectory_file import finish_trajectory
+from mjrec.formats.trajectory_log import TrajectoryLogWriter
+from mjrec.json_text import dumps, loads
+from mjrec.rendering.rendered_manifests import reconcile
+from mjrec.simulation.authored_model import authored_from_file
+from mjrec.simulation.model_store import ModelStore
+from mjrec.simulation.source_compiler import compile_within
+
+SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
+
+
+@pytest.fixture(scope="module")
+def inspector() -> Iterator[Inspector]:
+    with Inspector() as one:
+        yield one
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    path = tmp_path / "theirs"
+    path.mkdir()
+    return path
+
+
+# --- sound files, one of each kind ---------------------------------------------------
+
+
+def manifest(directory: Path) -> Path:
+    path = directory / "openaigym.manifest.0.7.manifest.json"
+    write_manifest(path, Manifest("openaigym.s.stats.json", (), {"env_id": "A-v0"}))
+    return path
+
+
+def stats(directory: Path) -> Path:
+    path = directory / "openaigym.episode_batch.0.7.stats.json"
+    write_stats_file(path, StatsFile(1.0, (2.0,), (3,), (4.0,), ("t",)))
+    return path
+
+
+def journal(directory: Path) -> Path:
+    path = directory / "openaigym.episodes.0.7.jsonl"
+    writer = JournalWriter(path)
+    writer.append(JournalEntry(0, 3, 4.0, "t", 1.0, 2.0, 7, None, True, False))
+    writer.close()
+    return path
+
+
+def metadata(directory: Path) -> Path:
+    path = directory / "openaigym.video.0.7.video000000.meta.json"
+    path.write_text('{"broken": false}')
+    return path
+
+
+def finished(directory: Path) -> Path:
+    return finish_trajectory(write_log(directory))
+
+
+def _stored(directory: Path, xml: str = SPHERE) -> dict[str, Any]:
+    source = directory.parent / "main.xml"
+    source.write_text(xml)
+    store = ModelStore(directory)
+    facts = store.add(
+        mujoco.MjModel.from_xml_path(str(source)), authored_from_file(source)
+    )
+    store.finish()
+    return facts
+
+
+def compiled(directory: Path) -> Path:
+    facts = {**_stored(directory), "xml": None}
+    (directory / "facts.json").write_text(json.dumps(facts))
+    return directory / facts["mjb"]
+
+
+def source(directory: Path) -> Path:
+    facts = {**_stored(directory), "mujoco": "3.1.4", "mjb": None}
+    (directory / "facts.json").write_text(json.dumps(facts))
+    return directory / facts["xml"]
+
+
+def mjcf(directory: Path) -> Path:
+    path = directory / "sphere.xml"
+    path.write_text(SPHERE)
+    return path
+
+
+def video(directory: Path) -> Path:
+    path = directory / "openaigym.video.0.7.video000000.mp4"
+    path.write_bytes(b"frames")
+    metadata(directory)
+    return path
+
+
+FILES: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "manifest": ("manifest", manifest),
+    "stats": ("stats", stats),
+    "journal": ("journal", journal),
+    "metadata": ("metadata", metadata),
+    "log": ("trajectory", write_log),
+    "log to be finished": ("finish", write_log),
+    "log to be rendered": ("rendering", write_log),
+    "h5": ("trajectory", finished),
+    "arrays of an h5": ("arrays", finished),
+    "mjb.gz": ("model", compiled),
+    "zip": ("model", source),
+    "mjcf": ("mjcf", mjcf),
+    "video for an archive": ("archive", video),
+}
+
+kinds = pytest.mark.parametrize("kind", FILES)
+
+
+@kinds
+def test_a_sound_file_is_read(inspector: Inspector, directory: Path, kind: str) -> None:
+    """So that what is refused below is refused for its harm."""
+    reader, write = FILES[kind]
+    outcome = inspector.read(reader, write(directory))
+    assert outcome.kind == "value", outcome
+
+
+# --- what is no file at all ----------------------------------------------------------
+
+
+def pipe(path: Path, _: Path) -> None:
+    os.mkfifo(path)
+
+
+def folder(path: Path, _: Path) -> None:
+    path.mkdir()
+
+
+def link_to_itself(path: Path, _: Path) -> None:
+    path.symlink_to(path.name)
+
+
+def link_to_a_device(path: Path, _: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def link_elsewhere(path: Path, elsewhere: Path) -> None:
+    path.symlink_to(elsewhere)
+
+
+def link_with_dots(path: Path, elsewhere: Path) -> None:
+    path.symlink_to(Path("..") / elsewhere.parent.name / elsewhere.name)
+
+
+def listening_socket(path: Path, _: Path) -> None:
+    # By a relative name, because those of sockets are short.
+    with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(path.name)
+
+
+@kinds
+@pytest.mark.parametrize(
+    "put",
+    [
+        *(pipe, folder, link_to_itself, link_to_a_device),
+        *(link_elsewhere, link_with_dots, listening_socket),
+    ],
+)
+def test_only_regular_files_of_the_directory_are_opened(
+    inspector: Inspector,
+    directory: Path,
+    kind: str,
+    put: Callable[[Path, Path], None],
+) -> None:
+    """No pipe is waited for, no device opened, no link followed to another place."""
+    reader, write = FILES[kind]
+    path = write(directory)
+    if kind == "mjcf" and put in (link_elsewhere, link_with_dots):
+        pytest.skip("a file that the user names is the user's, links and all")
+    if kind == "arrays of an h5" and put is folder:
+        pytest.skip("a directory is an answer that lists what is in it")
+    outside = directory.with_name("ours") / path.name
+    outside.parent.mkdir()
+    path.rename(outside)
+    os.utime(outside, (0, outside.stat().st_mtime))
+    put(path, outside)
+    inspector.refuses(reader, path)
+    assert outside.stat().st_atime == 0
+    assert list(outside.parent.iterdir()) == [outside]
+
+
+def test_links_within_the_directory_are_followed(directory: Path) -> None:
+    """As are the user's own, from elsewhere, that bear no monitor file's name."""
+    path = finished(directory)
+    kept = path.rename(directory / "kept.h5")
+    path.symlink_to(kept.name)
+    latest = directory.parent / "latest.h5"
+    latest.symlink_to(path)
+    assert len(load_trajectory(path)) == len(load_trajectory(latest)) == 4
+
+
+# --- what is not what its name says --------------------------------------------------
+
+
+def nothing(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def noise(path: Path) -> None:
+    path.write_bytes(np.random.default_rng(1).bytes(5000))
+
+
+def a_hole_of_a_terabyte(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+    os.truncate(path, 1 << 40)
+
+
+def half_of_it(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+@pytest.mark.parametrize(
+    "kind", [kind for kind in FILES if kind not in ("journal", "video for an archive")]
+)
+@pytest.mark.parametrize("spoil", [nothing, noise, a_hole_of_a_terabyte, half_of_it])
+def test_other_content_is_refused(
+    inspector: Inspector, directory: Path, kind: str, spoil: Callable[[Path], None]
+) -> None:
+    """A torn log is the one thing of which the beginning is worth something."""
+    reader, write = FILES[kind]
+    path = write(directory)
+    if kind.startswith("log") and spoil in (a_hole_of_a_terabyte, half_of_it):
+        assert inspector.read(reader, path).kind == "value"
+        return
+    if kind == "mjcf" and spoil is a_hole_of_a_terabyte:
+        pytest.skip("MuJoCo reads what the user names as it likes")
+    spoil(path)
+    inspector.refuses(reader, path)
+
+
+@pytest.mark.parametrize("spoil", [nothing, noise, a_hole_of_a_terabyte, half_of_it])
+def test_a_journal_of_anything_ends(
+    inspector: Inspector, directory: Path, spoil: Callable[[Path], None]
+) -> None:
+    """Its lines stand for themselves; those that are none are left out or refused."""
+    path = journal(directory)
+    spoil(path)
+    if spoil is a_hole_of_a_terabyte:
+        os.truncate(path, 1 << 28)
+    assert inspector.read("journal", path).kind in ("value", "refused")
+
+
+# --- JSON ----------------------------------------------------------------------------
+
+BOMBS = {
+    "nested lists": b"[" * 10_000_000,
+    "nested objects": b'{"a":' * 2_000_000,
+    "nested just within the parser's own limit": b'{"a": %s}'
+    % (b"[" * 900 + b"]" * 900),
+    "a number of a million digits": b'{"a": %s}' % (b"9" * 1_000_000),
+    "a fraction of ten million digits": b'{"stats": 0.%s}' % (b"9" * 10_000_000),
+    "twenty million values": b'{"a": [%s0]}' % (b"0," * 20_000_000),
+    "a key twice": b'{"a": 1, "a": 2}',
+    "the same key in two spellings": b'{"a": 1, "\\u0061": 2}',
+    "another encoding": '{"a": 1}'.encode("utf-16"),
+    "no text": b'{"a": "\xff"}',
+    "a list": b"[]",
+    "a text": b'"{}"',
+}
+
+
+@pytest.mark.parametrize("kind", ["manifest", "stats", "metadata"])
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_json_bombs_are_refused(
+    inspector: Inspector, directory: Path, kind: str, bomb: str
+) -> None:
+    """Within a gigabyte of memory, and before anything of it is used."""
+    path = FILES[kind][1](directory)
+    path.write_bytes(BOMBS[bomb])
+    if kind == "metadata" and bomb == "a fraction of ten million digits":
+        assert inspector.read("metadata", path).kind == "value"
+        return
+    inspector.refuses(kind, path)
+
+
+@pytest.mark.parametrize("value", ["1e400", "1e30", "-9223372036854775808", "NaN"])
+def test_counts_are_numbers_that_can_be_counted(
+    inspector: Inspector, directory: Path, value: str
+) -> None:
+    """An episode's length is none of these."""
+    path = stats(directory)
+    path.write_text(path.read_text().replace("[3]", f"[{value}]"))
+    assert "episode_lengths" in inspector.refuses("stats", path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            "../x.mp4",
+            "/etc/passwd",
+            "a/b.mp4",
+            "..",
+            "a\\b",
+            "a\0b",
+            "a\nb",
+            "\x1b[2J",
+        ),
+        *("\ud800", "x" * 256, "é" * 128),
+    ],
+)
+@pytest.mark.parametrize("key", ["stats", "videos", "broken"])
+def test_names_in_a_manifest_are_base_names(
+    inspector: Inspector, directory: Path, key: str, name: str
+) -> None:
+    """Short ones, which can be printed."""
+    path = manifest(directory)
+    values = json.loads(path.read_text())
+    if key == "stats":
+        values["stats"] = name
+    elif key == "videos":
+        values["videos"] = [["a.mp4", name]]
+    else:
+        values["mjrec"] = {"broken": [name]}
+    path.write_text(json.dumps(values))
+    inspector.refuses("manifest", path)
+
+
+@pytest.mark.parametrize(
+    "details",
+    [
+        *({"pending": 5}, {"pending": [5]}, {"broken": 5}, {"broken": [None]}),
+        *({"next_episode_id": -1}, {"next_episode_id": 1.5}, {"next_episode_id": True}),
+        {"next_episode_id": 10**30},
+    ],
+)
+def test_what_others_rely_on_in_a_manifest_is_as_it_should_be(
+    inspector: Inspector, directory: Path, details: dict[str, Any]
+) -> None:
+    """Rather than an error of Python's somewhere later."""
+    path = manifest(directory)
+    path.write_text(json.dumps({**json.loads(path.read_text()), "mjrec": details}))
+    inspector.refuses("manifest", path)
+
+
+def test_a_pending_video_elsewhere_is_not_looked_at(directory: Path) -> None:
+    """Though its name begins as that of a video of the directory does."""
+    outside = directory.parent / "openaigym.video.0.7.video000000.mp4"
+    outside.write_bytes(b"")
+    metadata(directory.parent)
+    (directory / "openaigym.video.0.7").mkdir()
+    name = f"openaigym.video.0.7/../../{outside.name}"
+    assert episode_of(name) is None
+    path = manifest(directory)
+    entry = {"pending": [{"episode_id": 0, "video": name}]}
+    path.write_text(json.dumps({**json.loads(path.read_text()), "mjrec": entry}))
+    reconcile(directory)
+    assert read_manifest(path).videos == ()
+
+
+def test_names_hold_small_numbers_and_no_slash() -> None:
+    """Reading a number takes longer than its digits are many."""
+    assert episode_of(f"openaigym.video.0.7.video{'1' * 10**6}.mp4") is None
+    assert infix_of("openaigym.episodes.0.7/../x.jsonl") is None
+    assert Infix.parse("1" * 10**6 + ".7") is None
+    assert Infix.parse("0.7/../..") is None
+
+
+@pytest.mark.parametrize("depth", [1, 50, 99, 100, 101, 500, 100_000])
+def test_whatever_is_written_can_be_read(depth: int) -> None:
+    """What is nested too deeply is written as what Python shows of it."""
+    value: Any = 1
+    for _ in range(depth):
+        value = [value]
+    again = loads(dumps({"options": value}))
+    assert (again == {"options": value}) == (depth < 100)
+
+
+# --- trajectories --------------------------------------------------------------------
+
+
+def replaced(name: str, **options: Any) -> Callable[[h5py.File], None]:
+    def replace(file: h5py.File) -> None:
+        del file[name]
+        file.create_dataset(name, **options)
+
+    return replace
+
+
+def virtual(file: h5py.File) -> None:
+    """A dataset put together of files that are counted when its shape is asked for."""
+    whole = h5py.h5s.create_simple((4,), (h5py.h5s.UNLIMITED,))
+    whole.select_hyperslab((0,), (h5py.h5s.UNLIMITED,), (1,), (1,))
+    part = h5py.h5s.create_simple((1,))
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_virtual(whole, b"/etc/%b", b"x", part)
+    del file["rewards"]
+    h5py.h5d.create(file.id, b"rewards", h5py.h5t.IEEE_F64LE, whole, properties)
+
+
+def overflowing_frames(file: h5py.File) -> None:
+    steps = [2**62, 2**63 - 1, -(2**63) + 1, -(2**62), 0]
+    replaced("frame_steps", data=np.array(steps))(file)
+    replaced("snapshots", data=np.zeros(5, file["snapshots"].dtype))(file)
+
+
+def half_a_billion_steps(file: h5py.File) -> None:
+    """Zeros, which pack a thousandfold."""
+    shape = (1 << 29,)
+    space = h5py.h5s.create_simple(shape)
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_chunk((1 << 24,))
+    properties.set_deflate(9)
+    del file["rewards"]
+    dataset = h5py.h5d.create(
+        file.id, b"rewards", h5py.h5t.IEEE_F64LE, space, properties
+    )
+    packed = zlib.compress(bytes(8 << 24), 9)
+    for index in range(32):
+        dataset.write_direct_chunk((index << 24,), packed)
+
+
+def one_field_by_many_names(file: h5py.File) -> None:
+    group = file["model_changes"].create_group("0")
+    group.attrs["step"] = np.int64(0)
+    data = np.zeros(4 << 20)
+    group.create_dataset("geom_rgba", data=data, compression=9, chunks=data.shape)
+    for index in range(100):
+        group[f"n{index}"] = group["geom_rgba"]
+
+
+def one_change_by_many_names(file: h5py.File) -> None:
+    group = file["model_changes"].create_group("0")
+    group.attrs["step"] = np.int64(0)
+    data = np.zeros(4 << 20)
+    group.create_dataset("geom_rgba", data=data, compression=9, chunks=data.shape)
+    for index in range(1, 1000):
+        file["model_changes"][str(index)] = group
+
+
+def linked_field(file: h5py.File) -> None:
+    group = file["model_changes"].create_group("0")
+    group.attrs["step"] = np.int64(0)
+    group["geom_rgba"] = h5py.ExternalLink("/etc/passwd", "/x")
+
+
+def object_field(file: h5py.File) -> None:
+    group = file["model_changes"].create_group("0")
+    group.attrs["step"] = np.int64(0)
+    group.create_dataset("geom_rgba", data=[b"cos\nsystem"], dtype=h5py.string_dtype())
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (virtual, "in a way that mjrec does not write"),
+        (overflowing_frames, "not of its steps"),
+        (half_a_billion_steps, "more than 67108864 rewards"),
+        (replaced("states", shape=(5, 2**35), dtype="f8"), "more memory"),
+        (replaced("rewards", shape=(2**40,), dtype="f8"), "more memory"),
+        (replaced("rewards", shape=(2**40,), dtype="f8", chunks=(9,)), "more memory"),
+        (one_field_by_many_names, "too large|in one another"),
+        (one_change_by_many_names, "in one another"),
+        (linked_field, "no 'geom_rgba' of its own"),
+        (object_field, "no dtype"),
+        (lambda file: file.attrs.create("format_version", True), "another type"),
+    ],
+)
+def test_hostile_hdf5_is_refused(
+    inspector: Inspector,
+    directory: Path,
+    change: Callable[[h5py.File], None],
+    reason: str,
+) -> None:
+    """Before its data is read, within a gigabyte of memory."""
+    path = finished(directory)
+    with h5py.File(path, "r+") as file:
+        change(file)
+    assert re.search(reason, inspector.refuses("trajectory", path))
+
+
+def test_arrays_that_would_fill_the_memory_are_not_read(
+    inspector: Inspector, directory: Path
+) -> None:
+    """Four gigabytes of observations out of four megabytes."""
+    header = TrajectoryHeader(facts={}, observation=Array("<f8", (1 << 20,)))
+    path = directory / "openaigym.trajectory.0.7.episode000000.log"
+    with contextlib.closing(TrajectoryLogWriter(path, header)) as writer:
+        for step in range(2):
+            writer.step_row(step, 0.0, False, False)[:] = 0
+    path = finish_trajectory(path)
+    rows = 500
+    with h5py.File(path, "r+") as file:
+        chunk = file["observations"].id.read_direct_chunk((0, 0))[1]
+        for name, kind in [("rewards", "f8"), ("terminated", "?"), ("truncated", "?")]:
+            replaced(name, data=np.zeros(rows - 1, kind))(file)
+        replaced("states", data=np.zeros((rows, 0)))(file)
+        shape = (rows, 1 << 20)
+        replaced(
+            "observations", shape=shape, dtype="f8", chunks=(1, 1 << 20), compression=1
+        )(file)
+        for row in range(rows):
+            file["observations"].id.write_direct_chunk((row, 0), chunk)
+    assert "claims to hold 4 GiB" in inspector.refuses("arrays", path)
+
+
+def record(kind: bytes, payload: bytes) -> bytes:
+    length = len(payload).to_bytes(8, "little")
+    checksum = zlib.crc32(payload, zlib.crc32(kind + length)).to_bytes(4, "little")
+    return kind + checksum + length + payload + bytes(-len(payload) % 8)
+
+
+def change(step: int, table: str, content: bytes) -> bytes:
+    return record(
+        b"chng", struct.pack("<qQ", step, len(table)) + table.encode() + content
+    )
+
+
+ONE = '{"name": "geom_rgba", "dtype": "|u1", "shape": [1]}'
+
+
+@pytest.mark.parametrize(
+    "records",
+    [
+        change(-1, f"[{ONE}]", b"a"),
+        change(0, f"[{ONE}, {ONE}]", b"ab"),
+        change(0, '[{"name": "x", "dtype": "|O", "shape": [1]}]', bytes(8)),
+        change(0, '[{"name": "x", "dtype": "<f8", "shape": [1099511627776]}]', b""),
+        change(0, "[" * 1_000_000, b""),
+        record(b"fact", b"[" * 1_000_000),
+        record(b"fact", b'{"complete": true, "complete": false}'),
+        record(b"fact", b'{"a": "%s"}' % (b"a" * (30 << 20))) * 3,
+    ],
+    ids=[
+        *("no step", "a field twice", "objects", "a terabyte", "nested change"),
+        *("nested facts", "a fact twice", "facts without end"),
+    ],
+)
+def test_hostile_records_of_a_log_are_refused(
+    inspector: Inspector, directory: Path, records: bytes
+) -> None:
+    """Their checksums are right."""
+    path = write_log(directory)
+    with path.open("ab") as file:
+        file.write(records)
+    inspector.refuses("trajectory", path)
+
+
+def test_an_environment_in_a_file_is_text(directory: Path) -> None:
+    """Nothing that a file names is imported or called, or made an environment of."""
+    done = directory / "done"
+    command = f"touch {done}"
+    path = write_log(
+        directory,
+        environment={
+            "framework": "gymnasium",
+            "id": "subprocess:check_output",
+            "entry_point": "subprocess:check_output",
+            "kwargs": {"args": command, "shell": True},
+        },
+        env_id="subprocess:check_output",
+    )
+    trajectory = load_trajectory(finish_trajectory(path))
+    assert trajectory.env_id == "subprocess:check_output"
+    assert trajectory.environment is not None
+    assert not done.exists()
+
+
+@pytest.mark.parametrize("model", [5, "x", [], {"mjb": "../x"}, {"mjb": {}}])
+def test_what_a_trajectory_says_of_its_model_is_checked(
+    directory: Path, model: Any
+) -> None:
+    """One error, of whatever type it is."""
+    trajectory = load_trajectory(write_log(directory, model=model))
+    with pytest.raises(UnreadableFile):
+        trajectory.model()
+
+
+def test_a_model_change_that_fits_nothing_names_the_file(directory: Path) -> None:
+    """And not the field alone."""
+    path = directory / "openaigym.trajectory.0.7.episode000000.log"
+    header = TrajectoryHeader(facts={"model": {**_stored(directory)}})
+    with contextlib.closing(TrajectoryLogWriter(path, header)) as writer:
+        writer.add_model_change(ModelChange(step=0, fields={"geom_rgba": np.ones(3)}))
+        writer.step_row(0, 0.0, False, False)
+    with pytest.raises(UnreadableFile, match="belongs to another model") as error:
+        load_trajectory(path).model()
+    assert error.value.path == path
+
+
+# --- models --------------------------------------------------------------------------
+
+
+def facts_of(directory: Path) -> dict[str, Any]:
+    facts: dict[str, Any] = json.loads((directory / "facts.json").read_text())
+    return facts
+
+
+def put_compiled(directory: Path, content: bytes, packed: bytes | None = None) -> Path:
+    """Store bytes as a compiled model, with facts that are true of them."""
+    digest = hashlib.sha256(content).hexdigest()
+    path = directory / f"openaigym.model.{digest[:16]}.mjb.gz"
+    path.write_bytes(gzip.compress(content) if packed is None else packed)
+    facts = {"sha256": digest, "bytes": len(content), "mjb": path.name, "xml": None}
+    facts["mujoco"] = mujoco.__version__
+    (directory / "facts.json").write_text(json.dumps(facts))
+    return path
+
+
+def test_bytes_that_are_no_model_are_refused(
+    inspector: Inspector, directory: Path
+) -> None:
+    """Though their hash is the recorded one."""
+    path = put_compiled(directory, np.random.default_rng(1).bytes(10_000))
+    inspector.refuses("model", path)
+
+
+def test_a_compiled_model_has_the_name_of_its_content(
+    inspector: Inspector, directory: Path
+) -> None:
+    """So that one file cannot stand for two models."""
+    path = compiled(directory)
+    other = path.rename(path.with_name("openaigym.model.0123456789abcdef.mjb.gz"))
+    facts = {**facts_of(directory), "mjb": other.name}
+    (directory / "facts.json").write_text(json.dumps(facts))
+    assert "not what was recorded" in inspector.refuses("model", other)
+
+
+CONTENT = bytes(1000)
+
+
+@pytest.mark.parametrize(
+    "packed",
+    [
+        gzip.compress(CONTENT) + gzip.compress(b"more"),
+        gzip.compress(b"") * 100_000 + gzip.compress(CONTENT),
+        gzip.compress(CONTENT)[:10].replace(b"\0", b"\x08", 1) + b"x" * 30_000_000,
+        gzip.compress(CONTENT)[:-1],
+        gzip.compress(CONTENT)[:-8] + bytes(8),
+        gzip.compress(CONTENT) + b"tail",
+    ],
+    ids=["two", "many", "endless name", "cut off", "wrong checksum", "tail"],
+)
+def test_gzip_of_another_making_is_refused(
+    inspector: Inspector, directory: Path, packed: bytes
+) -> None:
+    """What is packed is one stream, and nothing else is there."""
+    inspector.refuses("model", put_compiled(directory, CONTENT, packed))
+
+
+def test_a_gzip_bomb_is_not_unpacked(inspector: Inspector, directory: Path) -> None:
+    """Whatever size the facts give."""
+    path = put_compiled(directory, CONTENT, gzip.compress(bytes(1 << 28)))
+    assert "it holds more" in inspector.refuses("model", path)
+    facts = {**facts_of(directory), "bytes": (1 << 31) - 1}
+    (directory / "facts.json").write_text(json.dumps(facts))
+    assert "too small" in inspector.refuses("model", path)
+
+
+def put_zip(
+    directory: Path,
+    members: dict[str, bytes],
+    *,
+    method: int = zipfile.ZIP_DEFLATED,
+    again: tuple[str, ...] = (),
+) -> Path:
+    path = source(directory)
+    contents = b'{"format": 1, "main": "main.xml"}'
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, content in {"contents.json": contents, **members}.items():
+            archive.writestr(name, content)
+        for name in again:
+            with pytest.warns(UserWarning, match="Duplicate"):
+                archive.writestr(name, b"other")
+    return path
+
+
+MAIN = {"source/main.xml": SPHERE.encode()}
+
+
+def npy(header: str) -> bytes:
+    text = header.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\0" + len(text).to_bytes(2, "little") + text + bytes(64)
+
+
+HUGE = npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,)}")
+
+
+@pytest.mark.parametrize(
+    ("members", "options", "reason"),
+    [
+        (MAIN, {"again": ("source/main.xml",)}, "the same name"),
+        (MAIN, {"method": zipfile.ZIP_LZMA}, "packed in another way"),
+        (MAIN, {"method": zipfile.ZIP_BZIP2}, "packed in another way"),
+        ({**MAIN, "fields/geom_rgba.npy": HUGE}, {}, "as a plain array"),
+        ({**MAIN, "fields/geom_rgba.npy": b"\x93NUMPY\x03\0"}, {}, "as a plain array"),
+        ({**MAIN, "source/zeros": bytes(200 << 20)}, {}, "no model needs that"),
+        ({**MAIN, **{f"source/{i}": b"" for i in range(20_000)}}, {}, "more files"),
+        ({**MAIN, "source/../../x": b""}, {}, "a file called"),
+        ({**MAIN, "source//tmp/x": b""}, {}, "no plain relative path"),
+        ({**MAIN, "contents.json": b"[" * 100_000}, {}, "nested too deeply"),
+        ({**MAIN, "contents.json": b'{"format": 1, "main": "other"}'}, {}, "other"),
+        ({**MAIN, "contents.json": b'{"format": 1, "main": {}}'}, {}, "dict"),
+    ],
+)
+def test_hostile_zips_are_refused(
+    inspector: Inspector,
+    directory: Path,
+    members: dict[str, bytes],
+    options: dict[str, Any],
+    reason: str,
+) -> None:
+    """Before anything is unpacked that need not be."""
+    path = put_zip(directory, members, **options)
+    assert reason in inspector.refuses("model", path)
+
+
+def test_a_list_of_members_elsewhere_is_not_looked_for(
+    inspector: Inspector, directory: Path
+) -> None:
+    """Large zips have a second one, which counts where it is there."""
+    path = put_zip(directory, MAIN)
+    data = path.read_bytes()
+    path.write_bytes(data[:-22] + b"PK\6\7" + bytes(16) + data[-22:])
+    inspector.refuses("model", path)
+    path.write_bytes(data[:-2] + b"\4\0tail")
+    inspector.refuses("model", path)
+
+
+INSIDE = "<mujoco><worldbody>%s</worldbody></mujoco>"
+
+
+@pytest.mark.parametrize(
+    "xml",
+    [
+        '<mujoco><include file="/etc/passwd"/></mujoco>',
+        '<mujoco><include file="../../../../../../../../../../etc/passwd"/></mujoco>',
+        '<mujoco><include file="&#47;etc/passwd"/></mujoco>',
+        '<mujoco><asset><mesh file="~/x.obj"/></asset></mujoco>',
+        '<mujoco><compiler meshdir="/"/><asset><mesh file="x.obj"/></asset></mujoco>',
+        '<mujoco><extension><plugin plugin="mujoco.pid"/></extension></mujoco>',
+        '<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]><mujoco>&b;</mujoco>',
+        '<mujoco><include file="main.xml"/></mujoco>',
+        INSIDE % ("<body>" * 100_000 + "</body>" * 100_000),
+        '<mujoco><size nuserdata="2000000000"/></mujoco>',
+        '<mujoco><size memory="900P"/></mujoco>',
+        INSIDE % '<flexcomp name="f" type="grid" count="1000 1000 1000" dim="3"/>',
+    ],
+)
+def test_hostile_mjcf_is_refused(
+    inspector: Inspector, directory: Path, xml: str
+) -> None:
+    """Nothing but the files of the zip is read."""
+    inspector.refuses("model", put_zip(directory, {"source/main.xml": xml.encode()}))
+
+
+@pytest.mark.parametrize(
+    ("xml", "reason"),
+    [
+        (
+            INSIDE % '<replicate count="100000000"><geom size="1"/></replicate>',
+            "longer",
+        ),
+        (
+            '<mujoco><asset><texture name="t" type="2d" builtin="flat" width="60000" '
+            'height="60000"/></asset></mujoco>',
+            "memory",
+        ),
+    ],
+)
+def test_a_model_that_takes_for_ever_is_given_up(
+    directory: Path, xml: str, reason: str
+) -> None:
+    """And so is one that takes all memory; the process goes on."""
+    path = put_zip(directory, {"source/main.xml": xml.encode()})
+    with pytest.raises(UnreadableFile, match=reason):
+        compile_within(path, limit=1 << 20, compiled_size=1, seconds=3)
+
+
+def test_files_and_directories_are_not_multiplied(
+    inspector: Inspector, directory: Path
+) -> None:
+    """A megabyte of names would be looked at a thousand million times."""
+    compilers = "".join(f'<compiler meshdir="d{i}"/>' for i in range(20_000))
+    meshes = "".join(f'<mesh file="{i}"/>' for i in range(20_000))
+    xml = f"<mujoco>{compilers}<asset>{meshes}</asset></mujoco>"
+    path = put_zip(directory, {"source/main.xml": xml.encode()})
+    assert "than any model" in inspector.refuses("model", path)
