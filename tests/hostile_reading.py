@@ -23,7 +23,8 @@ from types import TracebackType
 from typing import Any, Self
 
 MEMORY = 1 << 30
-SECONDS = 20
+# A machine may be busy with other things.
+SECONDS = 60
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +144,13 @@ def _model(path: Path) -> None:
     load_model(path.parent, json.loads((path.parent / "facts.json").read_text()))
 
 
+def _source(path: Path) -> None:
+    """Read what a model is made from as the process that compiles it does."""
+    from mjrec.simulation.authored_model import read_authored
+
+    read_authored(path, limit=1 << 24)
+
+
 def _mjcf(path: Path) -> None:
     from mjrec.simulation.mjcf import load_mjcf
 
@@ -168,6 +176,7 @@ READERS: dict[str, Callable[[Path], None]] = {
     "rendering": _rendering,
     "finish": _finish,
     "model": _model,
+    "source": _source,
     "mjcf": _mjcf,
     "archive": _archive,
 }

@@ -22,23 +22,29 @@ import mujoco
 import numpy as np
 import pytest
 from hostile_reading import Inspector
+from sound_files import (
+    FILES,
+    SPHERE,
+    compiled,
+    finished,
+    journal,
+    manifest,
+    metadata,
+    source,
+    stats,
+    stored,
+)
 from trajectories_by_hand import write_log
 
 from mjrec import UnreadableFile, load_trajectory
-from mjrec.formats.journal import JournalEntry, JournalWriter
-from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
+from mjrec.formats.manifest import read_manifest
 from mjrec.formats.monitor_directory import Infix, episode_of, infix_of
-from mjrec.formats.stats_file import StatsFile, write_stats_file
 from mjrec.formats.trajectory import Array, ModelChange, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.json_text import dumps, loads
 from mjrec.rendering.rendered_manifests import reconcile
-from mjrec.simulation.authored_model import authored_from_file
-from mjrec.simulation.model_store import ModelStore
 from mjrec.simulation.source_compiler import compile_within
-
-SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
 
 
 @pytest.fixture(scope="module")
@@ -53,91 +59,6 @@ def directory(tmp_path: Path) -> Path:
     path.mkdir()
     return path
 
-
-# --- sound files, one of each kind ---------------------------------------------------
-
-
-def manifest(directory: Path) -> Path:
-    path = directory / "openaigym.manifest.0.7.manifest.json"
-    write_manifest(path, Manifest("openaigym.s.stats.json", (), {"env_id": "A-v0"}))
-    return path
-
-
-def stats(directory: Path) -> Path:
-    path = directory / "openaigym.episode_batch.0.7.stats.json"
-    write_stats_file(path, StatsFile(1.0, (2.0,), (3,), (4.0,), ("t",)))
-    return path
-
-
-def journal(directory: Path) -> Path:
-    path = directory / "openaigym.episodes.0.7.jsonl"
-    writer = JournalWriter(path)
-    writer.append(JournalEntry(0, 3, 4.0, "t", 1.0, 2.0, 7, None, True, False))
-    writer.close()
-    return path
-
-
-def metadata(directory: Path) -> Path:
-    path = directory / "openaigym.video.0.7.video000000.meta.json"
-    path.write_text('{"broken": false}')
-    return path
-
-
-def finished(directory: Path) -> Path:
-    return finish_trajectory(write_log(directory))
-
-
-def _stored(directory: Path, xml: str = SPHERE) -> dict[str, Any]:
-    source = directory.parent / "main.xml"
-    source.write_text(xml)
-    store = ModelStore(directory)
-    facts = store.add(
-        mujoco.MjModel.from_xml_path(str(source)), authored_from_file(source)
-    )
-    store.finish()
-    return facts
-
-
-def compiled(directory: Path) -> Path:
-    facts = {**_stored(directory), "xml": None}
-    (directory / "facts.json").write_text(json.dumps(facts))
-    return directory / facts["mjb"]
-
-
-def source(directory: Path) -> Path:
-    facts = {**_stored(directory), "mujoco": "3.1.4", "mjb": None}
-    (directory / "facts.json").write_text(json.dumps(facts))
-    return directory / facts["xml"]
-
-
-def mjcf(directory: Path) -> Path:
-    path = directory / "sphere.xml"
-    path.write_text(SPHERE)
-    return path
-
-
-def video(directory: Path) -> Path:
-    path = directory / "openaigym.video.0.7.video000000.mp4"
-    path.write_bytes(b"frames")
-    metadata(directory)
-    return path
-
-
-FILES: dict[str, tuple[str, Callable[[Path], Path]]] = {
-    "manifest": ("manifest", manifest),
-    "stats": ("stats", stats),
-    "journal": ("journal", journal),
-    "metadata": ("metadata", metadata),
-    "log": ("trajectory", write_log),
-    "log to be finished": ("finish", write_log),
-    "log to be rendered": ("rendering", write_log),
-    "h5": ("trajectory", finished),
-    "arrays of an h5": ("arrays", finished),
-    "mjb.gz": ("model", compiled),
-    "zip": ("model", source),
-    "mjcf": ("mjcf", mjcf),
-    "video for an archive": ("archive", video),
-}
 
 kinds = pytest.mark.parametrize("kind", FILES)
 
@@ -604,7 +525,7 @@ def test_what_a_trajectory_says_of_its_model_is_checked(
 def test_a_model_change_that_fits_nothing_names_the_file(directory: Path) -> None:
     """And not the field alone."""
     path = directory / "openaigym.trajectory.0.7.episode000000.log"
-    header = TrajectoryHeader(facts={"model": {**_stored(directory)}})
+    header = TrajectoryHeader(facts={"model": {**stored(directory)}})
     with contextlib.closing(TrajectoryLogWriter(path, header)) as writer:
         writer.add_model_change(ModelChange(step=0, fields={"geom_rgba": np.ones(3)}))
         writer.step_row(0, 0.0, False, False)
@@ -769,7 +690,6 @@ INSIDE = "<mujoco><worldbody>%s</worldbody></mujoco>"
         INSIDE % ("<body>" * 100_000 + "</body>" * 100_000),
         '<mujoco><size nuserdata="2000000000"/></mujoco>',
         '<mujoco><size memory="900P"/></mujoco>',
-        INSIDE % '<flexcomp name="f" type="grid" count="1000 1000 1000" dim="3"/>',
     ],
 )
 def test_hostile_mjcf_is_refused(

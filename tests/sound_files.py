@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One sound file of every kind that is read back, to be spoilt."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+from trajectories_by_hand import write_log
+
+from mjrec.formats.journal import JournalEntry, JournalWriter
+from mjrec.formats.manifest import Manifest, write_manifest
+from mjrec.formats.stats_file import StatsFile, write_stats_file
+from mjrec.formats.trajectory_file import finish_trajectory
+from mjrec.simulation.authored_model import authored_from_file
+from mjrec.simulation.model_store import ModelStore
+
+SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
+
+
+def manifest(directory: Path) -> Path:
+    path = directory / "openaigym.manifest.0.7.manifest.json"
+    write_manifest(path, Manifest("openaigym.s.stats.json", (), {"env_id": "A-v0"}))
+    return path
+
+
+def stats(directory: Path) -> Path:
+    path = directory / "openaigym.episode_batch.0.7.stats.json"
+    write_stats_file(path, StatsFile(1.0, (2.0,), (3,), (4.0,), ("t",)))
+    return path
+
+
+def journal(directory: Path) -> Path:
+    path = directory / "openaigym.episodes.0.7.jsonl"
+    writer = JournalWriter(path)
+    writer.append(JournalEntry(0, 3, 4.0, "t", 1.0, 2.0, 7, None, True, False))
+    writer.close()
+    return path
+
+
+def metadata(directory: Path) -> Path:
+    path = directory / "openaigym.video.0.7.video000000.meta.json"
+    path.write_text('{"broken": false}')
+    return path
+
+
+def finished(directory: Path) -> Path:
+    return finish_trajectory(write_log(directory))
+
+
+def stored(directory: Path, xml: str = SPHERE) -> dict[str, Any]:
+    source = directory.parent / "main.xml"
+    source.write_text(xml)
+    store = ModelStore(directory)
+    facts = store.add(
+        mujoco.MjModel.from_xml_path(str(source)), authored_from_file(source)
+    )
+    store.finish()
+    return facts
+
+
+def compiled(directory: Path) -> Path:
+    facts = {**stored(directory), "xml": None}
+    (directory / "facts.json").write_text(json.dumps(facts))
+    return directory / facts["mjb"]
+
+
+def source(directory: Path) -> Path:
+    facts = {**stored(directory), "mujoco": "3.1.4", "mjb": None}
+    (directory / "facts.json").write_text(json.dumps(facts))
+    return directory / facts["xml"]
+
+
+def mjcf(directory: Path) -> Path:
+    path = directory / "sphere.xml"
+    path.write_text(SPHERE)
+    return path
+
+
+def video(directory: Path) -> Path:
+    path = directory / "openaigym.video.0.7.video000000.mp4"
+    path.write_bytes(b"frames")
+    metadata(directory)
+    return path
+
+
+# Each with the reader of `hostile_reading` that it is for.
+FILES: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "manifest": ("manifest", manifest),
+    "stats": ("stats", stats),
+    "journal": ("journal", journal),
+    "metadata": ("metadata", metadata),
+    "log": ("trajectory", write_log),
+    "log to be finished": ("finish", write_log),
+    "log to be rendered": ("rendering", write_log),
+    "h5": ("trajectory", finished),
+    "arrays of an h5": ("arrays", finished),
+    "mjb.gz": ("model", compiled),
+    "zip": ("model", source),
+    "mjcf": ("mjcf", mjcf),
+    "video for an archive": ("archive", video),
+}

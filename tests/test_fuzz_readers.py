@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever a file holds, reading it gives what it says or one error that names it.
+
+Hypothesis makes the files: sound ones, changed where their structure has joints, with
+checksums that are right again. It always makes the same ones. What could take the
+process with it is read in forks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hostile_reading import Inspector, Outcome
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from sound_files import compiled, finished, source
+from trajectories_by_hand import write_log
+
+from mjrec import Error, UnreadableFile
+from mjrec.formats.journal import JournalEntry, JournalWriter, read_journal
+from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
+from mjrec.formats.stats_file import StatsFile, read_stats_file, write_stats_file
+from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
+from mjrec.formats.trajectory_log_reader import TrajectoryLogReader
+from mjrec.formats.video_metadata import is_broken
+from mjrec.json_text import dumps, loads
+from mjrec.rendering.recorded_facts import open_for_rendering
+
+FEW = settings(
+    derandomize=True,
+    deadline=None,
+    database=None,
+    max_examples=200,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+FEWER = settings(FEW, max_examples=80)
+
+
+# --- JSON ----------------------------------------------------------------------------
+
+NUMBERS = st.one_of(
+    st.integers(),
+    st.sampled_from([0, -1, 2**31, 2**63, 2**64, 10**400, 1e308, -0.0, 1e-320]),
+    st.floats(),
+)
+TEXTS = st.one_of(
+    st.text(max_size=8),
+    st.sampled_from(["", "..", "../x", "/", "a/b", "\0", "\ud800", "1e999", "a" * 300]),
+)
+VALUES = st.recursive(
+    st.one_of(st.none(), st.booleans(), NUMBERS, TEXTS),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3), st.dictionaries(TEXTS, inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+
+
+@st.composite
+def changed(draw: st.DrawFn, sound: Any) -> Any:
+    """Return `sound` with something in it replaced, removed or added."""
+    value = json.loads(json.dumps(sound))
+    for _ in range(draw(st.integers(1, 3))):
+        value = draw(_changed_once(value))
+    return value
+
+
+@st.composite
+def _changed_once(draw: st.DrawFn, value: Any) -> Any:
+    if not isinstance(value, dict | list) or not value or draw(st.integers(0, 9)) == 0:
+        return draw(VALUES)
+    keys: list[Any] = list(value) if isinstance(value, dict) else [*range(len(value))]
+    key = draw(st.sampled_from(keys))
+    what = draw(st.integers(0, 9))
+    if what == 0:
+        del value[key]
+    elif what == 1 and isinstance(value, dict):
+        value[draw(TEXTS)] = draw(VALUES)
+    elif what == 1:
+        value.append(draw(VALUES))
+    else:
+        value[key] = draw(_changed_once(value[key]))
+    return value
+
+
+def mangled(sound: Any) -> st.SearchStrategy[bytes]:
+    """Texts of changed values, some of which are damaged as texts too."""
+    texts = changed(sound).map(lambda value: json.dumps(value).encode())
+    return st.one_of(texts, texts, st.builds(damaged, texts, DAMAGE))
+
+
+DAMAGE = st.lists(
+    st.tuples(
+        st.floats(0, 1, exclude_max=True),
+        st.sampled_from(["flip", "set", "number", "cut", "insert", "copy"]),
+        st.integers(0, 255),
+        st.sampled_from([0, 1, -1, 2**31, 2**32, 2**40, 2**63 - 1, -(2**63)]),
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+def damaged(data: bytes, damage: list[tuple[float, str, int, int]]) -> bytes:
+    """Return `data` with bytes flipped, set, overwritten, cut off or put in."""
+    result = bytearray(data)
+    for place, what, byte, number in damage:
+        at = int(place * len(result))
+        if not result:
+            break
+        if what == "flip":
+            result[at] ^= 1 << byte % 8
+        elif what == "set":
+            result[at] = byte
+        elif what == "number":
+            at -= at % 8
+            result[at : at + 8] = number.to_bytes(8, "little", signed=True)
+        elif what == "cut":
+            del result[at:]
+        elif what == "insert":
+            result[at:at] = bytes([byte] * 8)
+        else:
+            result[at : at + 16] = result[: len(result[at : at + 16])]
+    return bytes(result)
+
+
+MANIFEST = {
+    "stats": "openaigym.episode_batch.0.7.stats.json",
+    "videos": [["a.mp4", "a.meta.json"], ["b.mp4", "b.meta.json"]],
+    "env_info": {"gym_version": "mjrec-1", "env_id": "A-v0"},
+    "mjrec": {
+        "next_episode_id": 3,
+        "pending": [{"episode_id": 2, "trajectory": "t", "video": "c.mp4"}],
+        "broken": ["d.meta.json"],
+    },
+}
+STATS = {
+    "initial_reset_timestamp": 1.5,
+    "timestamps": [2.5, 3.5],
+    "episode_lengths": [3, 4],
+    "episode_rewards": [None, 5.0],
+    "episode_types": ["t", "e"],
+}
+ENTRY = {
+    "episode_id": 0,
+    "length": 3,
+    "reward": 4.0,
+    "type": "t",
+    "start_time": 1.0,
+    "end_time": 2.0,
+    "seed": 7,
+    "options": {"a": [1]},
+    "terminated": True,
+    "truncated": False,
+}
+
+
+def read_or_refuse(path: Path, read: Callable[[Path], Any]) -> Any:
+    """Return what is read, None where there is one error that names the file."""
+    refusal: UnreadableFile | None = None
+    try:
+        return read(path)
+    except UnreadableFile as error:
+        refusal = error
+    assert refusal.path == path
+    assert len(str(refusal)) < 2000 + len(str(path))
+    return None
+
+
+@FEW
+@given(data=mangled(MANIFEST))
+def test_any_manifest(tmp_path: Path, data: bytes) -> None:
+    """What is read can be written again, and names files of the directory only."""
+    path = tmp_path / "openaigym.manifest.0.7.manifest.json"
+    path.write_bytes(data)
+    found: Manifest | None = read_or_refuse(path, read_manifest)
+    if found is not None:
+        names = [found.stats, *(name for pair in found.videos for name in pair)]
+        assert all((tmp_path / name).parent == tmp_path for name in names)
+        write_manifest(path, found)
+
+
+@FEW
+@given(data=mangled(STATS))
+def test_any_statistics(tmp_path: Path, data: bytes) -> None:
+    """What is read can be written again."""
+    path = tmp_path / "openaigym.episode_batch.0.7.stats.json"
+    path.write_bytes(data)
+    found: StatsFile | None = read_or_refuse(path, read_stats_file)
+    if found is not None:
+        write_stats_file(path, found)
+        assert read_stats_file(path).episode_lengths == found.episode_lengths
+
+
+@FEW
+@given(lines=st.lists(mangled(ENTRY), min_size=1, max_size=3))
+def test_any_journal(tmp_path: Path, lines: list[bytes]) -> None:
+    """What is read can be written again; the lines that cannot be are left out."""
+    path = tmp_path / "openaigym.episodes.0.7.jsonl"
+    path.write_bytes(b"\n".join(lines))
+    found: list[JournalEntry] = (
+        read_or_refuse(path, lambda path: list(read_journal(path))) or []
+    )
+    with contextlib.closing(JournalWriter(tmp_path / "again")) as writer:
+        for entry in found:
+            writer.append(entry)
+
+
+@FEW
+@given(data=mangled({"broken": True, "frame_steps": [[0, 3]], "episode_id": 2}))
+def test_any_metadata(tmp_path: Path, data: bytes) -> None:
+    """Metadata that cannot be read calls no video broken."""
+    path = tmp_path / "openaigym.video.0.7.video000000.meta.json"
+    path.write_bytes(data)
+    assert is_broken(path) in (True, False)
+
+
+@FEW
+@given(value=VALUES)
+def test_any_value_can_be_written_and_read(value: Any) -> None:
+    """And gives the same text again."""
+    assert dumps(loads(dumps(value))) == dumps(value)
+
+
+# --- the log of a trajectory ---------------------------------------------------------
+
+
+def records_of(log: bytes) -> list[tuple[bytes, bytes]]:
+    records, at = [], 32
+    while at < len(log):
+        kind, _, length = struct.unpack_from("<4sIQ", log, at)
+        records.append((kind, log[at + 16 : at + 16 + length]))
+        at += 16 + -(-length // 8) * 8
+    return records
+
+
+def log_of(records: list[tuple[bytes, bytes]]) -> bytes:
+    """Return a log of records whose checksums are right."""
+    parts = [b"mjrec trajectory log 1".ljust(31) + b"\n"]
+    for kind, payload in records:
+        length = len(payload).to_bytes(8, "little")
+        checksum = zlib.crc32(payload, zlib.crc32(kind + length))
+        parts += [kind, checksum.to_bytes(4, "little"), length, payload]
+        parts.append(bytes(-len(payload) % 8))
+    return b"".join(parts)
+
+
+@pytest.fixture(scope="module")
+def sound_log(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = write_log(tmp_path_factory.mktemp("log"))
+    table = b'[{"name": "geom_rgba", "dtype": "<f4", "shape": [2, 2]}]'
+    change = struct.pack("<qQ", 1, len(table)) + table + bytes(16)
+    return log_of([*records_of(path.read_bytes()), (b"chng", change)])
+
+
+def read_everything(path: Path) -> Any:
+    with open_trajectory(path) as reader:
+        content = reader.content()
+    with contextlib.suppress(Error):
+        open_for_rendering(path).close()
+    return content
+
+
+@FEW
+@given(data=st.data())
+def test_any_log(tmp_path: Path, sound_log: bytes, data: st.DataObject) -> None:
+    """Records changed, with checksums that are right, left out, doubled, exchanged."""
+    records = records_of(sound_log)
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(records) - 1))
+        kind, payload = records[at]
+        what = data.draw(st.integers(0, 5))
+        if what == 0:
+            records.insert(at, data.draw(st.sampled_from(records)))
+        elif what == 1 and len(records) > 1:
+            del records[at]
+        elif kind in (b"head", b"fact") and payload.startswith(b"{"):
+            with contextlib.suppress(ValueError):
+                payload = data.draw(mangled(json.loads(payload)))
+            records[at] = (kind, payload)
+        else:
+            records[at] = (kind, damaged(payload, data.draw(DAMAGE)))
+    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
+    path.write_bytes(log_of(records))
+    read_or_refuse(path, read_everything)
+
+
+@FEW
+@given(damage=DAMAGE)
+def test_any_damaged_log(tmp_path: Path, sound_log: bytes, damage: Any) -> None:
+    """Bytes changed anywhere: what was read before the damage stays what it was."""
+    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
+    path.write_bytes(damaged(sound_log, damage))
+    found = read_or_refuse(path, read_everything)
+    if found is not None:
+        assert (found.rewards == 0.5).all()
+
+
+@FEWER
+@given(data=st.data())
+def test_any_log_that_is_read_is_finished(
+    tmp_path: Path, sound_log: bytes, data: st.DataObject
+) -> None:
+    """As a file that holds the same."""
+    records = records_of(sound_log)
+    head = json.loads(records[0][1])
+    facts = data.draw(changed(head["facts"]))
+    records[0] = (b"head", json.dumps({**head, "facts": facts}).encode())
+    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
+    path.write_bytes(log_of(records))
+    finished_path = path.with_suffix(".h5")
+    finished_path.unlink(missing_ok=True)
+    if read_or_refuse(path, read_everything) is None:
+        return
+    with TrajectoryLogReader(path) as reader:
+        before = reader.content()
+    after = read_everything(finish_trajectory(path))
+    assert dumps(after.header.facts) == dumps(before.header.facts)
+    assert np.array_equal(after.snapshots, before.snapshots)
+
+
+# --- HDF5 and models, in forks -------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def inspector() -> Iterator[Inspector]:
+    with Inspector() as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A sound file of each kind, in a directory of its own."""
+    found: dict[str, Path] = {}
+    for name, write in {"h5": finished, "zip": source, "mjb": compiled}.items():
+        directory = tmp_path_factory.mktemp(name) / "recordings"
+        directory.mkdir()
+        found[name] = write(directory)
+    return found
+
+
+def check(outcome: Outcome, path: Path) -> None:
+    assert outcome.kind in ("value", "refused"), outcome
+    assert outcome.kind == "value" or outcome.names == str(path), outcome
+
+
+@pytest.mark.parametrize(
+    ("kind", "reader"), [("h5", "trajectory"), ("zip", "source"), ("mjb", "model")]
+)
+@FEWER
+@given(damage=DAMAGE)
+def test_any_damaged_file(
+    inspector: Inspector, sound: dict[str, Path], kind: str, reader: str, damage: Any
+) -> None:
+    """Of HDF5, of a model's sources, of a compiled model: no crash, no hang."""
+    path = sound[kind]
+    data = path.read_bytes()
+    try:
+        path.write_bytes(damaged(data, damage))
+        check(inspector.read(reader, path), path)
+    finally:
+        path.write_bytes(data)
