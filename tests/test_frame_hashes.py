@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disk import file_size_limit
 
-from mjrec.errors import DirectoryNotWritable
+from mjrec.errors import DirectoryNotWritable, FileNotWritten
 from mjrec.formats.ffmpeg import run_ffmpeg
 from mjrec.formats.frame_hashes import (
     FrameHashFile,
@@ -71,3 +72,15 @@ def test_a_disk_that_takes_nothing_is_one_error() -> None:
     """What the system says comes with the directory's name."""
     with pytest.raises(DirectoryNotWritable, match="/proc"):
         FrameHashFile(Path("/proc/a.framehash"), size=(4, 6), fps=Fraction(1))
+
+
+def test_a_full_disk_is_named_with_the_file(tmp_path: Path) -> None:
+    """And nothing is left of it."""
+    path = tmp_path / "run.framehash"
+    file = FrameHashFile(path, size=(4, 6), fps=Fraction(1))
+    with file_size_limit(100), pytest.raises(FileNotWritten, match=str(path)):
+        file.add(np.zeros((4, 6, 3), np.uint8))
+    file.abort()
+    with file_size_limit(100), pytest.raises(FileNotWritten, match=str(path)):
+        FrameHashFile(path, size=(4, 6), fps=Fraction(1))
+    assert list(tmp_path.iterdir()) == []

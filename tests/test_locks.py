@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from full_disk import file_size_limit
 
 from mjrec.formats.locks import Lock, is_locked, try_lock, wait_for_lock
 
@@ -248,3 +249,14 @@ def test_what_is_no_file_is_no_lock(make: Callable[[Path], None], path: Path) ->
     with pytest.raises(OSError, match="no lock is"):
         try_lock(path, "me")
     assert not is_locked(path)
+
+
+def test_a_full_disk_keeps_nobody_from_a_lock(tmp_path: Path) -> None:
+    """Its content is for people; the lock is in the kernel."""
+    path = tmp_path / ".lock"
+    with file_size_limit(0):
+        lock = try_lock(path, "content")
+    assert lock is not None
+    assert is_locked(path)
+    lock.release()
+    assert not path.exists()

@@ -119,6 +119,7 @@ def run_ffmpeg(
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             start_new_session=True,
+            restore_signals=False,
         )
     except OSError as error:
         raise _not_started(command[0], error) from error
@@ -187,6 +188,9 @@ class FfmpegProcess:
                 stderr=self._stderr,
                 bufsize=0,
                 start_new_session=True,
+                # A file that would grow beyond a limit is an error that ffmpeg tells,
+                # not the end of it: Python ignores SIGXFSZ, and so does ffmpeg then.
+                restore_signals=False,
                 pass_fds=() if keeps is None else (keeps.fileno(),),
             )
         except BaseException as error:

@@ -24,6 +24,7 @@ green, blue.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 from collections.abc import Iterator
 from fractions import Fraction
@@ -33,7 +34,7 @@ from typing import TextIO
 import numpy as np
 
 from ..atomic_files import replacing, temporary_path
-from ..errors import DirectoryNotWritable
+from ..errors import DirectoryNotWritable, FileNotWritten
 from ..frames import Frame
 
 __all__ = [
@@ -43,6 +44,9 @@ __all__ = [
     "frame_hash_line",
     "frame_hash_path",
 ]
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def frame_hash_header(*, height: int, width: int, fps: Fraction) -> str:
@@ -78,7 +82,9 @@ class FrameHashFile:
         fps: frames per second.
         temporary: its name until then; a new one, if None.
 
-    Every method raises `DirectoryNotWritable` when the file cannot be written.
+    Every method raises `FileNotWritten` when the disk is full, or a quota or a limit on
+    files' sizes is reached, and `DirectoryNotWritable` when the file cannot be written
+    for another reason.
     """
 
     def __init__(
@@ -96,7 +102,13 @@ class FrameHashFile:
             self._file: TextIO = self._temporary.open(
                 "w", encoding="ascii", buffering=1
             )
-            self._file.write(frame_hash_header(height=size[0], width=size[1], fps=fps))
+            try:
+                self._file.write(
+                    frame_hash_header(height=size[0], width=size[1], fps=fps)
+                )
+            except BaseException:
+                self.abort()
+                raise
 
     def add(self, frame: Frame) -> None:
         """Write the next frame's line."""
@@ -128,6 +140,8 @@ class FrameHashFile:
         try:
             yield
         except OSError as error:
+            if error.errno in _NO_ROOM:
+                raise FileNotWritten(self._path, error.strerror) from error
             raise DirectoryNotWritable(self._path.parent, error) from error
 
 

@@ -152,7 +152,9 @@ def _taken(path: Path, content: str, operation: int) -> Lock:
             # else have made another: then this one guards nothing.
             if _is_at(descriptor, path):
                 os.ftruncate(descriptor, 0)
-                os.write(descriptor, content.encode())
+                # A full disk takes no content; what counts is who holds the file.
+                with contextlib.suppress(OSError):
+                    os.write(descriptor, content.encode())
                 return Lock._of(path, descriptor)
         except BaseException:
             os.close(descriptor)

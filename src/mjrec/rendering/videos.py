@@ -8,7 +8,6 @@ of workers. The metadata comes last: where it is, the video is there and whole.
 from __future__ import annotations
 
 import logging
-import signal
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -184,8 +183,7 @@ def _write_video(
 
 def _was_ended(error: EncoderError) -> bool:
     """Tell whether ffmpeg was killed: by whoever lacked memory, or for hanging."""
-    # At a limit on the size of files it would die once more.
-    return (error.returncode or 0) < 0 and error.returncode != -signal.SIGXFSZ
+    return (error.returncode or 0) < 0
 
 
 def _encode(
