@@ -477,6 +477,28 @@ def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path: Path) -> None
     assert_in_order(tmp_path)
 
 
+def test_a_renderer_that_was_killed_leaves_its_video_pending(
+    killed: Callable[[str], Path],
+) -> None:
+    """Recovering removes what it had begun, and rendering does it anew."""
+    directory = killed("env = cheetah(workers=0)\nrun(env)\nenv.close()\ndie()")
+    command = [sys.executable, "-m", "mjrec", "render", str(directory), "--workers=1"]
+    manifest = manifest_of(directory)
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as renderer:
+        while not list(directory.glob(".*.mp4.*.part")):
+            assert renderer.poll() is None
+        renderer.kill()
+    recovery = mjrec.recover(directory)
+    assert not recovery.failures
+    assert not list(directory.glob(".*.part"))
+    # Its monitor had closed, and written all that there was to be written.
+    assert manifest_of(directory) == manifest
+    assert len(manifest["mjrec"]["pending"]) == 1
+    assert main(["render", str(directory)]) == 0
+    assert len(frames_in(directory, 0)) == 13
+    assert manifest_of(directory)["mjrec"]["pending"] == []
+
+
 def test_unfinished_models_go_when_nobody_records(tmp_path: Path) -> None:
     """While somebody does, they may be theirs."""
     part = tmp_path / ".openaigym.model.0123456789abcdef.zip.0123abcd.part"

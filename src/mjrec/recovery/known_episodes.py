@@ -26,6 +26,7 @@ class KnownEpisodes:
         remains: the monitor's files, as they were found.
 
     Attributes:
+        infix: the monitor's.
         env_info: what was recorded; None where nothing says it.
         first_episode_id: the lowest number that any file speaks of; None where none.
         last_episode_id: the highest number that any file speaks of; -1 where none.
@@ -33,6 +34,7 @@ class KnownEpisodes:
 
     def __init__(self, remains: Remains) -> None:
         self._remains = remains
+        self.infix = remains.infix
         files = remains.files
         # Of the running episodes and those with a video: of the others, of which
         # there may be millions, nothing is asked.

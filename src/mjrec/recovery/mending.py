@@ -12,7 +12,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ..errors import Error, UnreadableFile
@@ -23,7 +23,7 @@ from ..rendering.rendered_manifests import update_manifest
 from .known_episodes import KnownEpisodes
 from .live_videos import finish_video
 from .manifests import write_results
-from .remains import Remains, look_through, model_leftovers
+from .remains import Remains, lacks_results, look_through, model_leftovers
 from .report import RecoveredFile
 from .text_recordings import finish_text
 from .unfinished_logs import finish_log_of_dead
@@ -81,6 +81,7 @@ class Mending:
 
     def _mend(self, remains: Remains) -> None:
         known = KnownEpisodes(remains)
+        before = len(self.files)
         for log in remains.logs:
             with self._noting_failure(log.name), self._claimed(log) as is_ours:
                 if is_ours:
@@ -88,16 +89,29 @@ class Mending:
         for note in remains.notes:
             with self._noting_failure(_video_of(note)):
                 self._note(finish_video(note, known, is_over=self._is_over))
-        for text in remains.texts:
-            # Where there is no whole frame, it is swept up.
-            with contextlib.suppress(UnreadableFile):
-                self._note(finish_text(text, remains.infix, known))
-        self._sweep(look_through(self._directory, remains.infix))
-        for file in write_results(self._directory, remains.infix, known):
-            self._note(file)
+        kept = [text for text in remains.texts if not self._finish_text(text, known)]
+        has_news = len(self.files) > before
+        self._sweep(look_through(self._directory, remains.infix), kept)
+        if has_news or lacks_results(remains):
+            for file in write_results(self._directory, remains.infix, known):
+                self._note(file)
 
-    def _sweep(self, remains: Remains) -> None:
+    def _finish_text(self, text: Path, known: KnownEpisodes) -> bool:
+        """Finish a text recording; False where that failed and its frames stay."""
+        try:
+            self._note(finish_text(text, known))
+        except UnreadableFile:
+            # There is no whole frame in it.
+            return True
+        except (Error, OSError) as error:
+            self.failures.append(RecoveredFile(text.name, str(error)))
+            return False
+        return True
+
+    def _sweep(self, remains: Remains, kept: Sequence[Path]) -> None:
         for part in remains.leftovers:
+            if part in kept:
+                continue
             with self._noting_failure(part.name), self._claimed(part) as is_ours:
                 if is_ours:
                     self._remove(part)

@@ -29,6 +29,7 @@ __all__ = [
     "Remains",
     "has_work",
     "is_open",
+    "lacks_results",
     "look_through",
     "model_leftovers",
     "remains_of",
@@ -170,8 +171,16 @@ def is_open(remains: Remains) -> bool:
 
 def has_work(remains: Remains) -> bool:
     """Tell whether anything is to be put in order, of a monitor that is not open."""
+    return bool(remains.notes or remains.leftovers or lacks_results(remains))
+
+
+def lacks_results(remains: Remains) -> bool:
+    """Tell whether statistics or manifest are missing, or may be older than the rest.
+
+    A monitor that has closed wrote both, and removed its lock.
+    """
     files = remains.files
-    if remains.lock in remains.paths or remains.notes or remains.leftovers:
+    if remains.lock in remains.paths:
         return True
     if files.manifest is None:
         # Gym's own never had these, and its manifests cannot be made again.

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..formats.asciicast import AsciicastWriter, unfinished_recording
-from ..formats.monitor_directory import Infix, episode_of, video_prefix
+from ..formats.monitor_directory import episode_of, video_prefix
 from ..formats.video_metadata import StepRuns, metadata_path, timing_facts
 from .cut_off import facts_of, how_it_ended, sums_of, write_metadata
 from .known_episodes import KnownEpisodes
@@ -23,12 +23,11 @@ __all__ = ["finish_text"]
 _TOLD_BY_TRAJECTORY = ("type", "env_id", "seed", "options", "versions")
 
 
-def finish_text(part: Path, infix: Infix, known: KnownEpisodes) -> RecoveredFile | None:
+def finish_text(part: Path, known: KnownEpisodes) -> RecoveredFile | None:
     """Make a text recording, and its metadata, of the frames that are there.
 
     Args:
         part: the hidden file that the frames were written into.
-        infix: of its monitor.
         known: what is known of the monitor's episodes.
 
     Returns:
@@ -40,7 +39,7 @@ def finish_text(part: Path, infix: Infix, known: KnownEpisodes) -> RecoveredFile
     """
     number = episode_of(part.name)
     assert number is not None
-    path = part.with_name(f"{video_prefix(infix, number)}.json")
+    path = part.with_name(f"{video_prefix(known.infix, number)}.json")
     if metadata_path(path).exists():
         part.unlink(missing_ok=True)
         return None
