@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ import numpy as np
 import pytest
 from recordings import (
     frames_in,
-    frames_of,
     journal_of,
     manifest_of,
     metadata_of,
@@ -80,9 +80,9 @@ def killed(tmp_path: Path) -> Callable[[str], Path]:
     """Return a function that runs a program, which kills itself, on a directory."""
 
     def run(program: str, directory: Path | None = None) -> Path:
-        directory = directory or tmp_path / "run"
+        directory, said = directory or tmp_path / "run", tmp_path / "said"
         done = subprocess.run(
-            [sys.executable, "-c", PROGRAM + program, directory, "", TESTS],
+            [sys.executable, "-c", PROGRAM + program, directory, said, TESTS],
             capture_output=True,
             text=True,
             check=False,
@@ -341,23 +341,28 @@ def test_an_encoder_that_was_killed_too_is_told(killed: Callable[[str], Path]) -
     assert part.exists()
 
 
-def test_a_slow_encoder_is_waited_for(
+def test_an_encoder_that_outlives_its_process_is_waited_for(
     killed: Callable[[str], Path], tmp_path: Path
 ) -> None:
     """As long as was asked for; then it is told, and the next time it is done."""
-    directory = killed("env = monitor()\nrun(env, 7)\ndie(env)")
-    mjrec.recover(directory)
-    [video] = directory.glob("*.mp4")
-    _undo(directory, video)
-    part = _part_of(directory, video)
-    with _held(part):
+    directory = killed(
+        "env = monitor()\nrun(env, 7)\ndrained(env.video_recorder._writer)\n"
+        "pid = env.video_recorder._writer._encoding._process.pid\n"
+        "os.kill(pid, signal.SIGSTOP)\n"
+        "open(sys.argv[2], 'w').write(str(pid))\ndie()"
+    )
+    encoder = int((tmp_path / "said").read_text())
+    try:
         recovery = mjrec.recover(directory, timeout=0.1)
-        assert [file.name for file in recovery.failures] == [video.name]
+        [failure] = recovery.failures
+        assert failure.name.endswith("video000000.mp4")
         assert "still finishing" in str(recovery)
-        assert not video.exists()
-        assert part.exists()
-    assert video.name in [file.name for file in mjrec.recover(directory).files]
-    assert frames_of(video)
+        assert videos_in(directory) == []
+    finally:
+        os.kill(encoder, signal.SIGCONT)
+    assert mjrec.recover(directory).failures == ()
+    assert len(frames_in(directory, 0)) == 8
+    assert len(manifest_of(directory)["videos"]) == 1
     assert_in_order(directory)
 
 
@@ -367,14 +372,15 @@ def test_a_video_that_got_its_name_gets_its_metadata(
     """Its process was killed between the two."""
     directory = killed(
         "import mjrec.recorder.video_recorder as v\nv.write_text = lambda *_: die()\n"
-        "env = monitor()\nrun(env)\n"
+        "env = monitor(max_fps=2)\nrun(env)\n"
     )
     assert videos_in(directory) == [0]
     assert not list(directory.glob("*.meta.json"))
     mjrec.recover(directory)
     metadata = metadata_of(directory, 0)
     assert (metadata["complete"], metadata["terminated"]) == (True, True)
-    assert metadata["frame_steps"] == [[0, 12]]
+    # The last one is always taken.
+    assert (metadata["stride"], metadata["frame_steps"]) == (5, [[0, 10], [12, 12]])
     assert metadata["length"] == 12
     assert len(manifest_of(directory)["videos"]) == 1
     assert_in_order(directory)
@@ -575,54 +581,6 @@ def test_nothing_to_recover_loads_no_hdf5(tmp_path: Path) -> None:
         check=True,
     ).stdout
     assert said == "False\n"
-
-
-def _held(path: Path) -> Any:
-    """Hold an existing file locked, as an encoder does."""
-    import contextlib
-    import fcntl
-
-    @contextlib.contextmanager
-    def holding() -> Iterator[None]:
-        with path.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
-
-    return holding()
-
-
-def _undo(directory: Path, video: Path) -> None:
-    """Make a recovered video unfinished again."""
-    metadata = json.loads(video.with_suffix(".meta.json").read_text())
-    video.rename(_part_of(directory, video))
-    video.with_suffix(".meta.json").unlink()
-    encoder = metadata["encoder_version"]
-    note = {
-        "video": {
-            "path": video.name,
-            "temporary": _part_of(directory, video).name,
-            "hashes": None,
-            "height": metadata["height"],
-            "width": metadata["width"],
-            "fps": metadata["fps"],
-            "codec": metadata["codec"],
-            "pixel_format": metadata["pixel_format"],
-            "encoder": {
-                "ffmpeg": encoder["cmdline"][0],
-                "version": encoder["version"],
-                "sha256": None,
-                "arguments": encoder["cmdline"][1:],
-            },
-        },
-        "metadata": {"episode_id": 0},
-        "timing": {"timestep": None, "stride": 1, "frames_per_step": 1},
-        "ffmpeg_size": 1,
-    }
-    (directory / f".{video.name}.note.part").write_text(json.dumps(note))
-
-
-def _part_of(directory: Path, video: Path) -> Path:
-    return directory / f".{video.name}.0123abcd.part"
 
 
 def _infix(directory: Path) -> Any:
