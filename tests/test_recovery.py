@@ -161,6 +161,26 @@ def test_a_live_video_cut_off_in_mid_episode_is_whole_up_to_there(
     assert_in_order(directory)
 
 
+def test_hashes_of_frames_that_never_reached_the_encoder_are_left_out(
+    killed: Callable[[str], Path],
+) -> None:
+    """The process was killed between the two."""
+    directory = killed(
+        "import mjrec.formats.video_writer as v\n"
+        "write, count = v.FfmpegProcess.write, iter(range(9))\n"
+        "def fifth(*arguments):\n"
+        "    die() if next(count) == 5 else write(*arguments)\n"
+        "v.FfmpegProcess.write = fifth\nenv = monitor()\nrun(env)\n"
+        "env.video_recorder.close()\n"
+    )
+    mjrec.recover(directory)
+    [hashes] = directory.glob("*.framehash")
+    assert len(frames_in(directory, 0)) == 5
+    assert len(hashes.read_text().splitlines()) == 9 + 5
+    assert metadata_of(directory, 0)["frame_steps"] == [[0, 4]]
+    assert_in_order(directory)
+
+
 def test_what_was_recovered_stands_in_the_manifest(
     killed: Callable[[str], Path],
 ) -> None:
