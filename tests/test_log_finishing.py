@@ -100,6 +100,32 @@ def test_a_process_that_dies_is_told(
     assert log.exists()
 
 
+@pytest.mark.usefixtures("elsewhere")
+def test_a_process_that_hangs_is_ended(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Where it hung is in the log."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\n"
+        "if sys.argv[0] == '-m':\n"
+        "    import threading\n"
+        "    import mjrec.formats.trajectory_file as f\n"
+        "    def wait_for_a_disk(log):\n"
+        "        threading.Event().wait()\n"
+        "    f.finish_trajectory = wait_for_a_disk\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("MJREC_PATIENCE", "3")
+    log = write_log(tmp_path)
+    with pytest.raises(Error, match="did nothing for 3 seconds"):
+        finish_log(log)
+    assert log.exists()
+    assert "in wait_for_a_disk" in caplog.text
+    assert not children()
+
+
 def test_without_another_process_it_is_done_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,22 +15,29 @@ import logging
 import os
 import signal
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 __all__ = [
+    "MOST_OF_STACKS",
     "ask_for_stacks",
     "environment_of_child",
     "python_command",
     "said_in",
     "say_stacks_when_asked",
+    "stacks_in",
+    "stacks_said_in",
     "take_standard_output",
 ]
 
 logger = logging.getLogger(__name__)
 
+MOST_OF_STACKS = 20_000
 _STACKS = signal.SIGUSR1
+_LOOKS_FOR_STACKS = 20
+_SECONDS_BETWEEN_LOOKS = 0.1
 
 
 def python_command(module: str) -> list[str]:
@@ -85,6 +92,32 @@ def ask_for_stacks(pid: int) -> None:
         os.kill(pid, _STACKS)
         # Should it only have been stopped.
         os.kill(pid, signal.SIGCONT)
+
+
+def stacks_said_in(words: IO[bytes], pid: int) -> str:
+    """Return where a child hangs, for the log.
+
+    Args:
+        words: the file that its standard error is. It is read beside its position,
+            which is the child's too.
+        pid: the child's number.
+    """
+    descriptor = words.fileno()
+    before = os.fstat(descriptor).st_size
+    ask_for_stacks(pid)
+    after = before
+    for _ in range(_LOOKS_FOR_STACKS):
+        time.sleep(_SECONDS_BETWEEN_LOOKS)
+        size = os.fstat(descriptor).st_size
+        if size == after > before:
+            break
+        after = size
+    return stacks_in(os.pread(descriptor, MOST_OF_STACKS, before))
+
+
+def stacks_in(said: bytes) -> str:
+    """Return what a child has said of where it hangs, as text."""
+    return said.decode(errors="replace").strip() or "(it does not say)"
 
 
 def said_in(line: bytes) -> dict[str, Any]:

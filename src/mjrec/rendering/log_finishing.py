@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -21,15 +23,20 @@ from typing import IO, Any
 
 from ..errors import Error
 from ..formats.trajectory_file import finish_trajectory
+from ..patience import Patience
 from .carried_errors import carried, unpacked
 from .child_python import (
     environment_of_child,
     python_command,
     said_in,
+    say_stacks_when_asked,
+    stacks_said_in,
     take_standard_output,
 )
 
 __all__ = ["finish_log", "main"]
+
+logger = logging.getLogger(__name__)
 
 _MODULE = "mjrec.rendering.log_finishing"
 
@@ -37,6 +44,7 @@ _MODULE = "mjrec.rendering.log_finishing"
 _LARGEST_HERE = 8 << 20
 _SECONDS_TO_LEAVE = 3.0
 _END_OF_STDERR = 1500
+_READ_SIZE = 1 << 16
 
 
 def finish_log(log: Path) -> Path:
@@ -45,13 +53,15 @@ def finish_log(log: Path) -> Path:
     What `finish_trajectory` does, for a long log in a process of its own. It may be
     interrupted (Ctrl-C): then no process and no half file is left, and the log stays.
     In the very moment in which the process is started it may be left alone instead; it
-    then finishes the log and ends.
+    then finishes the log and ends. A process that hangs, using no CPU for
+    `patience_s`, is ended, and what it was at is in the log.
 
     Returns:
         The path of the HDF5 file.
 
     Raises:
-        Error: as `finish_trajectory`; or the process was killed, and the log stays.
+        Error: as `finish_trajectory`; or the process was killed or hung, and the log
+            stays.
     """
     try:
         size = log.stat().st_size
@@ -75,6 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Finish the log that is named; return the exit status."""
     [path] = sys.argv[1:] if argv is None else argv
     answers = take_standard_output()
+    say_stacks_when_asked()
     # So that the unfinished file is removed.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     said: dict[str, Any]
@@ -131,10 +142,9 @@ def _start(log: Path, words: IO[bytes]) -> _Finisher:
 
 
 def _result(log: Path, process: _Finisher, words: IO[bytes]) -> Path:
-    assert process.stdout is not None
     said: Mapping[str, Any] = {}
     # One that is killed says nothing, and libraries may have said something before.
-    for line in process.stdout:
+    for line in _output(log, process, words).splitlines():
         said = said_in(line)
     status = process.wait()
     if "finished" in said:
@@ -149,6 +159,45 @@ def _result(log: Path, process: _Finisher, words: IO[bytes]) -> Path:
         f"The process that was to finish {log} {how}. The log stays, and `mjrec "
         f"render` of its directory tries again. The end of what it said: {last_words}"
     )
+
+
+def _output(log: Path, process: _Finisher, words: IO[bytes]) -> bytes:
+    """Return all that the process says, unless it hangs."""
+    assert process.stdout is not None
+    output, patience, used = b"", Patience(), 0.0
+    while True:
+        ready, _, _ = select.select([process.stdout], [], [], patience.begin_slice())
+        patience.end_slice()
+        if ready:
+            block = os.read(process.stdout.fileno(), _READ_SIZE)
+            if not block:
+                return output
+            output += block
+        elif (now := _cpu_seconds(process.pid)) > used:
+            used = now
+            patience.renew()
+        elif patience.is_over:
+            logger.error(
+                "The process that was to finish %s hangs. What it was at:\n%s",
+                log,
+                stacks_said_in(words, process.pid),
+            )
+            raise Error(
+                f"The process that was to finish {log} did nothing for "
+                f"{patience.seconds:g} seconds and was ended. The log stays, and "
+                "`mjrec render` of its directory tries again."
+            )
+
+
+def _cpu_seconds(pid: int) -> float:
+    """Return how long a process has computed; 0 where nobody knows."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return 0.0
+    # Behind the name, which may hold anything, user's and system's time.
+    fields = stat.rpartition(")")[2].split()
+    return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

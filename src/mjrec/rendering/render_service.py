@@ -15,7 +15,6 @@ import select
 import signal
 import subprocess
 import tempfile
-import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,10 +23,10 @@ from typing import IO, Any
 from ..errors import Error
 from ..patience import Patience, patience_s
 from .child_python import (
-    ask_for_stacks,
     environment_of_child,
     python_command,
     said_in,
+    stacks_said_in,
 )
 from .cpu_slots import check_workers
 from .progress import Progress
@@ -45,9 +44,6 @@ _SECONDS_TO_STOP = 3.0
 _END_OF_STDERR = 1500
 # What the server waits for itself, it gives up after one patience.
 _PATIENCES = 3
-_LOOKS_FOR_STACKS = 20
-_SECONDS_BETWEEN_LOOKS = 0.1
-_MOST_OF_STACKS = 20_000
 
 # A forked child shares the pipes, which would then never end for the server.
 _services: weakref.WeakSet[RenderService] = weakref.WeakSet()
@@ -315,17 +311,7 @@ class _Server:
         """Return what the threads of one that hangs are at, for the log."""
         if self._stderr is None:
             return "(nobody could hear it)"
-        before = os.fstat(self._stderr.fileno()).st_size
-        ask_for_stacks(self._process.pid)
-        after = before
-        for _ in range(_LOOKS_FOR_STACKS):
-            time.sleep(_SECONDS_BETWEEN_LOOKS)
-            size = os.fstat(self._stderr.fileno()).st_size
-            if size == after > before:
-                break
-            after = size
-        said = os.pread(self._stderr.fileno(), _MOST_OF_STACKS, before)
-        return said.decode(errors="replace").strip() or "(it does not say)"
+        return stacks_said_in(self._stderr, self._process.pid)
 
     def end_hanging(self, seconds: float) -> None:
         """End it, and say in the obituary that it hung for so long."""

@@ -16,10 +16,12 @@ from typing import IO, Any
 
 from ..errors import Error
 from .child_python import (
+    MOST_OF_STACKS,
     ask_for_stacks,
     environment_of_child,
     python_command,
     said_in,
+    stacks_in,
 )
 from .frame_ring import FrameRing
 
@@ -29,7 +31,6 @@ _END_OF_STDERR = 2000
 _SECONDS_TO_DIE = 5.0
 _SECONDS_TO_SAY_STACKS = 5.0
 _SECONDS_BETWEEN_WORDS = 0.3
-_MOST_OF_STACKS = 20_000
 
 
 class WorkerProcess:
@@ -121,13 +122,13 @@ class WorkerProcess:
         self.listen()
         ask_for_stacks(self.pid)
         said, patience_s = b"", _SECONDS_TO_SAY_STACKS
-        while len(said) < _MOST_OF_STACKS:
+        while len(said) < MOST_OF_STACKS:
             ready, _, _ = select.select([self.words], [], [], patience_s)
             data = self.words.read(1 << 16) if ready else None
             if not data:
                 break
             said, patience_s = said + data, _SECONDS_BETWEEN_WORDS
-        return said.decode(errors="replace").strip() or "(it does not say)"
+        return stacks_in(said)
 
     def end(self) -> None:
         """End it at once. Idempotent."""
