@@ -699,27 +699,25 @@ def test_hostile_mjcf_is_refused(
     inspector.refuses("model", put_zip(directory, {"source/main.xml": xml.encode()}))
 
 
-@pytest.mark.parametrize(
-    ("xml", "reason"),
-    [
-        (
-            INSIDE % '<replicate count="100000000"><geom size="1"/></replicate>',
-            "longer",
-        ),
-        (
-            '<mujoco><asset><texture name="t" type="2d" builtin="flat" width="60000" '
-            'height="60000"/></asset></mujoco>',
-            "memory",
-        ),
-    ],
+FOR_EVER = INSIDE % '<replicate count="100000000"><geom size="1"/></replicate>'
+TEN_GIGABYTES = (
+    '<mujoco><asset><texture name="t" type="2d" builtin="flat" width="60000" '
+    'height="60000"/></asset></mujoco>'
 )
-def test_a_model_that_takes_for_ever_is_given_up(
-    directory: Path, xml: str, reason: str
+
+
+@pytest.mark.parametrize(
+    ("xml", "seconds", "reason"),
+    [(FOR_EVER, 3, "longer than 3 seconds"), (TEN_GIGABYTES, 100, "memory")],
+    ids=["for ever", "ten gigabytes"],
+)
+def test_a_model_that_takes_too_much_is_given_up(
+    directory: Path, xml: str, seconds: int, reason: str
 ) -> None:
-    """And so is one that takes all memory; the process goes on."""
+    """Time or memory; this process goes on."""
     path = put_zip(directory, {"source/main.xml": xml.encode()})
     with pytest.raises(UnreadableFile, match=reason):
-        compile_within(path, limit=1 << 20, compiled_size=1, seconds=3)
+        compile_within(path, limit=1 << 20, compiled_size=1, seconds=seconds)
 
 
 def test_files_and_directories_are_not_multiplied(

@@ -150,6 +150,8 @@ def read_authored(path: Path, *, limit: int) -> mujoco.MjModel:
         apply_fields(model, dict(_fields(members)))
     except (*_REFUSALS, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
+        if isinstance(error, MemoryError) or reason == _MUJOCO_GAVE_UP:
+            reason = "it needs more memory than there is, or than it may have"
         raise UnreadableFile(path, reason.rstrip(".")) from error
     return model
 
@@ -378,7 +380,9 @@ _LONGEST_DIRECTORY = 1 << 20
 _ALWAYS_FINE = 1 << 26
 _MOST_EXPANSION = 100
 
-# What MuJoCo raises where memory does not suffice is a RuntimeError.
+# What MuJoCo raises where memory does not suffice, as a RuntimeError.
+_MUJOCO_GAVE_UP = "Caught an unknown exception!"
+
 _REFUSALS = (KeyError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
 
 
