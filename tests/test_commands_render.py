@@ -23,7 +23,7 @@ from trajectories_by_hand import (
     write_pending_manifest,
 )
 
-from mjrec import Monitor, clear_monitor_files, iter_episodes
+from mjrec import GLError, Monitor, clear_monitor_files, iter_episodes
 from mjrec.commands import main
 from mjrec.formats.monitor_directory import Infix
 from mjrec.rendering import again, crew
@@ -361,6 +361,25 @@ def test_strict_fails_where_nothing_is_to_be_seen(
     assert len(list(tmp_path.glob("*.mp4"))) == 1
     content = json.loads(manifest.read_text())
     assert len(content["mjrec"]["pending"]) == bool(again_at)
+
+
+def test_where_nothing_can_be_drawn_one_try_is_enough(
+    tmp_path: Path, mjrec: Run, painter: Painter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each video is told with the reason."""
+    tries: list[Path] = []
+
+    def fail(trajectory: Path, *rest: object) -> None:
+        tries.append(trajectory)
+        raise GLError("nothing renders here")
+
+    monkeypatch.setattr(painter, "frames", fail)
+    for episode_id in range(3):
+        write_finished(tmp_path, episode_id)
+    status, out, _ = mjrec(tmp_path, "--fps", "30")
+    assert status == 1
+    assert "3 videos could not be rendered:" in out
+    assert len(tries) == 1
 
 
 def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 
-from ..errors import BlankVideo, Error, InvalidArgument
+from ..errors import BlankVideo, Error, GLError, InvalidArgument
 from ..rates import to_rate
 from .outcomes import Outcome
 from .pending import EpisodeKey
@@ -112,16 +112,26 @@ def render_again(
         now = replace(now, frames_done=now.frames_done + 1)
         on_progress(now)
 
+    gl_failure: str | None = None
     with DrawingWorkers(workers) as crew:
         for place, (trajectory, video) in enumerate(zip(paths, outs, strict=True), 1):
-            outcome = _render(
-                trajectory,
-                variant,
-                video,
-                workers=crew,
-                strict=strict,
-                on_frame=count_frame,
+            outcome = Outcome(
+                name=video.name, directory=video.parent, failure=gl_failure
             )
+            # Where nothing can be drawn, each would take as long to find that out.
+            if gl_failure is None:
+                try:
+                    outcome = _render(
+                        trajectory,
+                        variant,
+                        video,
+                        workers=crew,
+                        strict=strict,
+                        on_frame=count_frame,
+                    )
+                except GLError as error:
+                    gl_failure = str(error)
+                    outcome = replace(outcome, failure=gl_failure)
             # Also the frames that were not drawn: nobody waits for them any more.
             now = replace(now, videos_done=place, frames_done=sum(counts[:place]))
             on_progress(now)
@@ -137,7 +147,11 @@ def _render(
     strict: bool,
     on_frame: Callable[[], object],
 ) -> Outcome:
-    """Render one, and return what became of it."""
+    """Render one, and return what became of it.
+
+    Raises:
+        GLError: nothing can be drawn here.
+    """
     outcome = Outcome(name=video.name, directory=video.parent)
     try:
         file = render_video(
@@ -154,6 +168,8 @@ def _render(
         return replace(
             outcome, is_video=True, frame_count=error.frame_count, failure=str(error)
         )
+    except GLError:
+        raise
     except (Error, OSError) as error:
         return replace(outcome, failure=str(error))
     except Exception as error:
