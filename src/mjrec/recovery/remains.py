@@ -134,8 +134,7 @@ def remains_of(directory: Path) -> list[Remains]:
     """Return the files of all monitors, those that are open too."""
     grouped: dict[Infix, list[Path]] = {}
     for path in iter_monitor_files(directory, hidden=True):
-        part = _PART.fullmatch(path.name)
-        infix = Infix.parse(infix_of(part["final"] if part else path.name) or "")
+        infix = _infix_of(path.name)
         if infix is not None:
             grouped.setdefault(infix, []).append(path)
     return [
@@ -146,8 +145,15 @@ def remains_of(directory: Path) -> list[Remains]:
 
 def look_through(directory: Path, infix: Infix) -> Remains:
     """Return the files of one monitor as they are now."""
-    found = (remains for remains in remains_of(directory) if remains.infix == infix)
-    return next(found, Remains(directory, infix, ()))
+    # Many names are compared, of whole directories, once for each dead monitor.
+    paths = [
+        path
+        for path in directory.iterdir()
+        if f".{infix}." in path.name
+        and _infix_of(path.name) == infix
+        and path.is_file()
+    ]
+    return Remains(directory, infix, tuple(sorted(paths)))
 
 
 def model_leftovers(directory: Path) -> list[Path]:
@@ -189,6 +195,11 @@ def lacks_results(remains: Remains) -> bool:
         return files.journal is not None and MonitorResults(files).is_behind
     except UnreadableFile:
         return True
+
+
+def _infix_of(name: str) -> Infix | None:
+    part = _PART.fullmatch(name)
+    return Infix.parse(infix_of(part["final"] if part else name) or "")
 
 
 def _begins_with_frame(part: Path) -> bool:
