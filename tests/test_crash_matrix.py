@@ -96,6 +96,8 @@ def crash(directory: Path, render: str, way: str, delay: float) -> Crash:
         [sys.executable, "-c", PROGRAM, str(directory), render, way, str(delay)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
+        # Or what follows the first line could be read with it, and be lost.
+        bufsize=0,
         start_new_session=True,
     ) as process:
         assert process.stdout is not None

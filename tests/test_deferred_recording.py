@@ -243,7 +243,7 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(
 
 def test_killed_monitor_leaves_what_can_be_rendered(tmp_path: Path) -> None:
     """A whole episode is there after SIGKILL, and its video can be made."""
-    code = SCRIPT + "env.close = None\nenv._recorder._end_episode(complete=True)\n"
+    code = SCRIPT + "env.close = None\nenv._recorder._end_episode()\n"
     code += "import os, signal; os.kill(os.getpid(), signal.SIGKILL)\n"
     done = run_script(code.replace("workers=1", "workers=0"), tmp_path)
     assert done.returncode == -signal.SIGKILL, done.stderr

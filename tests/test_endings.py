@@ -216,3 +216,39 @@ def test_ways_of_ending_a_program(
     assert trajectory.facts["reason"] == reason
     if reason == "exception":
         assert trajectory.facts["exception"]["message"] == "too far"
+
+
+def test_a_signal_whose_exception_is_lost_comes_again(tmp_path: Path) -> None:
+    """Python ignores what finalisers raise, and there is no second SIGTERM."""
+    done = run(
+        "class Last:\n"
+        "    def __del__(self): os.kill(os.getpid(), signal.SIGTERM)\n"
+        "Last()\n"
+        "import time\n"
+        "time.sleep(30)\n",
+        tmp_path,
+    )
+    assert done.returncode == 143, done.stderr
+    assert "2 videos pending" in done.stderr
+
+
+def test_the_end_of_an_episode_that_is_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C while its trajectory is written: the episode is complete all the same."""
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
+    monitor = Monitor(env, tmp_path, lambda _: True, workers=0)
+    monitor.reset(seed=0)
+    steps(monitor, 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "mjrec.recorder.trajectory_recorder.TrajectoryRecorder.end",
+            lambda *_: signal.raise_signal(signal.SIGINT),
+        )
+        with pytest.raises(KeyboardInterrupt):
+            steps(monitor, 1)
+    monitor.close()
+    [path] = tmp_path.glob("*.h5")
+    facts = mjrec.load_trajectory(path).facts
+    assert (facts["complete"], facts["truncated"]) == (True, True)
+    assert stats_of(tmp_path)["episode_lengths"] == [3]

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 from .errors import Error
@@ -57,6 +59,9 @@ def exit_on_signals() -> None:
         )
     for signum in _deadly():
         signal.signal(signum, _raise)
+    if sys.unraisablehook is not _send_again:
+        _hooks[:] = [sys.unraisablehook]
+        sys.unraisablehook = _send_again
 
 
 @contextlib.contextmanager
@@ -75,6 +80,8 @@ def exiting_on_signals() -> Iterator[None]:
     finally:
         for signum in handled:
             signal.signal(signum, signal.SIG_DFL)
+        if sys.unraisablehook is _send_again:
+            sys.unraisablehook = _hooks.pop()
 
 
 def _deadly() -> list[signal.Signals]:
@@ -92,9 +99,26 @@ def received() -> Terminated | None:
 
 
 _received: list[Terminated] = []
+_hooks: list[Callable[[sys.UnraisableHookArgs], object]] = []
+_MOMENT = 0.05
 
 
 def _raise(signum: int, frame: FrameType | None) -> None:
     error = Terminated(signum)
     _received.append(error)
     raise error
+
+
+def _send_again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Send a signal again whose exception has been lost.
+
+    It was raised between two instructions of a finaliser, or of a callback, where
+    Python reports exceptions and goes on. There is no second SIGTERM, but a SIGKILL.
+    """
+    error = unraisable.exc_value
+    if not isinstance(error, Terminated):
+        _hooks[0](unraisable)
+        return
+    # Not here, where it would be lost once more.
+    signum = error.signal
+    threading.Timer(_MOMENT, lambda: os.kill(os.getpid(), signum)).start()

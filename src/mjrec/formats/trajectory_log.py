@@ -430,12 +430,6 @@ class TrajectoryLogWriter:
                 raise DirectoryNotWritable(self.path.parent, error) from error
             self._is_there = False
 
-    def __del__(self) -> None:
-        # Also of one that could not be made.
-        descriptor = getattr(self, "_descriptor", None)
-        if descriptor is not None:
-            os.close(descriptor)
-
     def __repr__(self) -> str:
         tail = self._tail
         state = "closed" if self.closed else f"{tail.offset} bytes written"

@@ -30,7 +30,7 @@ from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
 from .deferred_video import DeferredVideo
-from .endings import RESET, ending
+from .endings import CLOSE, INTERRUPT, RESET, ending
 from .episode_videos import EpisodeVideos
 from .faults import Faults, What
 from .opening import OpenDirectory, open_directory
@@ -153,8 +153,10 @@ class Recorder:
         self._videos = EpisodeVideos()
         self._decision = (-1, False)
         self._faults = Faults(options.on_error)
-        # Of the running episode, once the environment has raised.
+        # Why the running episode ends early, once the environment has raised.
         self._ending: dict[str, Any] | None = None
+        # What the last step said.
+        self._flags = {"terminated": False, "truncated": False}
         self._place: OpenDirectory = open_directory(
             directory,
             force=options.force,
@@ -271,7 +273,7 @@ class Recorder:
             self._next_episode_id -= 1
             self._discard_episode()
         else:
-            self._end_episode(complete=False, **self._ending or {"reason": RESET})
+            self._end_episode(otherwise=RESET)
         self._ending = None
         self.stats_recorder.after_reset()
         self._episode_start = {
@@ -336,14 +338,18 @@ class Recorder:
         """
         reward = reward_to_float(reward)
         done = bool(terminated or truncated)
-        self.stats_recorder.count(reward, done)
         self._ending = None
+        if done:
+            # Before it is counted: an end that is interrupted is taken up again.
+            self._flags = {
+                "terminated": bool(terminated),
+                "truncated": bool(truncated),
+            }
+        self.stats_recorder.count(reward, done)
         try:
             if done:
                 # First of all, so that no failing video can lose the episode.
-                self._journal_episode(
-                    terminated=bool(terminated), truncated=bool(truncated)
-                )
+                self._journal_episode()
         finally:
             try:
                 if self._trajectory is not None:
@@ -357,11 +363,7 @@ class Recorder:
                     self._take_picture(self._live_video, is_there=picture, last=done)
             finally:
                 if done:
-                    self._end_episode(
-                        complete=True,
-                        terminated=bool(terminated),
-                        truncated=bool(truncated),
-                    )
+                    self._end_episode()
 
     def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
         """End the running episode, and wait until all videos are rendered.
@@ -415,7 +417,7 @@ class Recorder:
             self._take_last_picture()
         finally:
             try:
-                self._end_episode(complete=False, **self._ending or ending(None))
+                self._end_episode()
             finally:
                 # A trajectory without its model is worth nothing, and what stores it
                 # may end with the process.
@@ -678,7 +680,7 @@ class Recorder:
                     raise
                 self._live_video.give_up(str(error))
 
-    def _journal_episode(self, *, terminated: bool, truncated: bool) -> None:
+    def _journal_episode(self) -> None:
         stats = self.stats_recorder
         try:
             self._journal.append(
@@ -688,8 +690,7 @@ class Recorder:
                     reward=stats.episode_rewards[-1],
                     type=stats.episode_types[-1],
                     end_time=stats.timestamps[-1],
-                    terminated=terminated,
-                    truncated=truncated,
+                    **self._flags,
                     **self._episode_start,
                 )
             )
@@ -708,23 +709,37 @@ class Recorder:
         if trajectory is not None:
             trajectory.discard()
 
-    def _end_episode(self, *, complete: bool, **facts: Any) -> None:
-        """Finish the running episode's trajectory and video, if there are any."""
+    def _how_it_ended(self, otherwise: str) -> dict[str, Any]:
+        """Return whether the running episode is complete, and what ended it."""
+        if self.stats_recorder.done:
+            return {"complete": True, **self._flags}
+        return {"complete": False, **(self._ending or {"reason": otherwise})}
+
+    def _end_episode(self, *, otherwise: str = CLOSE) -> None:
+        """Finish the running episode's trajectory and video, if there are any.
+
+        Args:
+            otherwise: why, where it is not over and nothing was raised.
+        """
+        facts = self._how_it_ended(otherwise)
         try:
-            self._end_trajectory(complete=complete, **facts)
+            self._end_trajectory(facts)
         finally:
             if self._live_video is not None:
-                self._end_live_video(self._live_video, complete=complete, **facts)
+                self._end_live_video(self._live_video, facts)
 
-    def _end_trajectory(self, *, complete: bool, **facts: Any) -> None:
+    def _end_trajectory(self, facts: Mapping[str, Any]) -> None:
         trajectory = self._trajectory
         if trajectory is None:
             return
         stats = self.stats_recorder
+        is_short = trajectory.steps < (stats.steps or 0) and not trajectory.is_stopped
+        if is_short and facts["complete"]:
+            # Ctrl-C has come between the counting of the last step and its row.
+            facts = {"complete": False, "reason": INTERRUPT}
         try:
             trajectory.end(
                 {
-                    "complete": complete,
                     **facts,
                     "length": trajectory.steps,
                     "reward": stats.rewards,
@@ -765,7 +780,7 @@ class Recorder:
             raise failed[0]
 
     def _end_live_video(
-        self, recorder: VideoRecorder, *, complete: bool, **facts: Any
+        self, recorder: VideoRecorder, facts: Mapping[str, Any]
     ) -> None:
         """Finish a video that was drawn live; what is known goes with it."""
         if not recorder.enabled or recorder.closed:
@@ -773,7 +788,7 @@ class Recorder:
         stats = self.stats_recorder
         if "complete" not in recorder.metadata:
             # Else an end that was interrupted is taken up again.
-            recorder.metadata.update(complete=complete, **facts)
+            recorder.metadata.update(facts)
         recorder.metadata.update(length=stats.steps, reward=stats.rewards)
         try:
             recorder.close()

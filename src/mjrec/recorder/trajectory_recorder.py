@@ -62,6 +62,7 @@ class TrajectoryRecorder:
         path: of the log, which is there after the first step.
         steps: how many steps were recorded.
         frame_count: how many snapshots were taken.
+        is_stopped: nothing more of the episode is recorded, after an error.
         blocks: memory that the next trajectory may use, once this one has ended.
     """
 
@@ -91,7 +92,7 @@ class TrajectoryRecorder:
         self._log: TrajectoryLogWriter | None = None
         self._ended = False
         self._is_told = False
-        self._is_stopped = False
+        self.is_stopped = False
         # What a row holds behind its state; and a state where there is none.
         self._behind_state: tuple[memoryview, ...] = ()
         # Where all of a step, and its frame, can be copied without asking further.
@@ -111,7 +112,7 @@ class TrajectoryRecorder:
 
     def before_step(self, action: Any) -> None:
         """Note the action of the coming step, which the environment may overwrite."""
-        if self._is_stopped:
+        if self.is_stopped:
             return
         if self._log is None:
             self._action = action_array(action)
@@ -134,7 +135,7 @@ class TrajectoryRecorder:
 
     def stop(self, reason: str) -> None:
         """Record nothing more of the episode, and say why; what was recorded stays."""
-        self._is_stopped = True
+        self.is_stopped = True
         self.note(broken_reason=reason)
 
     def step(
@@ -164,7 +165,7 @@ class TrajectoryRecorder:
             FileNotWritten: the disk is full; all is kept, and another call tries again.
             PicturesDiffer: no picture of this moment can be made from its state.
         """
-        if self._is_stopped:
+        if self.is_stopped:
             return
         log = self._log
         assert log is not None, "before_step was not called"
@@ -214,7 +215,7 @@ class TrajectoryRecorder:
         log, states, number = self._log, self._states, self.steps
         if log is None or states is None or self._last_frame == number:
             return
-        if self._is_stopped:
+        if self.is_stopped:
             return
         if not self._takes_frames:
             self._last_frame = number
