@@ -9,7 +9,9 @@ process with it is read in forks.
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
+import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -33,6 +35,7 @@ from mjrec.formats.trajectory_log_reader import TrajectoryLogReader
 from mjrec.formats.video_metadata import is_broken
 from mjrec.json_text import dumps, loads
 from mjrec.rendering.recorded_facts import open_for_rendering
+from mjrec.rendering.rendered_manifests import reconcile
 
 FEW = settings(
     derandomize=True,
@@ -63,20 +66,30 @@ VALUES = st.recursive(
     max_leaves=6,
 )
 
+# What has broken readers: each is tried in every place, far more often than what
+# Hypothesis would come to by itself.
+NASTY_VALUES: list[Any] = [
+    *(None, True, 0, 5, -1, 0.5, 10**400, 2**64, -(2**63), 1e308, float("inf")),
+    *("", "5", "..", "../x", "a/b", "\ud800", "a" * 300, "1e999999999"),
+    *([], {}, [5], [None], ["../x"], [[]], {"a": 1}, [{}], [{"video": 5}]),
+]
+NASTY = st.sampled_from(NASTY_VALUES).map(copy.deepcopy)
+
 
 @st.composite
 def changed(draw: st.DrawFn, sound: Any) -> Any:
     """Return `sound` with something in it replaced, removed or added."""
     value = json.loads(json.dumps(sound))
     for _ in range(draw(st.integers(1, 3))):
-        value = draw(_changed_once(value))
+        value = draw(_changed_once(value, at_the_top=True))
     return value
 
 
 @st.composite
-def _changed_once(draw: st.DrawFn, value: Any) -> Any:
-    if not isinstance(value, dict | list) or not value or draw(st.integers(0, 9)) == 0:
-        return draw(VALUES)
+def _changed_once(draw: st.DrawFn, value: Any, at_the_top: bool = False) -> Any:
+    is_end = not isinstance(value, dict | list) or not value
+    if is_end or draw(st.integers(0, 30 if at_the_top else 3)) == 3:
+        return draw(st.one_of(NASTY, NASTY, VALUES))
     keys: list[Any] = list(value) if isinstance(value, dict) else [*range(len(value))]
     key = draw(st.sampled_from(keys))
     what = draw(st.integers(0, 9))
@@ -91,10 +104,26 @@ def _changed_once(draw: st.DrawFn, value: Any) -> Any:
     return value
 
 
+def spoilt(sound: Any) -> Iterator[Any]:
+    """Yield `sound` with each thing in it replaced by each nasty one, and left out."""
+    if isinstance(sound, dict | list):
+        keys: list[Any] = [*sound] if isinstance(sound, dict) else [*range(len(sound))]
+        for key in keys:
+            for inner in spoilt(sound[key]):
+                changed = copy.copy(sound)
+                changed[key] = inner
+                yield changed
+            changed = copy.copy(sound)
+            del changed[key]
+            yield changed
+    yield from NASTY_VALUES
+
+
 def mangled(sound: Any) -> st.SearchStrategy[bytes]:
     """Texts of changed values, some of which are damaged as texts too."""
     texts = changed(sound).map(lambda value: json.dumps(value).encode())
-    return st.one_of(texts, texts, st.builds(damaged, texts, DAMAGE))
+    rarely = st.integers(0, 7).flatmap(lambda n: DAMAGE if n == 5 else st.just([]))
+    return st.builds(damaged, texts, rarely)
 
 
 DAMAGE = st.lists(
@@ -179,19 +208,42 @@ def read_or_refuse(path: Path, read: Callable[[Path], Any]) -> Any:
 @given(data=mangled(MANIFEST))
 def test_any_manifest(tmp_path: Path, data: bytes) -> None:
     """What is read can be written again, and names files of the directory only."""
+    check_manifest(tmp_path, data)
+
+
+def test_every_manifest_with_one_thing_wrong(tmp_path: Path) -> None:
+    """Likewise."""
+    for value in spoilt(MANIFEST):
+        check_manifest(tmp_path, json.dumps(value).encode())
+
+
+def check_manifest(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "openaigym.manifest.0.7.manifest.json"
     path.write_bytes(data)
     found: Manifest | None = read_or_refuse(path, read_manifest)
     if found is not None:
         names = [found.stats, *(name for pair in found.videos for name in pair)]
         assert all((tmp_path / name).parent == tmp_path for name in names)
+        assert all(len(os.fsencode(name)) <= 255 for name in names)
         write_manifest(path, found)
+        # It uses more of it than reading checks.
+        reconcile(tmp_path)
 
 
 @FEW
 @given(data=mangled(STATS))
 def test_any_statistics(tmp_path: Path, data: bytes) -> None:
     """What is read can be written again."""
+    check_statistics(tmp_path, data)
+
+
+def test_all_statistics_with_one_thing_wrong(tmp_path: Path) -> None:
+    """Likewise."""
+    for value in spoilt(STATS):
+        check_statistics(tmp_path, json.dumps(value).encode())
+
+
+def check_statistics(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "openaigym.episode_batch.0.7.stats.json"
     path.write_bytes(data)
     found: StatsFile | None = read_or_refuse(path, read_stats_file)
@@ -291,6 +343,20 @@ def test_any_log(tmp_path: Path, sound_log: bytes, data: st.DataObject) -> None:
     path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
     path.write_bytes(log_of(records))
     read_or_refuse(path, read_everything)
+
+
+@pytest.mark.parametrize("part", ["facts", "rows"])
+def test_every_header_with_one_thing_wrong(
+    tmp_path: Path, sound_log: bytes, part: str
+) -> None:
+    """Of a log; what is relied on in rendering is looked at there."""
+    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
+    records = records_of(sound_log)
+    head = json.loads(records[0][1])
+    for value in spoilt(head[part]):
+        records[0] = (b"head", json.dumps({**head, part: value}).encode())
+        path.write_bytes(log_of(records))
+        read_or_refuse(path, read_everything)
 
 
 @FEW
