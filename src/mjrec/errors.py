@@ -173,7 +173,7 @@ class FileNotWritten(Error, OSError):
         self.path = path
         super().__init__(
             f"Cannot write {path}: {reason}. What is there stays as it is; where space "
-            "was lacking, free some, and the next close() or `mjrec render` tries again."
+            "was lacking, free some: the next close() or `mjrec render` tries again."
         )
 
 
