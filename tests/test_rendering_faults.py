@@ -311,7 +311,10 @@ def test_a_killed_encoder_beside_a_simulation(
     [name] = caught.value.failures
     assert name.endswith("video000001.mp4")
     assert len(list(directory.glob("*.mp4"))) == 2
-    assert list(reasons_in(directory)) == [name]
+    [(pending, reason)] = reasons_in(directory).items()
+    assert pending == name
+    assert reason is not None
+    assert reason.endswith("no memory")
     assert not list(directory.glob(".*"))
     monkeypatch.delenv("IMAGEIO_FFMPEG_EXE")
     assert [outcome.failure for outcome in finish(directory)] == [None]
@@ -349,7 +352,19 @@ def test_with_strict_a_dark_scene_is_an_error(tmp_path: Path) -> None:
 
 
 def test_with_strict_a_dark_live_scene_is_an_error(tmp_path: Path) -> None:
-    """As its video ends."""
+    """As its episode ends; the video counts as finished."""
+    live = Monitor(
+        pendulum(tmp_path, render_mode="rgb_array"),
+        tmp_path / "run",
+        lambda _: True,
+        render="live",
+        strict=True,
+    )
+    with pytest.raises(BlankVideo, match="frames are black"):
+        run(live, episodes=1)
+    live.close()
+    [manifest] = (tmp_path / "run").glob("*.manifest.json")
+    assert len(json.loads(manifest.read_text())["videos"]) == 1
     env = pendulum(tmp_path, render_mode="rgb_array")
     recorder = VideoRecorder(env, tmp_path / "v.mp4", strict=True)
     env.reset(seed=0)

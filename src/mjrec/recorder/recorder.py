@@ -506,6 +506,7 @@ class Recorder:
             clock=self._subject.clock,
             declared=self._subject.declared,
             facts=self._subject.pictures.facts,
+            strict=self._options.strict,
         )
         if recorder.enabled:
             self._live_video = recorder
@@ -842,7 +843,7 @@ class Recorder:
             },
             "first_episode_id": self._place.first_episode_id,
             "next_episode_id": self._next_episode_id,
-            "pending": self._videos.pending(),
+            "pending": self._videos.pending(self.failures()),
             "broken": self._videos.broken(),
             "faults": self._faults.listed(),
             "versions": dict(versions()),
