@@ -25,6 +25,14 @@ from mjrec.formats.ffmpeg import ffmpeg_executable
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the key of the tests' recordings out of the home directory."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 def pytest_report_header() -> list[str]:
     """Say what the pictures come from."""
     return [f"MUJOCO_GL={os.environ['MUJOCO_GL']}", f"dm_control: {_HAS_DM_CONTROL}"]

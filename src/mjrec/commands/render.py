@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from ..rendering.finishing import finish_pending
 from ..rendering.outcomes import Outcome
 from ..rendering.pending import EpisodeKey, recorded_episodes
 from ..rendering.views import View
+from ..simulation.model_trust import trusting_all_models
 from .help_text import flowing_help
 from .view_options import camera_of, size_of
 
@@ -91,6 +93,7 @@ def render(
     out: Path | None = None,
     workers: int | None = None,
     strict: bool = False,
+    trust_models: bool = False,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
     """Render the pending videos of a directory, or recorded episodes again.
@@ -118,6 +121,9 @@ def render(
             given.
         strict: fail where a video shows nothing: black, of one colour, or without any
             movement; it is kept.
+        trust_models: load compiled models also where another user, or another machine,
+            has written them, as is needed where their sources are not there. A crafted
+            one can do anything to whoever loads it.
         as_json: print one JSON object at the end, and nothing else.
     """
     height, width = size_of(size)
@@ -137,7 +143,8 @@ def render(
     check_workers(workers)
     directory, keys = _episodes(target, episode)
     console = rich.console.Console(quiet=as_json)
-    with RenderProgress(console) as progress:
+    trust = trusting_all_models() if trust_models else contextlib.nullcontext()
+    with trust, RenderProgress(console) as progress:
         if is_again:
             outcomes = render_again(
                 _trajectories(target, keys),

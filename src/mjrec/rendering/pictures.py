@@ -55,7 +55,8 @@ def render(
             ...
 
     Args:
-        trajectory: what `mjrec.load_trajectory` returned, or its path.
+        trajectory: what `mjrec.load_trajectory` returned, or its path. With
+            `trust_models=True` there, the compiled model is loaded whoever wrote it.
         camera: the name or number of one of the model's cameras, -1 for the free
             camera in the place that the model gives it, an `mujoco.MjvCamera`, or a
             mapping of its members; None is as recorded.
@@ -73,7 +74,7 @@ def render(
 
     Raises:
         UnreadableFile: the trajectory or its model is missing, damaged, or made by a
-            MuJoCo that this one cannot read.
+            MuJoCo that this one cannot read, or by a stranger.
         NoPictures: the trajectory has states and no snapshots.
         UnknownName: its model has no camera of that name, or there is no such quality.
         InvalidArgument: another value that cannot be, also a size that the driver
@@ -92,7 +93,8 @@ def render(
         check_has_pictures(reader)
         warn_of_other_pictures(reader)
         chosen = chosen_frames(reader.frame_count, reader.header.facts, max_fps)
-    pool = DrawingWorkers(workers)
+    is_trusted = bool(getattr(trajectory, "trust_models", False))
+    pool = DrawingWorkers(workers, trust_models=is_trusted)
     return _Pictures(pool, lambda: pool.frames(path, chosen.indices, view))
 
 

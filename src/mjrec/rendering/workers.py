@@ -20,6 +20,7 @@ from ..gl.backends import (
     rendering_is_off,
 )
 from ..patience import Patience
+from ..simulation.model_trust import with_all_models_trusted
 from .carried_errors import unpacked
 from .frame_ring import SLOTS, FrameRing
 from .views import View
@@ -59,18 +60,22 @@ class DrawingWorkers:
 
     Args:
         count: how many processes; more than one use one CPU each.
+        trust_models: whether they load compiled models that a stranger wrote; they do
+            in any case where `MJREC_TRUST_MODELS` says so here.
 
     Raises:
         InvalidArgument: `count` is not a whole number of at least 1.
         UnknownName: `MUJOCO_GL` names no backend that there is.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, *, trust_models: bool = False) -> None:
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise InvalidArgument(
                 f"workers must be a whole number of at least 1, got {count!r}."
             )
         self._environ = _environment(os.environ, alone=count == 1)
+        if trust_models:
+            self._environ = with_all_models_trusted(self._environ)
         self._seats = [_Seat() for _ in range(count)]
         self._selector = selectors.DefaultSelector()
         self._gl_strings: dict[str, str] = {}

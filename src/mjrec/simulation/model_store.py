@@ -8,7 +8,8 @@
     └── openaigym.model.<16 hex digits>.zip       what it was made from, where known
 
 The digits are the beginning of the sha256 of the compiled model. Only the MuJoCo
-version that compiled a model can load it; the zip is for all others.
+version that compiled a model can load it; the zip is for all others, and for whoever
+is not the user who has stored it (`model_trust`).
 """
 
 from __future__ import annotations
@@ -38,6 +39,12 @@ from .authored_model import (
     authored_from_file,
     with_embedded_files,
     write_authored,
+)
+from .model_trust import (
+    TRUST_VARIABLE,
+    all_models_are_trusted,
+    is_sealed,
+    seal_of,
 )
 from .source_compiler import compile_within
 
@@ -98,7 +105,7 @@ class ModelStore:
         Returns:
             The facts by which `load_model` finds it: `sha256` of the compiled model,
             `bytes` of it, `mjb` and `xml` (base names; `xml` may be None), `mujoco`
-            (the version).
+            (the version), `seal` (of this user; None where there is no key).
         """
         compiled = _compiled(model)
         digest = hashlib.sha256(compiled.data).hexdigest()
@@ -109,6 +116,7 @@ class ModelStore:
             "mjb": f"{stem}.mjb.gz",
             "xml": None if authored is None else f"{stem}.zip",
             "mujoco": mujoco.__version__,
+            "seal": seal_of(digest),
         }
         names = {name for name in (facts["mjb"], facts["xml"]) if name is not None}
         if not names <= self._known:
@@ -175,34 +183,60 @@ class ModelStore:
         self._failures.append(FileNotWritten(path, error.strerror or error))
 
 
-def load_model(directory: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:
+def load_model(
+    directory: Path, facts: Mapping[str, Any], *, trust_models: bool = False
+) -> mujoco.MjModel:
     """Return a stored model.
 
-    It is loaded as it was compiled, where this is the MuJoCo version that compiled it,
-    and else compiled again from what it was made from; of that, only files from the
-    zip are read.
+    It is loaded as it was compiled, where this is the MuJoCo version that compiled it
+    and the seal says that this user has stored it. Else it is compiled again from what
+    it was made from; of that, only files from the zip are read.
 
     Args:
         directory: of the recording.
         facts: as `ModelStore.add` returned them.
+        trust_models: whether to load a compiled model without a seal too. MuJoCo
+            believes what stands in it: a crafted one can do anything.
 
     Raises:
         UnreadableFile: the files are missing, damaged or not what the facts say, or
-            another MuJoCo version is needed.
+            another MuJoCo version or trust is needed.
     """
     compiled, source = (_path(directory, facts.get(key)) for key in ("mjb", "xml"))
+    has_source = source is not None and source.exists()
     is_same_version = facts.get("mujoco") == mujoco.__version__
     if compiled is not None and is_same_version and compiled.exists():
-        try:
-            return _load_compiled(compiled, facts)
-        except UnreadableFile as error:
-            if source is None or not source.exists():
-                raise
-            logger.warning("%s It is compiled from %s again.", error, source.name)
-    if source is not None and source.exists():
+        if trust_models or _is_trusted(facts):
+            try:
+                return _load_compiled(compiled, facts)
+            except UnreadableFile as error:
+                if not has_source:
+                    raise
+                logger.warning("%s It is compiled from %s again.", error, source)
+        elif not has_source:
+            raise _not_trusted(compiled)
+        else:
+            logger.info("%s is a stranger's; its sources are compiled.", compiled)
+    if source is not None and has_source:
         size = _recorded_size(source, facts)
         return compile_within(source, limit=_source_limit(size), compiled_size=size)
     raise _not_loadable(directory, facts, is_same_version=is_same_version)
+
+
+def _is_trusted(facts: Mapping[str, Any]) -> bool:
+    sealed = is_sealed(facts.get("seal"), facts.get("sha256"))
+    return sealed or all_models_are_trusted()
+
+
+def _not_trusted(path: Path) -> UnreadableFile:
+    return UnreadableFile(
+        path,
+        "the compiled model was not written by this user on this machine, and a "
+        "crafted one can do anything to whoever loads it; what it was made from, which "
+        "would be compiled instead, is not there. If you trust whoever recorded it: "
+        "`mjrec render --trust-models`, mjrec.load_trajectory(path, "
+        f"trust_models=True), or {TRUST_VARIABLE}=1",
+    )
 
 
 def _not_loadable(

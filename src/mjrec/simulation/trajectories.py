@@ -33,12 +33,19 @@ _ALWAYS_FINE = 1 << 31
 _MOST_EXPANSION = 64
 
 
-def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+def load_trajectory(
+    path: str | os.PathLike[str], *, trust_models: bool = False
+) -> Trajectory:
     """Return a recorded episode.
 
     Args:
         path: of its `openaigym.trajectory.*.h5`, or of the `.log` of an episode that
             is not over, or whose process was killed.
+        trust_models: whether `model()`, and `mjrec.render` of what is returned, load
+            a compiled model that another user, or another machine, has written. A
+            crafted one can do anything to whoever loads it; so without this, such a
+            model is compiled from its sources, where they are there.
+            `MJREC_TRUST_MODELS=1` says the same for all.
 
     Raises:
         UnreadableFile: there is no such file, or it is damaged, foreign, or of a newer
@@ -53,7 +60,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     if path.is_dir():
         raise InvalidArgument(_what_is_in(path))
     with open_trajectory(path) as reader:
-        return Trajectory(reader)
+        return Trajectory(reader, trust_models=trust_models)
 
 
 class Trajectory:
@@ -83,9 +90,11 @@ class Trajectory:
 
     Args:
         reader: of the file; it may be closed afterwards.
+        trust_models: whether a compiled model that a stranger wrote is loaded.
 
     Attributes:
         path: of the file that was read.
+        trust_models: as given.
         facts: all that is known besides arrays, as `docs/format.md` lists it.
         states: `(T + 1, n) float64`, the physics states (`mjSTATE_INTEGRATION`, in
             MuJoCo's units); n is 0 where there was no simulation. See `component`.
@@ -98,10 +107,11 @@ class Trajectory:
         dropped: how many rows at the end were torn when its process was killed.
     """
 
-    def __init__(self, reader: TrajectoryReader) -> None:
+    def __init__(self, reader: TrajectoryReader, *, trust_models: bool = False) -> None:
         count, row_count = reader.step_count, reader.row_count
         _check_size(reader)
         self.path = reader.path
+        self.trust_models = trust_models
         self.facts = reader.header.facts
         self.states = reader.states(0, row_count)
         self.actions = reader.actions(0, count)
@@ -193,7 +203,8 @@ class Trajectory:
 
         Raises:
             UnreadableFile: the model beside this file is missing or damaged, or was
-                written by another MuJoCo version and not with its sources.
+                written by another MuJoCo version, or by somebody else, and not with
+                its sources.
             InvalidArgument: there is no such step.
         """
         # Here, because reading needs no simulator.
@@ -208,7 +219,7 @@ class Trajectory:
             )
         if not isinstance(stored, Mapping):
             raise UnreadableFile(self.path, "what it says of its model is no object")
-        model = load_model(self.path.parent, stored)
+        model = load_model(self.path.parent, stored, trust_models=self.trust_models)
         try:
             # One at a time: there may be thousands, and each as large as a texture.
             with open_trajectory(self.path) as reader:
