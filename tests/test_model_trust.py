@@ -23,7 +23,7 @@ from rides import Ride, record
 from sound_files import stored
 
 import mjrec
-from mjrec import UnreadableFile, load_trajectory
+from mjrec import UnreadableFile, UntrustedModel, load_trajectory
 from mjrec.commands import main
 from mjrec.simulation.model_store import load_model
 from mjrec.simulation.model_trust import is_sealed, seal_of
@@ -319,7 +319,7 @@ def test_mujoco_never_sees_what_nobody_vouches_for(
         del crafted["seal"]
     else:
         crafted["seal"] = others[seal]
-    with pytest.raises(UnreadableFile, match="not written by this user") as error:
+    with pytest.raises(UntrustedModel, match="not written by this user") as error:
         load_model(directory, crafted)
     assert error.value.path == directory / crafted["mjb"]
     for way_out in ("--trust-models", "trust_models=True", "MJREC_TRUST_MODELS=1"):
@@ -329,14 +329,16 @@ def test_mujoco_never_sees_what_nobody_vouches_for(
 def test_a_strangers_sources_are_compiled(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In a process with limits; what is compiled in the directory is left alone."""
+    """In a process with limits; where that fails, the ways out are told too."""
     facts = stored(directory)
     become_another_user(monkeypatch, tmp_path)
     forbid_compiled_models(monkeypatch, directory)
     assert load_model(directory, facts).ngeom == 1
     (directory / facts["xml"]).write_bytes(b"no zip")
-    with pytest.raises(UnreadableFile, match=facts["xml"]):
+    with pytest.raises(UntrustedModel, match="it is no zip file") as error:
         load_model(directory, facts)
+    assert "--trust-models" in str(error.value)
+    assert "move this one away" not in str(error.value)
 
 
 def test_ones_own_model_is_loaded_as_it_was_compiled(directory: Path) -> None:
@@ -361,7 +363,7 @@ def test_trust_by_environment_variable(
     become_another_user(monkeypatch, tmp_path)
     monkeypatch.setenv("MJREC_TRUST_MODELS", said)
     if not is_loaded:
-        with pytest.raises(UnreadableFile, match="not written by this user"):
+        with pytest.raises(UntrustedModel, match="not written by this user"):
             load_model(directory, facts)
         return
     assert load_model(directory, facts).ngeom == 1
@@ -396,9 +398,9 @@ def theirs(directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_pictures_of_a_strangers_recording_need_a_word(theirs: Ride) -> None:
     """Of the trajectory, which goes to the workers too."""
     trajectory = load_trajectory(theirs.path)
-    with pytest.raises(UnreadableFile, match="not written by this user"):
+    with pytest.raises(UntrustedModel, match="not written by this user"):
         trajectory.model()
-    with pytest.raises(UnreadableFile, match="not written by this user"):
+    with pytest.raises(UntrustedModel, match="not written by this user"):
         next(mjrec.render(trajectory))
     trusted = load_trajectory(theirs.path, trust_models=True)
     assert trusted.model().ngeom == 3
@@ -447,3 +449,24 @@ def test_sources_show_what_the_environment_showed(
     again = load_trajectory(path).model()
     np.testing.assert_array_equal(again.geom_rgba, model.geom_rgba)
     np.testing.assert_array_equal(again.geom_size, model.geom_size)
+
+
+@pytest.mark.dm_control
+def test_composers_sources_show_what_the_task_showed(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are what composer has put together for the episode."""
+    manipulation = pytest.importorskip("dm_control.manipulation")
+    env = manipulation.load("reach_site_features", seed=2)
+    size = {"height": 48, "width": 64}
+    monitor = mjrec.Monitor(
+        env, directory, lambda _: True, workers=0, env_id="dm_control/reach", **size
+    )
+    monitor.reset()
+    shown = [env.physics.render(**size)]
+    monitor.step(np.full(env.action_spec().shape, 0.1))
+    shown.append(env.physics.render(**size))
+    monitor.close(wait=False)
+    become_another_user(monkeypatch, tmp_path)
+    [path] = directory.glob("*.trajectory.*")
+    np.testing.assert_array_equal(list(mjrec.render(path)), shown)

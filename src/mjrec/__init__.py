@@ -36,6 +36,7 @@ from .errors import (
     ResetNotAllowed,
     UnknownName,
     UnreadableFile,
+    UntrustedModel,
 )
 
 if TYPE_CHECKING:
@@ -130,6 +131,7 @@ __all__ = [
     "Trajectory",
     "UnknownName",
     "UnreadableFile",
+    "UntrustedModel",
     "VideoRecorder",
     "VideoWriter",
     "capped_cubic_video_schedule",

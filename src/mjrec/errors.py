@@ -27,6 +27,7 @@
     ├── PolicyError                         a policy raised or gave a bad action
     ├── ArchiveError                        write_archive's checks
     ├── UnreadableFile                      a damaged or foreign file
+    │   └── UntrustedModel                  a stranger's, and without its sources
     └── MissingDependency (also ImportError)  an extra is not installed
 
 Every message says what was asked, what is there, and what to do.
@@ -66,6 +67,7 @@ __all__ = [
     "ResetNotAllowed",
     "UnknownName",
     "UnreadableFile",
+    "UntrustedModel",
 ]
 
 
@@ -327,6 +329,20 @@ class UnreadableFile(Error):
             else ""
         )
         super().__init__(f"Cannot read {path}: {reason}.{advice}")
+
+
+class UntrustedModel(UnreadableFile):
+    """A compiled model that a stranger may have written, which is not loaded.
+
+    Attributes:
+        path: of the model.
+        reason: why nothing else can be used instead, and how to say that it is trusted.
+    """
+
+    def __init__(self, path: Path, reason: object) -> None:
+        super().__init__(path, reason)
+        # It is no worse there than elsewhere: the base's advice is of no use.
+        self.args = (f"The model {path} is not loaded: {self.reason}.",)
 
 
 class MissingDependency(Error, ImportError):

@@ -74,7 +74,9 @@ def render(
 
     Raises:
         UnreadableFile: the trajectory or its model is missing, damaged, or made by a
-            MuJoCo that this one cannot read, or by a stranger.
+            MuJoCo that this one cannot read.
+        UntrustedModel: its model was compiled by another user or on another machine,
+            and its sources are not there.
         NoPictures: the trajectory has states and no snapshots.
         UnknownName: its model has no camera of that name, or there is no such quality.
         InvalidArgument: another value that cannot be, also a size that the driver

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic_files import replacing
-from ..errors import FileNotWritten, UnreadableFile
+from ..errors import FileNotWritten, UnreadableFile, UntrustedModel
 from ..formats.json_fields import unreadable
 from ..formats.monitor_directory import FILE_PREFIX
 from ..formats.regular_files import open_regular
@@ -200,27 +200,27 @@ def load_model(
 
     Raises:
         UnreadableFile: the files are missing, damaged or not what the facts say, or
-            another MuJoCo version or trust is needed.
+            another MuJoCo version is needed.
+        UntrustedModel: there is only a compiled model without a seal.
     """
-    compiled, source = (_path(directory, facts.get(key)) for key in ("mjb", "xml"))
-    has_source = source is not None and source.exists()
+    compiled, source = (
+        path if path is not None and path.exists() else None
+        for path in (_path(directory, facts.get(key)) for key in ("mjb", "xml"))
+    )
     is_same_version = facts.get("mujoco") == mujoco.__version__
-    if compiled is not None and is_same_version and compiled.exists():
-        if trust_models or _is_trusted(facts):
-            try:
-                return _load_compiled(compiled, facts)
-            except UnreadableFile as error:
-                if not has_source:
-                    raise
-                logger.warning("%s It is compiled from %s again.", error, source)
-        elif not has_source:
-            raise _not_trusted(compiled)
-        else:
-            logger.info("%s is a stranger's; its sources are compiled.", compiled)
-    if source is not None and has_source:
-        size = _recorded_size(source, facts)
-        return compile_within(source, limit=_source_limit(size), compiled_size=size)
-    raise _not_loadable(directory, facts, is_same_version=is_same_version)
+    if compiled is None or not is_same_version:
+        if source is None:
+            raise _not_loadable(directory, facts, is_same_version=is_same_version)
+        return _compile(source, facts)
+    if not (trust_models or _is_trusted(facts)):
+        return _compile_instead_of(compiled, source, facts)
+    try:
+        return _load_compiled(compiled, facts)
+    except UnreadableFile as error:
+        if source is None:
+            raise
+        logger.warning("%s It is compiled from %s again.", error, source.name)
+        return _compile(source, facts)
 
 
 def _is_trusted(facts: Mapping[str, Any]) -> bool:
@@ -228,14 +228,33 @@ def _is_trusted(facts: Mapping[str, Any]) -> bool:
     return sealed or all_models_are_trusted()
 
 
-def _not_trusted(path: Path) -> UnreadableFile:
-    return UnreadableFile(
-        path,
-        "the compiled model was not written by this user on this machine, and a "
-        "crafted one can do anything to whoever loads it; what it was made from, which "
-        "would be compiled instead, is not there. If you trust whoever recorded it: "
-        "`mjrec render --trust-models`, mjrec.load_trajectory(path, "
-        f"trust_models=True), or {TRUST_VARIABLE}=1",
+def _compile(source: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:
+    size = _recorded_size(source, facts)
+    return compile_within(source, limit=_source_limit(size), compiled_size=size)
+
+
+def _compile_instead_of(
+    compiled: Path, source: Path | None, facts: Mapping[str, Any]
+) -> mujoco.MjModel:
+    """Return the model from its sources, because a stranger has compiled it."""
+    if source is None:
+        raise _untrusted(compiled, "is not there")
+    logger.info("%s is a stranger's. %s is compiled.", compiled, source.name)
+    try:
+        return _compile(source, facts)
+    except UnreadableFile as error:
+        reason = f"cannot be compiled instead ({source.name}: {error.reason})"
+        raise _untrusted(compiled, reason) from error
+
+
+def _untrusted(compiled: Path, what_of_sources: str) -> UntrustedModel:
+    return UntrustedModel(
+        compiled,
+        "it was not written by this user on this machine, and a crafted one can do "
+        f"anything to whoever loads it; and what it was made from {what_of_sources}. "
+        "If you trust whoever recorded it: `mjrec render --trust-models`, "
+        "mjrec.load_trajectory(path, trust_models=True), or the environment variable "
+        f"{TRUST_VARIABLE}=1",
     )
 
 

@@ -203,8 +203,8 @@ class Trajectory:
 
         Raises:
             UnreadableFile: the model beside this file is missing or damaged, or was
-                written by another MuJoCo version, or by somebody else, and not with
-                its sources.
+                written by another MuJoCo version and not with its sources.
+            UntrustedModel: likewise, and it was written by another user.
             InvalidArgument: there is no such step.
         """
         # Here, because reading needs no simulator.
