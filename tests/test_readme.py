@@ -68,7 +68,7 @@ def test_python_block_runs(name: str, checkout: Path) -> None:
 def test_command_runs(line: str, checkout: Path) -> None:
     """As it stands, with the recordings that the ones before it made."""
     needs_dm_control(line)
-    if line.startswith(("mjrec list", "mjrec render")):
+    if line.startswith(("mjrec list", "mjrec render", "mjrec recover")):
         out = f"--out {line.split()[2]} "
         [recording] = [x for x in shell_lines() if out in x]
         run(sys.executable, "-m", *shlex.split(recording), cwd=checkout)

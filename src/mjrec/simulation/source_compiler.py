@@ -40,7 +40,7 @@ _LONGEST_REASON = 2000
 # The largest robots and rooms of the field compile in seconds.
 _SECONDS = 300.0
 # Python, MuJoCo and what they need for threads, and then some room.
-_BASE_MEMORY = 3 << 30
+_BASE_MEMORY = 6 << 30
 _MEMORY_FACTOR = 8
 
 
