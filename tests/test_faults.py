@@ -50,6 +50,12 @@ def go_on(monitor: Any, steps: int) -> None:
         monitor.step(monitor.action_space.sample() * 0)
 
 
+def remove(directory: Path) -> None:
+    """Remove a directory, though a thread may be writing a model there."""
+    while directory.exists():
+        shutil.rmtree(directory, ignore_errors=True)
+
+
 def faults_of(directory: Path) -> list[tuple[int | None, str]]:
     found = manifest_of(directory)["mjrec"]["faults"]
     assert all(fault["reason"] for fault in found)
@@ -87,7 +93,7 @@ def test_dead_encoder(
     assert metadata_of(tmp_path / "run", 0)["broken"] is True
     assert len(frames_in(tmp_path / "run", 1)) == 9
     assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8]
-    assert [r.levelno for r in caplog.records if "not whole" in r.message] == [
+    assert [r.levelno for r in caplog.records if "Not recorded whole" in r.message] == [
         logging.WARNING
     ]
 
@@ -171,15 +177,81 @@ def test_full_disk_at_the_journal(
 def test_directory_that_is_removed_during_the_run(
     render: str, pendulum: Pendulum, tmp_path: Path
 ) -> None:
-    """The simulation goes on to its end, and closing says what is lost, once."""
+    """The simulation goes on to its end; that no results can be written is an error."""
     monitor = pendulum(render=render, workers=0, on_error="warn")
     run(monitor)
-    shutil.rmtree(tmp_path / "run")
+    remove(tmp_path / "run")
     run(monitor)
     run(monitor, 3)
-    monitor.close()
-    assert monitor.stats_recorder.episode_lengths == [8, 8]
+    with pytest.raises(FileNotWritten, match=r"stats\.json"):
+        monitor.close()
     assert not (tmp_path / "run").exists()
+    (tmp_path / "run").mkdir()
+    monitor.close()
+    assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8]
+
+
+def test_disk_that_has_no_room_at_all(pendulum: Pendulum, tmp_path: Path) -> None:
+    """What nothing was written of is not promised, and the results come later."""
+    monitor = pendulum(workers=0, on_error="warn")
+    with file_size_limit(0):
+        run(monitor)
+        with pytest.raises(FileNotWritten):
+            monitor.close()
+    monitor.close()
+    assert stats_of(tmp_path / "run")["episode_lengths"] == [8]
+    assert (0, "trajectory") in faults_of(tmp_path / "run")
+    assert manifest_of(tmp_path / "run")["mjrec"]["pending"] == []
+    assert list((tmp_path / "run").glob("*.log")) == []
+
+
+@pytest.mark.parametrize("on_error", ["raise", "warn"])
+def test_first_picture_that_cannot_be_drawn(
+    on_error: str, pendulum: Pendulum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """States are recorded all the same; the metadata says what became of the video."""
+    monitor = pendulum(render="live", on_error=on_error)
+    with monkeypatch.context() as patch:
+
+        def broken(*_: object) -> None:
+            raise RuntimeError("no window yet")
+
+        patch.setattr(monitor.unwrapped, "render", broken)
+        if on_error == "raise":
+            with pytest.raises(RuntimeError, match="no window yet"):
+                run(monitor)
+        else:
+            run(monitor)
+    run(monitor)
+    monitor.close()
+    if on_error == "raise":
+        # The reset after it has replaced the one that was never whole.
+        assert len(frames_in(tmp_path / "run", 0)) == 9
+    else:
+        assert len(frames_in(tmp_path / "run", 1)) == 9
+        assert faults_of(tmp_path / "run") == [(0, "video")]
+        assert metadata_of(tmp_path / "run", 0)["broken_reason"] == "no window yet"
+        assert len(list((tmp_path / "run").glob("*.h5"))) == 2
+
+
+def test_a_reset_is_allowed_after_a_picture_that_failed(
+    pendulum: Pendulum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is no other way on for whoever catches the error."""
+    monitor = pendulum(render="live")
+    run(monitor, 4)
+    with monkeypatch.context() as patch:
+
+        def broken(*_: object) -> None:
+            raise RuntimeError("the window is gone")
+
+        patch.setattr(monitor.unwrapped, "render", broken)
+        with pytest.raises(RuntimeError, match="the window is gone"):
+            go_on(monitor, 1)
+    run(monitor)
+    monitor.close()
+    metadata = metadata_of(tmp_path / "run", 0)
+    assert metadata["exception"]["message"] == "the window is gone"
 
 
 def test_directory_that_is_removed_is_an_error_by_default(
@@ -188,7 +260,7 @@ def test_directory_that_is_removed_is_an_error_by_default(
     """At the first thing that cannot be written, which it names."""
     monitor = pendulum(workers=0)
     run(monitor)
-    shutil.rmtree(tmp_path / "run")
+    remove(tmp_path / "run")
     with pytest.raises(FileNotWritten, match="episode000001"):
         run(monitor)
     with pytest.raises(FileNotWritten):

@@ -955,7 +955,7 @@ def test_close_can_be_tried_again_when_there_is_space(
     env = mjrec.Monitor(corridor, tmp_path / "a", video_callable=False)
     play(env, 1)
     (tmp_path / "a").rename(tmp_path / "b")
-    with pytest.raises(mjrec.FileNotWritten, match=r"stats\.json.*close\(\) once more"):
+    with pytest.raises(mjrec.FileNotWritten, match=r"stats\.json.*next close\(\)"):
         env.close()
     (tmp_path / "b").rename(tmp_path / "a")
     env.close()

@@ -73,6 +73,12 @@ def start(tmp_path: Path) -> Iterator[Callable[..., RenderService]]:
         service.stop()
 
 
+@pytest.fixture
+def others() -> set[int]:
+    """The processes that were there before."""
+    return children()
+
+
 def finished(logs: list[Path]) -> list[bool]:
     return [log.with_suffix(".h5").exists() and not log.exists() for log in logs]
 
@@ -132,13 +138,13 @@ def test_nothing_is_started_before_there_is_something_to_do(
 
 
 def test_submitting_never_waits(
-    tmp_path: Path, start: Callable[..., RenderService]
+    others: set[int], tmp_path: Path, start: Callable[..., RenderService]
 ) -> None:
     """Not even while the server does not read, with more names than a pipe holds."""
     log = write_log(tmp_path, video=None)
     service = start()
     service.submit(log)
-    [server] = children()
+    [server] = children() - others
     os.kill(server, signal.SIGSTOP)
     missing = [tmp_path / f"{log.stem[:-6]}{k:06d}.log" for k in range(1, 3000)]
     for path in missing:
@@ -251,18 +257,19 @@ def test_a_wait_can_be_interrupted(
 
 
 def test_ctrl_c_in_the_terminal_does_not_reach_the_server(
-    tmp_path: Path, start: Callable[..., RenderService]
+    others: set[int], tmp_path: Path, start: Callable[..., RenderService]
 ) -> None:
     """It has a session of its own, and gives way to others."""
     service = start()
     service.submit(write_log(tmp_path, video=None))
-    [server] = children()
+    [server] = children() - others
     assert os.getsid(server) == server
     wait_until(lambda: os.getpriority(os.PRIO_PROCESS, server) == 10)
 
 
 @pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_second_server_goes_on_for_a_dead_one(
+    others: set[int],
     signum: signal.Signals,
     recorded: Path,
     start: Callable[..., RenderService],
@@ -275,7 +282,7 @@ def test_a_second_server_goes_on_for_a_dead_one(
     service = start(recorded)
     for log in sorted(recorded.glob("*.log")):
         service.submit(log)
-    [server] = children()
+    [server] = children() - others
     if signum == signal.SIGKILL:
         wait_until(lambda: list(recorded.glob(".*.mp4.*.part")))
     os.kill(server, signum)
@@ -284,10 +291,11 @@ def test_a_second_server_goes_on_for_a_dead_one(
     assert [len(frames_of(video)) for video in recorded.glob("*.mp4")] == [4, 4]
     assert signum.name in caplog.text
     assert not list(recorded.glob(".*"))
-    assert not children()
+    assert children() == others
 
 
 def test_servers_that_die_are_one_clear_failure(
+    others: set[int],
     tmp_path: Path,
     start: Callable[..., RenderService],
     caplog: pytest.LogCaptureFixture,
@@ -298,7 +306,7 @@ def test_servers_that_die_are_one_clear_failure(
     for log in logs:
         service.submit(log)
     for _ in range(2):
-        [server] = children()
+        [server] = children() - others
         os.kill(server, signal.SIGKILL)
         wait_until(functools.partial(_has_ended, server))
         later = write_log(tmp_path, 2)
@@ -311,10 +319,11 @@ def test_servers_that_die_are_one_clear_failure(
     service.submit(write_log(tmp_path, 3))
     service.wait()
     assert len(service.failures) == 4
-    assert not children()
+    assert children() == others
 
 
 def test_a_server_that_hangs_is_ended(
+    others: set[int],
     tmp_path: Path,
     start: Callable[..., RenderService],
     caplog: pytest.LogCaptureFixture,
@@ -345,7 +354,7 @@ def test_a_server_that_hangs_is_ended(
     pids = [int(pid) for pid in (tmp_path / "pids").read_text().split()]
     assert len(pids) == 2
     wait_until(lambda: all(map(_has_ended, pids)))
-    assert not children()
+    assert children() == others
 
 
 def test_a_server_at_work_does_not_hang(

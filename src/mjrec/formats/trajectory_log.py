@@ -161,6 +161,7 @@ class TrajectoryLogWriter:
 
     Attributes:
         path: of the log.
+        is_there: the file was made.
         blocks: the memory in use.
 
     Raises:
@@ -180,7 +181,7 @@ class TrajectoryLogWriter:
         self._process_id = os.getpid()
         self._lock = threading.RLock()
         self._descriptor: int | None = None
-        self._is_there = False
+        self.is_there = False
         self._tail = _Tail(0, _beginning(header.facts, blocks.layout_text))
         flush_in_time(self)
 
@@ -412,9 +413,15 @@ class TrajectoryLogWriter:
             self._let_go()
 
     def abandon(self) -> None:
-        """Close the file without writing what is not there yet. Idempotent."""
+        """Close the file without writing what is not there yet. Idempotent.
+
+        A file without anything in it is removed.
+        """
         with self._lock:
+            is_empty = not self.closed and self._tail.offset == 0
             self._let_go()
+            if is_empty:
+                self._remove()
 
     def discard(self) -> None:
         """Leave nothing, whether it was closed or not. Idempotent.
@@ -422,13 +429,17 @@ class TrajectoryLogWriter:
         Raises:
             DirectoryNotWritable: the file cannot be removed.
         """
-        self.abandon()
-        if self._is_there and os.getpid() == self._process_id:
+        with self._lock:
+            self._let_go()
+            self._remove()
+
+    def _remove(self) -> None:
+        if self.is_there and os.getpid() == self._process_id:
             try:
                 self.path.unlink(missing_ok=True)
             except OSError as error:
                 raise DirectoryNotWritable(self.path.parent, error) from error
-            self._is_there = False
+            self.is_there = False
 
     def __repr__(self) -> str:
         tail = self._tail
@@ -464,7 +475,7 @@ class TrajectoryLogWriter:
         return size
 
     def _open(self) -> int:
-        self._is_there = True
+        self.is_there = True
         try:
             self._descriptor = os.open(self.path, _NEW_FILE, 0o666)
         except FileExistsError:

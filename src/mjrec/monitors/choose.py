@@ -114,7 +114,8 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             a dead encoder, a video that cannot be rendered) the simulation goes on,
             the log says so once, and the manifest lists under `mjrec.faults` which
             episodes lack what. What the environment itself raises is raised in any
-            case, and so is wrong use, a step before the first reset for instance.
+            case, and so is wrong use, a step before the first reset for instance, and
+            a `close()` that can write no results.
         strict: whether a video that shows nothing (all frames black, of one colour
             each, or all the same) is an error, `BlankVideo` as its episode ends or, of
             a deferred one, `RenderError` in `close`. The video is kept in any case, its

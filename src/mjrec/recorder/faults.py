@@ -53,7 +53,7 @@ class Faults:
         if fault not in self._faults:
             self._faults.append(fault)
             of = "" if episode_id is None else f" of episode {episode_id}"
-            logger.warning("The %s%s is not whole: %s", what, of, error)
+            logger.warning("Not recorded whole: %s%s. %s", what, of, error)
         return True
 
     def listed(self) -> list[dict[str, Any]]:

@@ -288,10 +288,17 @@ class Recorder:
         except Exception as error:
             if not self._tolerates("video", error):
                 raise
-            self._trajectory = self._live_video = None
-            self._begin_live_video(episode_id, enabled=False)
+            # Where it is only the first picture, states are recorded all the same.
+            if self._live_video is not None:
+                self._live_video.give_up(str(error))
+            else:
+                self._begin_live_video(episode_id, enabled=False)
         if self._options.write_upon_reset:
-            self._flush()
+            try:
+                self._write_results()
+            except FileNotWritten as error:
+                if not self._faults.tolerates("statistics", error, episode_id=None):
+                    raise
 
     def note_error(self, error: BaseException) -> None:
         """Note that the environment's step or reset has raised, or its user has.
@@ -436,8 +443,9 @@ class Recorder:
         return self._rendering.failures if self._rendering is not None else {}
 
     def _let_go(self) -> None:
-        # Where it fails, all stays open, and the next close tries again.
-        self._flush()
+        # Where it fails, all stays open, and the next close tries again. That is an
+        # error in any case: no simulation is disturbed, and nothing else would say it.
+        self._write_results()
         self.closed = True
         self.stats_recorder.closed = True
         self._journal.close()
@@ -659,9 +667,10 @@ class Recorder:
             if last:
                 recorder.capture_last()
         except Exception as error:
-            if not self._tolerates("video", error):
-                raise
             # Also where it is the environment's own `render` that has raised.
+            if not self._tolerates("video", error):
+                self.note_error(error)
+                raise
             recorder.give_up(str(error))
 
     def _take_last_picture(self) -> None:
@@ -696,8 +705,10 @@ class Recorder:
                 )
             )
         except OSError as error:
-            if not self._tolerates("journal", error):
-                raise
+            path = self.directory / journal_name(self._place.infix)
+            named = FileNotWritten(path, error.strerror or error)
+            if not self._tolerates("journal", named):
+                raise named from error
 
     def _tolerates(self, what: What, error: BaseException) -> bool:
         """Note what of the running episode is lost; tell whether to go on."""
@@ -752,6 +763,9 @@ class Recorder:
                 raise
             trajectory.abandon()
         self._trajectory, self._blocks = None, trajectory.blocks
+        if not trajectory.is_there:
+            # The disk was too full for a single row: there is nothing to promise.
+            return
         if isinstance(self.video_recorder, DeferredVideo):
             self.video_recorder.close()
             self._videos.add_deferred(
@@ -812,13 +826,6 @@ class Recorder:
             "recording": LIVE,
             "versions": dict(versions()),
         }
-
-    def _flush(self) -> None:
-        try:
-            self._write_results()
-        except FileNotWritten as error:
-            if not self._faults.tolerates("statistics", error, episode_id=None):
-                raise
 
     def _write_results(self) -> None:
         self.stats_recorder.flush()

@@ -110,6 +110,11 @@ class TrajectoryRecorder:
         self._first_time = pace.clock()
         self._take_first()
 
+    @property
+    def is_there(self) -> bool:
+        """Whether there is a file, with as much as could be written."""
+        return self._log is not None and self._log.is_there
+
     def before_step(self, action: Any) -> None:
         """Note the action of the coming step, which the environment may overwrite."""
         if self.is_stopped:

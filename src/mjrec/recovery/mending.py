@@ -81,11 +81,12 @@ class Mending:
 
     def _mend(self, remains: Remains) -> None:
         known = KnownEpisodes(remains)
-        before = len(self.files)
         for log in remains.logs:
             with self._noting_failure(log.name), self._claimed(log) as is_ours:
                 if is_ours:
                     self._note(finish_log_of_dead(log, known))
+        # Of logs a manifest says nothing that is not so of trajectories.
+        before = len(self.files)
         for note in remains.notes:
             with self._noting_failure(_video_of(note)):
                 self._note(finish_video(note, known, is_over=self._is_over))

@@ -177,7 +177,8 @@ def is_open(remains: Remains) -> bool:
 
 def has_work(remains: Remains) -> bool:
     """Tell whether anything is to be put in order, of a monitor that is not open."""
-    return bool(remains.notes or remains.leftovers or lacks_results(remains))
+    unfinished = remains.notes or remains.leftovers or remains.logs
+    return bool(unfinished or lacks_results(remains))
 
 
 def lacks_results(remains: Remains) -> bool:
@@ -192,7 +193,9 @@ def lacks_results(remains: Remains) -> bool:
         # Gym's own never had these, and its manifests cannot be made again.
         return bool(files.journal or files.trajectories)
     try:
-        return files.journal is not None and MonitorResults(files).is_behind
+        results = MonitorResults(files)
+        is_damaged = results.manifest is None
+        return files.journal is not None and (is_damaged or results.is_behind)
     except UnreadableFile:
         return True
 
