@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,9 @@ def test_full_disk_while_an_episode_is_recorded(
     """Its trajectory ends there; what was recorded before is whole."""
     monitor = pendulum(workers=0, on_error=on_error)
     run(monitor)
+    # A thread stores it, and this is not about that.
+    while not list((tmp_path / "run").glob("*.mjb.gz")):
+        time.sleep(0.01)
     with file_size_limit(200):
         if on_error == "raise":
             with pytest.raises(FileNotWritten, match="episode000001"):
