@@ -22,6 +22,7 @@ import pytest
 from PIL import Image
 
 from mjrec.errors import FileNotWritten, UnreadableFile
+from mjrec.simulation import model_store
 from mjrec.simulation.model_store import (
     AuthoredModel,
     ModelStore,
@@ -179,14 +180,31 @@ def test_a_model_that_changes_later_is_stored_as_it_was(directory: Path) -> None
 
 
 def test_a_full_disk_is_one_error_and_can_be_tried_again(directory: Path) -> None:
-    """The error names the file; the store goes on."""
+    """The error names the file; what could not be written is kept until it can."""
+    shutil.rmtree(directory)
+    store = ModelStore(directory)
+    facts = store.add(sphere())
+    for _ in range(2):
+        with pytest.raises(FileNotWritten, match=facts["mjb"]):
+            store.finish()
+    directory.mkdir()
+    store.finish()
+    assert load_model(directory, facts).ngeom == 1
+    store.finish()
+
+
+def test_a_model_too_many_is_not_kept(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that is full for long does not fill the memory; the error is told once."""
+    monkeypatch.setattr(model_store, "_MOST_KEPT", 0)
     shutil.rmtree(directory)
     store = ModelStore(directory)
     facts = store.add(sphere())
     with pytest.raises(FileNotWritten, match=facts["mjb"]):
         store.finish()
-    store.finish()
     directory.mkdir()
+    store.finish()
     store.add(sphere())
     store.finish()
     assert load_model(directory, facts).ngeom == 1

@@ -65,6 +65,9 @@ _LARGEST = 1 << 31
 _ALWAYS_FINE = 1 << 28
 _MOST_EXPANSION = 100
 
+# Of models that could not be written, until there is room for them.
+_MOST_KEPT = 1 << 28
+
 _NAME = re.compile(r"openaigym\.model\.(?P<digits>[0-9a-f]{16})\.(mjb\.gz|zip)")
 
 
@@ -88,7 +91,8 @@ class ModelStore:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._known: set[str] = set()
-        self._failures: list[FileNotWritten] = []
+        self._failures: dict[str, FileNotWritten] = {}
+        self._failed: dict[str, _Job] = {}
         self._writer: WorkerThread[_Job] | None = None
 
     def add(
@@ -128,20 +132,31 @@ class ModelStore:
         """Wait until every model is stored. More may be added afterwards.
 
         Raises:
-            FileNotWritten: one could not be; it is tried again when it is added again.
+            FileNotWritten: one could not be. It is tried again by the next call, and
+                when it is added again.
         """
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        self._wait()
+        failed, self._failed = self._failed, {}
+        for stem, job in failed.items():
+            del self._failures[stem]
+            self._queue(job)
+        self._wait()
         if self._failures:
-            failure, *_ = self._failures
-            self._failures.clear()
+            failure, *_ = self._failures.values()
+            # What is kept is told again, if it fails again.
+            kept = self._failed.keys()
+            self._failures = {k: v for k, v in self._failures.items() if k in kept}
             raise failure
 
     def leave(self) -> None:
         """Let what waits be stored in the background. Never blocks."""
         if self._writer is not None:
             self._writer.leave()
+
+    def _wait(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
 
     def _queue(self, job: _Job) -> None:
         if self._writer is None:
@@ -163,7 +178,7 @@ class ModelStore:
                 if not _can_hold(temporary, len(job.compiled)):
                     _write_gzip(temporary, job.compiled, 0)
         except OSError as error:
-            self._note_failure(path, error)
+            self._note_failure(path, job, error)
 
     def _store_authored(self, path: Path, job: _Job, authored: AuthoredModel) -> None:
         if path.exists():
@@ -176,11 +191,14 @@ class ModelStore:
         except ValueError as error:
             logger.debug("%s is not stored: %s", path.name, error)
         except OSError as error:
-            self._note_failure(path, error)
+            self._note_failure(path, job, error)
 
-    def _note_failure(self, path: Path, error: OSError) -> None:
+    def _note_failure(self, path: Path, job: _Job, error: OSError) -> None:
         self._known.discard(path.name)
-        self._failures.append(FileNotWritten(path, error.strerror or error))
+        kept = sum(len(other.compiled) for other in self._failed.values())
+        if kept + len(job.compiled) <= _MOST_KEPT:
+            self._failed[job.stem] = job
+        self._failures[job.stem] = FileNotWritten(path, error.strerror or error)
 
 
 def load_model(
