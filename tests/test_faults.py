@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,18 @@ def go_on(monitor: Any, steps: int) -> None:
     """Take some more."""
     for _ in range(steps):
         monitor.step(monitor.action_space.sample() * 0)
+
+
+@contextlib.contextmanager
+def not_drawn(monitor: Any, why: str) -> Iterator[None]:
+    """Let the environment's render() raise."""
+
+    def render(*_: object) -> None:
+        raise RuntimeError(why)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(monitor.unwrapped, "render", render)
+        yield
 
 
 def remove(directory: Path) -> None:
@@ -112,17 +125,14 @@ def test_dead_encoder_is_an_error_by_default(
 
 
 def test_environment_that_cannot_be_drawn_any_more(
-    pendulum: Pendulum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pendulum: Pendulum, tmp_path: Path
 ) -> None:
     """What its render() raises ends the video, not the simulation."""
     monitor = pendulum(render="live", on_error="warn")
     run(monitor, 4)
 
-    def broken(*_: object) -> None:
-        raise RuntimeError("the window is gone")
-
-    monkeypatch.setattr(monitor.unwrapped, "render", broken)
-    go_on(monitor, 4)
+    with not_drawn(monitor, "the window is gone"):
+        go_on(monitor, 4)
     monitor.close()
     assert faults_of(tmp_path / "run") == [(0, "video")]
     metadata = metadata_of(tmp_path / "run", 0)
@@ -211,16 +221,11 @@ def test_disk_that_has_no_room_at_all(pendulum: Pendulum, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("on_error", ["raise", "warn"])
 def test_first_picture_that_cannot_be_drawn(
-    on_error: str, pendulum: Pendulum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    on_error: str, pendulum: Pendulum, tmp_path: Path
 ) -> None:
     """States are recorded all the same; the metadata says what became of the video."""
     monitor = pendulum(render="live", on_error=on_error)
-    with monkeypatch.context() as patch:
-
-        def broken(*_: object) -> None:
-            raise RuntimeError("no window yet")
-
-        patch.setattr(monitor.unwrapped, "render", broken)
+    with not_drawn(monitor, "no window yet"):
         if on_error == "raise":
             with pytest.raises(RuntimeError, match="no window yet"):
                 run(monitor)
@@ -239,19 +244,16 @@ def test_first_picture_that_cannot_be_drawn(
 
 
 def test_a_reset_is_allowed_after_a_picture_that_failed(
-    pendulum: Pendulum, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pendulum: Pendulum, tmp_path: Path
 ) -> None:
     """There is no other way on for whoever catches the error."""
     monitor = pendulum(render="live")
     run(monitor, 4)
-    with monkeypatch.context() as patch:
-
-        def broken(*_: object) -> None:
-            raise RuntimeError("the window is gone")
-
-        patch.setattr(monitor.unwrapped, "render", broken)
-        with pytest.raises(RuntimeError, match="the window is gone"):
-            go_on(monitor, 1)
+    with (
+        not_drawn(monitor, "the window is gone"),
+        pytest.raises(RuntimeError, match="the window is gone"),
+    ):
+        go_on(monitor, 1)
     run(monitor)
     monitor.close()
     metadata = metadata_of(tmp_path / "run", 0)

@@ -52,6 +52,7 @@ __all__ = [
     "JournalReader",
     "JournalWriter",
     "count_lines",
+    "entry_of",
     "read_journal",
 ]
 
@@ -238,7 +239,7 @@ class JournalReader:
                 self._gave_up = True
                 raise ValueError("it is too long to be an episode's")
             values = json_object(line)
-            entry = _parse(values)
+            entry = entry_of(values)
         except ValueError as error:
             torn = not line.endswith(b"\n") and not self._gave_up
             # Its writer was killed in the middle of it, or is at it now.
@@ -336,7 +337,12 @@ def _lines(path: Path, file: BinaryIO) -> Iterator[bytes]:
         yield line
 
 
-def _parse(values: Mapping[str, Any]) -> JournalEntry:
+def entry_of(values: Mapping[str, Any]) -> JournalEntry:
+    """Return the entry whose members a line of a journal, or a trajectory, has.
+
+    Raises:
+        ValueError: one is missing, or is not what it should be.
+    """
     return JournalEntry(
         episode_id=field(values, "episode_id", _count),
         length=field(values, "length", _count),

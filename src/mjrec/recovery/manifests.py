@@ -11,14 +11,9 @@ from typing import Any
 
 from .. import json_text
 from ..errors import DirectoryNotWritable, UnreadableFile
-from ..formats.journal import JournalEntry, JournalWriter
+from ..formats.journal import JournalEntry, JournalWriter, entry_of
 from ..formats.json_fields import (
-    boolean,
-    field,
-    integer,
-    number,
     read_object,
-    text,
     unreadable,
 )
 from ..formats.locks import wait_for_lock
@@ -121,18 +116,7 @@ def _entry_of(
         if facts.get("complete") is not True:
             return None
         with unreadable(remains.files.trajectories[episode_id]):
-            return JournalEntry(
-                episode_id=episode_id,
-                length=field(facts, "length", integer),
-                reward=field(facts, "reward", number),
-                type=field(facts, "type", text),
-                start_time=field(facts, "start_time", number),
-                end_time=field(facts, "end_time", number),
-                seed=facts.get("seed"),
-                options=facts.get("options"),
-                terminated=field(facts, "terminated", boolean),
-                truncated=field(facts, "truncated", boolean),
-            )
+            return entry_of({**facts, "episode_id": episode_id})
     except UnreadableFile:
         return None
 
