@@ -276,6 +276,21 @@ def test_directory_that_is_removed_is_an_error_by_default(
     assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8]
 
 
+def test_directory_that_is_made_anew_is_noticed(
+    pendulum: Pendulum, tmp_path: Path
+) -> None:
+    """At the end of the next episode: the journal is another one, or none."""
+    monitor = pendulum(render="off", trajectory_callable=False)
+    run(monitor)
+    remove(tmp_path / "run")
+    (tmp_path / "run").mkdir()
+    with pytest.raises(FileNotWritten, match="removed while it was written"):
+        run(monitor)
+    run(monitor)
+    monitor.close()
+    assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8, 8]
+
+
 @pytest.mark.parametrize("on_error", ["raise", "warn"])
 def test_videos_that_cannot_be_rendered(
     on_error: str,

@@ -332,3 +332,16 @@ def test_an_endless_line_does_not_fill_the_memory(
     assert "1 line and all that follows left out: line 2" in caplog.text
     assert "too long" in caplog.text
     assert count_lines(path) == 2
+
+
+def test_a_journal_that_was_removed_is_noticed(path: Path) -> None:
+    """What is written into it is nowhere; the entry after that begins another."""
+    writer = JournalWriter(path)
+    writer.append(ENTRY)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match="removed while it was written"):
+        writer.append(ENTRY)
+    assert not path.exists()
+    writer.append(ENTRY)
+    writer.close()
+    assert list(read_journal(path)) == [ENTRY]

@@ -132,7 +132,7 @@ class JournalWriter:
         Raises:
             ClosedError: after `close`.
             OSError: it cannot be written (a full disk); the journal is then as it
-                was before.
+                was before. Or somebody has removed it.
         """
         if self._closed:
             raise ClosedError(f"The journal {self._path} is closed.")
@@ -154,7 +154,15 @@ class JournalWriter:
             file.close()
 
     def _write(self, file: io.FileIO, line: bytes) -> None:
-        if os.fstat(file.fileno()).st_size > self._size:
+        status = os.fstat(file.fileno())
+        if status.st_nlink == 0:
+            # What is written there is nowhere. The next entry begins another file.
+            file.close()
+            self._file = None
+            raise OSError(
+                errno.ENOENT, "it was removed while it was written", str(self._path)
+            )
+        if status.st_size > self._size:
             # Half a line would damage the one after it. Taking it back had failed, or
             # was interrupted.
             os.ftruncate(file.fileno(), self._size)
