@@ -64,6 +64,15 @@ def not_drawn(monitor: Any, why: str) -> Iterator[None]:
         yield
 
 
+def raised(
+    on_error: str, kind: type[Exception], match: str
+) -> contextlib.AbstractContextManager[object]:
+    """Expect an error where it is to be raised, and none where it is to be told."""
+    if on_error == "raise":
+        return pytest.raises(kind, match=match)
+    return contextlib.nullcontext()
+
+
 def remove(directory: Path) -> None:
     """Remove a directory, though a thread may be writing a model there."""
     while directory.exists():
@@ -150,12 +159,8 @@ def test_full_disk_while_an_episode_is_recorded(
     # A thread stores it, and this is not about that.
     while not list((tmp_path / "run").glob("*.mjb.gz")):
         time.sleep(0.01)
-    with file_size_limit(200):
-        if on_error == "raise":
-            with pytest.raises(FileNotWritten, match="episode000001"):
-                run(monitor)
-        else:
-            run(monitor)
+    with file_size_limit(200), raised(on_error, FileNotWritten, "episode000001"):
+        run(monitor)
     run(monitor)
     monitor.close()
     assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8, 8]
@@ -173,12 +178,8 @@ def test_full_disk_at_the_journal(
     monitor = pendulum(render="off", trajectory_callable=False, on_error=on_error)
     run(monitor)
     size = sum(p.stat().st_size for p in (tmp_path / "run").glob("*.jsonl"))
-    with file_size_limit(size + 20):
-        if on_error == "raise":
-            with pytest.raises(OSError, match="episodes"):
-                run(monitor)
-        else:
-            run(monitor)
+    with file_size_limit(size + 20), raised(on_error, OSError, "episodes"):
+        run(monitor)
     run(monitor)
     monitor.close()
     assert stats_of(tmp_path / "run")["episode_lengths"] == [8, 8, 8]
@@ -225,12 +226,9 @@ def test_first_picture_that_cannot_be_drawn(
 ) -> None:
     """States are recorded all the same; the metadata says what became of the video."""
     monitor = pendulum(render="live", on_error=on_error)
-    with not_drawn(monitor, "no window yet"):
-        if on_error == "raise":
-            with pytest.raises(RuntimeError, match="no window yet"):
-                run(monitor)
-        else:
-            run(monitor)
+    why = "no window yet"
+    with not_drawn(monitor, why), raised(on_error, RuntimeError, why):
+        run(monitor)
     run(monitor)
     monitor.close()
     if on_error == "raise":

@@ -8,7 +8,6 @@ import json
 import math
 import random
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
+from full_disk import file_size_limit
 
 from mjrec.errors import ClosedError, UnreadableFile
 from mjrec.formats import journal
@@ -285,16 +285,9 @@ def test_a_full_disk_leaves_whole_lines(path: Path) -> None:
     writer = JournalWriter(path)
     writer.append(ENTRY)
     size = path.stat().st_size
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    old = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     # As on a full disk, the first part of the line is written, and then no more.
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size + 10, hard))
-    try:
-        with pytest.raises(OSError, match="space"):
-            writer.append(NEXT)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, old)
+    with file_size_limit(size + 10), pytest.raises(OSError, match="space"):
+        writer.append(NEXT)
     writer.append(NEXT)
     writer.close()
     assert list(read_journal(path)) == [ENTRY, NEXT]

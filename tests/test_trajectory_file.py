@@ -7,7 +7,6 @@ import dataclasses
 import os
 import random
 import re
-import resource
 import shutil
 import signal
 import subprocess
@@ -19,6 +18,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from full_disk import file_size_limit
 
 import mjrec.formats.trajectory_file as trajectory_file
 import mjrec.formats.trajectory_hdf5 as trajectory_hdf5
@@ -368,13 +368,11 @@ def test_nothing_to_finish_is_one_clear_error(log: Path) -> None:
 def test_a_full_disk_leaves_the_log_and_nothing_else(log: Path, room: int) -> None:
     """One error that names the file; with room again it succeeds."""
     write(log)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
-    try:
-        with pytest.raises(FileNotWritten, match=r"\.h5: File too large"):
-            finish_trajectory(log)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with (
+        file_size_limit(room),
+        pytest.raises(FileNotWritten, match=r"\.h5: File too large"),
+    ):
+        finish_trajectory(log)
     assert list(log.parent.iterdir()) == [log]
     finish_trajectory(log)
 

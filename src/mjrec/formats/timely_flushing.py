@@ -50,18 +50,19 @@ class _Watch:
             self.writers.discard(writer)
 
     def _keep(self) -> None:
-        while True:
+        time.sleep(_SECONDS)
+        while self._look_at_all():
             time.sleep(_SECONDS)
-            with self.lock:
-                writers = list(self.writers)
-                if not writers:
-                    self.is_kept = False
-                    return
-            for writer in writers:
-                writer.flush_if_due()
-            # Or the last one would live until the next round.
-            del writers
-            writer = None  # type: ignore[assignment]
+
+    def _look_at_all(self) -> bool:
+        """Flush what is due; return whether there is anything to look after."""
+        # Not in `_keep`, which would keep the last writer alive until the next round.
+        with self.lock:
+            writers = list(self.writers)
+            self.is_kept = bool(writers)
+        for writer in writers:
+            writer.flush_if_due()
+        return bool(writers)
 
 
 _watch = _Watch()
