@@ -14,11 +14,13 @@ from ..environments.scenes import Scenes
 from ..errors import NotPicklable, RenderError
 from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
+from ..recorder.ended_trajectories import Rendering
 from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
 from ..recorder.options import DEFERRED, WARN, RecorderOptions
-from ..recorder.recorder import EpisodePictures, Recorder, Rendering, Subject
+from ..recorder.recorder import Recorder
 from ..recorder.stats_recorder import StatsRecorder
+from ..recorder.subject import EpisodePictures, Subject
 from ..recorder.video_recorder import VideoRecorder
 from ..rendering.render_service import RenderService
 from ..simulation.inside import simulation_time

@@ -10,10 +10,8 @@ import time
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from ..errors import Error, FileNotWritten, NoPictures, PicturesDiffer
 from ..formats.journal import JournalEntry, JournalWriter
@@ -30,83 +28,23 @@ from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
 from .deferred_video import DeferredVideo
+from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
 from .episode_videos import EpisodeVideos
 from .faults import Faults, What
 from .opening import OpenDirectory, open_directory
-from .options import (
-    DEFERRED,
-    LIVE,
-    OFF,
-    RecorderOptions,
-    RenderingChoice,
-    type_of_mode,
-)
+from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
 from .stats_recorder import StatsRecorder, reward_to_float
+from .subject import Subject, check_pictures, what_is_missing
 from .trajectory_recorder import Pace, TrajectoryRecorder
 from .versions import versions
-from .video_recorder import PictureSource, VideoRecorder, can_give_pictures
+from .video_recorder import VideoRecorder, can_give_pictures
 
-__all__ = ["EpisodePictures", "Recorder", "Rendering", "Subject"]
+__all__ = ["Recorder"]
 
 logger = logging.getLogger(__name__)
 
 _FORMAT_VERSION = 1
-
-
-class EpisodePictures(PictureSource, Protocol):
-    """Where the pictures of a run come from, episode by episode."""
-
-    def begin_episode(self) -> None:
-        """Prepare for pictures of an episode; the environment has just been reset."""
-
-    def facts(self) -> Mapping[str, Any]:
-        """Return what the metadata of a video says about its pictures."""
-
-    def close(self) -> None:
-        """Free what was acquired; idempotent."""
-
-
-class Rendering(Protocol):
-    """Whoever turns ended trajectories into videos, beside the simulation."""
-
-    def submit(self, trajectory: Path) -> None:
-        """Take over an ended trajectory. Never waits."""
-
-    def wait(self, on_progress: Callable[[Any], None]) -> None:
-        """Return when all that was taken over is done."""
-
-    def stop(self) -> None:
-        """Stop at once; what is not done stays pending. Idempotent."""
-
-    @property
-    def failures(self) -> Mapping[str, str]:
-        """Why videos could not be rendered, by the base names of the videos."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Subject:
-    """What is recorded, as far as a recorder knows it.
-
-    Attributes:
-        env_id: the environment's name.
-        pictures: where live pictures come from.
-        clock: returns the simulated time in seconds, or None.
-        declared: returns the rate to take where there is no simulated time.
-        rendering: when pictures are drawn.
-        states: of its simulation; None where there is none that can be seen.
-        environment: what it can be made from again, for the trajectories.
-        random_state: returns the state of its random generator, for JSON, or None.
-    """
-
-    env_id: str
-    pictures: EpisodePictures
-    clock: Callable[[], float | None]
-    declared: Callable[[], Fraction]
-    rendering: RenderingChoice
-    states: StateSource | None = None
-    environment: Mapping[str, Any] | None = None
-    random_state: Callable[[], Any] = lambda: None
 
 
 class Recorder:
@@ -136,13 +74,12 @@ class Recorder:
         rendering: Callable[[Path], Rendering] | None = None,
         finish_log: Callable[[Path], object],
     ) -> None:
-        self._finish_log = finish_log
         self._schedule = to_schedule(options.video_callable)
         self._choice = subject.rendering
         if self._choice.mode == OFF:
             self._schedule = disable_videos
         if self._schedule is not disable_videos and self._choice.mode == LIVE:
-            _check_pictures(subject)
+            check_pictures(subject)
         self._subject = subject
         self._states = subject.states
         self._options = options
@@ -166,7 +103,9 @@ class Recorder:
         )
         if self._states is not None:
             self._states.open(self.directory)
-        self._rendering = rendering(self.directory) if rendering else None
+        self._ended = EndedTrajectories(
+            rendering(self.directory) if rendering else None, finish_log
+        )
         self._next_episode_id = self._place.first_episode_id
         self._episode_start: dict[str, Any] = {}
         self._journal = JournalWriter(
@@ -184,7 +123,6 @@ class Recorder:
         )
         self._trajectory: TrajectoryRecorder | None = None
         self._blocks: RowBlocks | None = None
-        self._unfinished: list[Path] = []
         self._said: set[str] = set()
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
         # The same, where it is drawn live.
@@ -388,10 +326,9 @@ class Recorder:
         if self.closed:
             return
         self._end_by_close()
-        if self._rendering is not None:
-            self._rendering.wait(on_progress)
+        self._ended.wait(on_progress)
         try:
-            self._finish_trajectories()
+            self._ended.finish()
         except Error as error:
             if not self._faults.tolerates("trajectory", error, episode_id=None):
                 raise
@@ -409,8 +346,7 @@ class Recorder:
         """
         if self.closed:
             return
-        if self._rendering is not None:
-            self._rendering.stop()
+        self._ended.stop()
         try:
             self._end_by_close()
         except Exception:
@@ -440,7 +376,7 @@ class Recorder:
 
     def failures(self) -> Mapping[str, str]:
         """Return why videos could not be rendered, by their names."""
-        return self._rendering.failures if self._rendering is not None else {}
+        return self._ended.failures
 
     def _let_go(self) -> None:
         # Where it fails, all stays open, and the next close tries again. That is an
@@ -592,7 +528,7 @@ class Recorder:
             raise NoPictures(
                 f"The videos of {self._subject.env_id} cannot be rendered from its "
                 f"states: {start.refusal}. They cannot be drawn live either: "
-                f"{_what_is_missing(self._subject.pictures)}."
+                f"{what_is_missing(self._subject.pictures)}."
             )
         if start.refusal not in self._said:
             self._said.add(start.refusal)
@@ -771,28 +707,7 @@ class Recorder:
             self._videos.add_deferred(
                 self._next_episode_id - 1, trajectory.path, self.video_recorder
             )
-        if self._rendering is not None:
-            self._rendering.submit(trajectory.path)
-        else:
-            self._unfinished.append(trajectory.path)
-
-    def _finish_trajectories(self) -> None:
-        """Give the trajectories that nobody has finished their final form.
-
-        Raises:
-            Error: of the first that could not be; the others are finished all the same.
-        """
-        failed: list[Error] = []
-        for _ in range(len(self._unfinished)):
-            log = self._unfinished.pop(0)
-            try:
-                if log.exists():
-                    self._finish_log(log)
-            except Error as error:
-                failed.append(error)
-                self._unfinished.append(log)
-        if failed:
-            raise failed[0]
+        self._ended.add(trajectory.path)
 
     def _end_live_video(
         self, recorder: VideoRecorder, facts: Mapping[str, Any]
@@ -867,24 +782,3 @@ def _refuse_what_the_parent_made() -> None:
 
 
 os.register_at_fork(after_in_child=_refuse_what_the_parent_made)
-
-
-def _check_pictures(subject: Subject) -> None:
-    if can_give_pictures(subject.pictures):
-        return
-    why = "" if subject.rendering.reason is None else f" ({subject.rendering.reason})"
-    raise NoPictures(
-        f"Videos were asked for, and {subject.env_id} gives no pictures{why}: "
-        f"{_what_is_missing(subject.pictures)}, or record statistics only with "
-        "video_callable=False."
-    )
-
-
-def _what_is_missing(pictures: PictureSource) -> str:
-    mode = getattr(pictures, "render_mode", None)
-    return getattr(
-        pictures,
-        "missing",
-        f"its render_mode is {mode!r}. Make the environment with "
-        'render_mode="rgb_array"',
-    )

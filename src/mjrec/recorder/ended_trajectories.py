@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of the trajectories of episodes that are over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Protocol
+
+from ..errors import Error
+
+__all__ = ["EndedTrajectories", "Rendering"]
+
+_NO_FAILURES: Mapping[str, str] = MappingProxyType({})
+
+
+class Rendering(Protocol):
+    """Whoever turns ended trajectories into videos, beside the simulation."""
+
+    def submit(self, trajectory: Path) -> None:
+        """Take over an ended trajectory. Never waits."""
+
+    def wait(self, on_progress: Callable[[Any], None]) -> None:
+        """Return when all that was taken over is done."""
+
+    def stop(self) -> None:
+        """Stop at once; what is not done stays pending. Idempotent."""
+
+    @property
+    def failures(self) -> Mapping[str, str]:
+        """Why videos could not be rendered, by the base names of the videos."""
+
+
+class EndedTrajectories:
+    """Hands ended trajectories to whoever renders, or keeps them until the end.
+
+    Args:
+        rendering: whoever renders; None where nothing is to be rendered now.
+        finish_log: gives the log of an ended episode its final form, where nothing
+            renders.
+    """
+
+    def __init__(
+        self, rendering: Rendering | None, finish_log: Callable[[Path], object]
+    ) -> None:
+        self._rendering = rendering
+        self._finish_log = finish_log
+        self._unfinished: list[Path] = []
+
+    @property
+    def failures(self) -> Mapping[str, str]:
+        """Why videos could not be rendered, by the base names of the videos."""
+        return _NO_FAILURES if self._rendering is None else self._rendering.failures
+
+    def add(self, log: Path) -> None:
+        """Take over the log of an episode that is over. Never waits."""
+        if self._rendering is not None:
+            self._rendering.submit(log)
+        else:
+            self._unfinished.append(log)
+
+    def wait(self, on_progress: Callable[[Any], None]) -> None:
+        """Return when whoever renders is done; at once where nobody does."""
+        if self._rendering is not None:
+            self._rendering.wait(on_progress)
+
+    def stop(self) -> None:
+        """Let nobody render any more; idempotent."""
+        if self._rendering is not None:
+            self._rendering.stop()
+
+    def finish(self) -> None:
+        """Give those that nobody has finished their final form.
+
+        Raises:
+            Error: of the first that could not be; the others are finished all the same.
+        """
+        failed: list[Error] = []
+        for _ in range(len(self._unfinished)):
+            log = self._unfinished.pop(0)
+            try:
+                if log.exists():
+                    self._finish_log(log)
+            except Error as error:
+                failed.append(error)
+                self._unfinished.append(log)
+        if failed:
+            raise failed[0]

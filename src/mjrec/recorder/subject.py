@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is recorded, as far as a recorder knows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any, Protocol
+
+from ..errors import NoPictures
+from ..simulation.state_source import StateSource
+from .options import RenderingChoice
+from .video_recorder import PictureSource, can_give_pictures
+
+__all__ = ["EpisodePictures", "Subject", "check_pictures", "what_is_missing"]
+
+
+class EpisodePictures(PictureSource, Protocol):
+    """Where the pictures of a run come from, episode by episode."""
+
+    def begin_episode(self) -> None:
+        """Prepare for pictures of an episode; the environment has just been reset."""
+
+    def facts(self) -> Mapping[str, Any]:
+        """Return what the metadata of a video says about its pictures."""
+
+    def close(self) -> None:
+        """Free what was acquired; idempotent."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """What is recorded, as far as a recorder knows it.
+
+    Attributes:
+        env_id: the environment's name.
+        env_index: which sub-environment of a vector environment it is; None for an
+            environment of its own.
+        pictures: where live pictures come from.
+        further_pictures: from further cameras, by what the names of their videos have
+            in the end.
+        clock: returns the simulated time in seconds, or None.
+        declared: returns the rate to take where there is no simulated time.
+        rendering: when pictures are drawn.
+        cameras: all of them, for JSON, where there are several.
+        states: of its simulation; None where there is none that can be seen.
+        environment: what it can be made from again, for the trajectories.
+        random_state: returns the state of its random generator, for JSON, or None.
+    """
+
+    env_id: str
+    pictures: EpisodePictures
+    clock: Callable[[], float | None]
+    declared: Callable[[], Fraction]
+    rendering: RenderingChoice
+    env_index: int | None = None
+    further_pictures: Mapping[str, EpisodePictures] = field(default_factory=dict)
+    cameras: tuple[Any, ...] = ()
+    states: StateSource | None = None
+    environment: Mapping[str, Any] | None = None
+    random_state: Callable[[], Any] = lambda: None
+
+
+def check_pictures(subject: Subject) -> None:
+    """Check that live pictures can be had.
+
+    Raises:
+        NoPictures: they cannot.
+    """
+    if can_give_pictures(subject.pictures):
+        return
+    why = "" if subject.rendering.reason is None else f" ({subject.rendering.reason})"
+    raise NoPictures(
+        f"Videos were asked for, and {subject.env_id} gives no pictures{why}: "
+        f"{what_is_missing(subject.pictures)}, or record statistics only with "
+        "video_callable=False."
+    )
+
+
+def what_is_missing(pictures: PictureSource) -> str:
+    """Return why there are no pictures, and what would help."""
+    mode = getattr(pictures, "render_mode", None)
+    return getattr(
+        pictures,
+        "missing",
+        f"its render_mode is {mode!r}. Make the environment with "
+        'render_mode="rgb_array"',
+    )
