@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rules by which episodes are chosen after they ended, against naive ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mjrec.errors import InvalidArgument, UnknownName
+from mjrec.recorder.selection import Selection, Standing, selection_from
+from mjrec.recorder.tracking import FinishedEpisode
+
+
+def episode(
+    number: int,
+    reward: float = 0.0,
+    *,
+    terminated: bool = True,
+    success: bool | None = None,
+) -> FinishedEpisode:
+    """Return an episode that has ended."""
+    return FinishedEpisode(
+        episode_id=number,
+        length=1,
+        reward=reward,
+        type="t",
+        terminated=terminated,
+        truncated=not terminated,
+        success=success,
+        seed=None,
+        options=None,
+        start_time=0.0,
+        end_time=1.0,
+        total_steps=number + 1,
+    )
+
+
+def told(keep: Any, episodes: Sequence[FinishedEpisode]) -> Selection:
+    """Return a selection that has been told of the episodes."""
+    selection = selection_from(keep)
+    for each in episodes:
+        selection.add(each)
+    return selection
+
+
+def chosen(keep: Any, episodes: Sequence[FinishedEpisode]) -> list[int]:
+    """Return what is chosen in the end."""
+    selection = told(keep, episodes)
+    selection.close()
+    assert selection.undecided == 0
+    return selection.chosen
+
+
+def worse(one: FinishedEpisode, other: FinishedEpisode) -> bool:
+    """Tell whether a return is worse, as a person would say it."""
+    if math.isnan(other.reward):
+        return False
+    return math.isnan(one.reward) or one.reward < other.reward
+
+
+# Few different ones, so that there are ties.
+some_rewards = st.lists(
+    st.sampled_from([0.0, -0.0, 1.0, -2.5, 7.25, math.nan, math.inf, -math.inf]),
+    max_size=12,
+)
+
+
+def with_rewards(rewards: Sequence[float]) -> list[FinishedEpisode]:
+    """Return episodes with these returns; not every number is that of one."""
+    return [episode(3 + 2 * k, reward) for k, reward in enumerate(rewards)]
+
+
+@given(some_rewards, st.integers(1, 5))
+def test_worst_are_those_with_fewer_than_n_before_them(
+    rewards: list[float], count: int
+) -> None:
+    """Before an episode stand the worse ones, and the earlier of equal ones."""
+    episodes = with_rewards(rewards)
+    assert chosen(f"worst:{count}", episodes) == [
+        this.episode_id
+        for this in episodes
+        if sum(
+            worse(other, this)
+            or (not worse(this, other) and other.episode_id < this.episode_id)
+            for other in episodes
+        )
+        < count
+    ]
+
+
+@given(some_rewards, st.integers(1, 5))
+def test_best_are_those_with_fewer_than_n_before_them(
+    rewards: list[float], count: int
+) -> None:
+    """The same, the other way round; NaN is still the worst."""
+    episodes = with_rewards(rewards)
+    assert chosen(f"best:{count}", episodes) == [
+        this.episode_id
+        for this in episodes
+        if sum(
+            worse(this, other)
+            or (not worse(other, this) and other.episode_id < this.episode_id)
+            for other in episodes
+        )
+        < count
+    ]
+
+
+@given(some_rewards)
+def test_median_is_the_first_episode_in_the_lower_middle(rewards: list[float]) -> None:
+    """At most half of the others are worse, and fewer than half are better."""
+    episodes = with_rewards(rewards)
+    half = (len(episodes) - 1) // 2
+    middle = [
+        this.episode_id
+        for this in episodes
+        if sum(worse(other, this) for other in episodes)
+        <= half
+        < len(episodes) - sum(worse(this, other) for other in episodes)
+    ]
+    assert chosen("median", episodes) == middle[:1]
+
+
+@given(
+    st.lists(st.tuples(st.booleans(), st.sampled_from([True, False, None]))),
+    st.integers(1, 4),
+)
+def test_failures_are_what_the_environment_calls_so(
+    flags: list[tuple[bool, bool | None]], most: int
+) -> None:
+    """Where it says nothing of success, what was terminated; the first, if limited."""
+    episodes = [
+        episode(k, terminated=terminated, success=success)
+        for k, (terminated, success) in enumerate(flags)
+    ]
+    failed = [
+        k
+        for k, (terminated, success) in enumerate(flags)
+        if success is False or (success is None and terminated)
+    ]
+    assert chosen("failures", episodes) == failed
+    assert chosen(f"failures:{most}", episodes) == failed[:most]
+
+
+@given(some_rewards, st.integers(1, 3), st.sampled_from(["best", "worst"]))
+def test_what_fell_out_never_comes_back(
+    rewards: list[float], count: int, kind: str
+) -> None:
+    """So its files may go at once, and no more than N stay."""
+    selection = selection_from(f"{kind}:{count}")
+    dropped: set[int] = set()
+    episodes = with_rewards(rewards)
+    for number, this in enumerate(episodes):
+        selection.add(this)
+        so_far = [each.episode_id for each in episodes[: number + 1]]
+        standing = {each: selection.standing(each) for each in so_far}
+        candidates = [e for e in so_far if standing[e] is Standing.CANDIDATE]
+        assert len(candidates) == selection.undecided == min(count, number + 1)
+        now = {e for e in so_far if standing[e] is Standing.DROPPED}
+        assert dropped <= now
+        dropped = now
+    assert selection.chosen == []
+    selection.close()
+    assert dropped.isdisjoint(selection.chosen)
+
+
+@given(some_rewards, st.sampled_from(["best:2", "worst:2", "failures:2", "median"]))
+def test_an_episode_may_be_told_of_twice(rewards: list[float], rule: str) -> None:
+    """Ctrl-C between the telling and what follows from it has it told again."""
+    episodes = with_rewards(rewards)
+    twice = [each for each in episodes for _ in range(2)]
+    assert told(rule, twice).finished == len(episodes)
+    assert chosen(rule, twice) == chosen(rule, episodes)
+
+
+def test_failures_are_decided_at_once() -> None:
+    """And after the last of so many nothing can be chosen any more."""
+    selection = selection_from("failures:1")
+    selection.add(episode(0, terminated=False))
+    assert selection.standing(0) is Standing.DROPPED
+    assert not selection.is_full
+    selection.add(episode(1))
+    assert selection.standing(1) is Standing.CHOSEN
+    assert selection.is_full
+    assert selection.chosen == [1]
+
+
+def test_function_gets_the_finished_episodes() -> None:
+    """All of them, in their order, once; NumPy's numbers will do."""
+    calls = []
+
+    def longest(episodes: Sequence[FinishedEpisode]) -> Any:
+        calls.append([each.episode_id for each in episodes])
+        return np.array([4, 0])
+
+    selection = told(longest, [episode(k) for k in range(5)])
+    assert selection.name == f"{test_function_gets_the_finished_episodes.__name__}" + (
+        ".<locals>.longest"
+    )
+    assert {selection.standing(k) for k in range(5)} == {Standing.CANDIDATE}
+    selection.close()
+    selection.close()
+    assert calls == [[0, 1, 2, 3, 4]]
+    assert selection.chosen == [0, 4]
+    assert selection.standing(1) is Standing.DROPPED
+
+
+def no_function(episodes: Sequence[FinishedEpisode]) -> Any:
+    """Raise."""
+    raise ZeroDivisionError("of the user")
+
+
+@pytest.mark.parametrize(
+    ("keep", "what"),
+    [
+        (no_function, "no_function .*ZeroDivisionError: of the user"),
+        (lambda episodes: [7, 0], "returned 7, .* there are 0, 1, 2"),
+        (lambda episodes: None, "TypeError"),
+        (lambda episodes: 2, "TypeError"),
+        (lambda episodes: [0.5], "TypeError"),
+        (lambda episodes: [True, False, True], "True is no number of an episode"),
+        (lambda episodes: episodes[:1], "TypeError"),
+    ],
+)
+def test_function_that_cannot_choose_is_named(
+    keep: Callable[..., Any], what: str
+) -> None:
+    """And nothing is decided, so that nothing needs to be deleted."""
+    selection = told(keep, [episode(k) for k in range(3)])
+    with pytest.raises(InvalidArgument, match=what):
+        selection.close()
+    assert selection.chosen == []
+    assert selection.undecided == 3
+
+
+@pytest.mark.parametrize("rule", ["worst:2", "best:1", "failures", "median"])
+def test_without_episodes_nothing_is_chosen(rule: str) -> None:
+    """A run may be closed before anything has finished."""
+    assert chosen(rule, []) == []
+
+
+@pytest.mark.parametrize("keep", ["wurst:3", "", "median:2", "best-3", ":3", "all"])
+def test_unknown_rule_is_told_which_there_are(keep: str) -> None:
+    """The names as they are to be written."""
+    with pytest.raises(UnknownName, match=r"best:N, worst:N, failures.* median"):
+        selection_from(keep)
+
+
+@pytest.mark.parametrize(
+    "keep",
+    ["worst", "worst:", "worst:0", "best:-1", "best:x", "failures:0", "worst:1.5"],
+)
+def test_rule_without_a_number_of_episodes(keep: str) -> None:
+    """The error says where it stands."""
+    with pytest.raises(InvalidArgument, match="1 or more"):
+        selection_from(keep)
+
+
+@pytest.mark.parametrize("keep", [3, True, ["worst:3"], b"worst:3"])
+def test_what_is_neither_text_nor_function(keep: Any) -> None:
+    """Is an error that lists the rules."""
+    with pytest.raises(InvalidArgument, match="must be one of best:N"):
+        selection_from(keep)
