@@ -6,13 +6,14 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
+from ..recorder.tracking import FinishedEpisode, Tracker
 from ..recovery import recover
 
 if TYPE_CHECKING:
@@ -48,6 +49,14 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     allow_early_reset: bool | None = None,
     on_error: str = "raise",
     strict: bool = False,
+    keep: str | Callable[[Sequence[FinishedEpisode]], Iterable[int]] | None = None,
+    step_trigger: Callable[[int], Any] | None = None,
+    video_length: int | None = None,
+    name_prefix: str | None = None,
+    episode_info: bool = False,
+    annotate: bool = False,
+    tiled: bool = False,
+    trackers: Tracker | Sequence[Tracker] = (),
     env_id: str | None = None,
 ) -> GymnasiumMonitor | DmEnvMonitor:
     """Record what happens to an environment into a monitor directory.
@@ -87,7 +96,9 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
         fps: the rate written into the videos. None is real time: one frame for each
             step, as long as the simulated time of the step.
         camera: a name or number, or an `mujoco.MjvCamera`, of a MuJoCo environment;
-            None is what the environment itself shows.
+            None is what the environment itself shows. A list of them gives a video
+            each: `....video000027.mp4` of the first, `....video000027.<camera>.mp4`
+            of the others.
         width: of the videos, in pixels; None is the environment's own.
         height: likewise.
         max_fps: the most frames per second of simulated time: steps 0, n, 2n ... with
@@ -120,6 +131,30 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             each, or all the same) is an error, `BlankVideo` as its episode ends or, of
             a deferred one, `RenderError` in `close`. The video is kept in any case, its
             metadata has `suspect_black` or `suspect_constant`, and the log a warning.
+        keep: which episodes get a video, decided when they have ended, instead of
+            `video_callable`: "best:3" or "worst:3" (by return), "failures" or
+            "failures:20" (the first 20), "median", or a function from the finished
+            episodes (`mjrec.trackers.FinishedEpisode`) to the numbers of those to
+            keep. Every episode is recorded, and what is not chosen is deleted, at once
+            where the rule allows; with "median" and a function all states stay on
+            disk until `close`. The manifest and the metadata name the rule.
+        step_trigger: which steps begin a video, instead of `video_callable`: a
+            function from the number of steps taken so far to a bool, asked before
+            each step. The first picture is that before the step.
+        video_length: steps of a video after its first picture; it goes on across
+            resets. None is until the end of the episode.
+        name_prefix: finished videos have Gymnasium's names besides,
+            `<name_prefix>-episode-27.mp4` or `<name_prefix>-step-1000.mp4`: links to
+            the same files.
+        episode_info: whether the last step of an episode has `info["episode"]`, a
+            dictionary of return "r", length "l" and seconds "t", as Gymnasium's
+            RecordEpisodeStatistics gives it. A key that is there stays as it is.
+            Gymnasium environments only.
+        annotate: whether episode, step, simulated time and return are written on the
+            pictures. They are then not those of `env.render()` any more.
+        tiled: one video of all `camera`s side by side, instead of one for each. Of a
+            vector environment: also a video of all sub-environments side by side.
+        trackers: who is told of finished episodes and videos, see `mjrec.trackers`.
         env_id: the environment's name in the recordings. None is the name in its
             spec; dm_env environments have none, so theirs is worth giving, as
             `dm_control/<domain>-<task>`.
@@ -162,6 +197,14 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             observations=observations,
             on_error=on_error,
             strict=strict,
+            keep=keep,
+            step_trigger=step_trigger,
+            video_length=video_length,
+            name_prefix=name_prefix,
+            episode_info=episode_info,
+            annotate=annotate,
+            tiled=tiled,
+            trackers=trackers,
             allow_early_reset=(
                 monitor.allows_early_reset
                 if allow_early_reset is None

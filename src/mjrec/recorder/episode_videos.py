@@ -8,6 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from ..formats.monitor_directory import episode_of
 from ..formats.pending_videos import pending_video, with_reason
 from ..formats.video_metadata import is_broken, is_done, metadata_path
 from .deferred_video import DeferredVideo
@@ -26,6 +27,8 @@ class EpisodeVideos:
     def __init__(self) -> None:
         self.scheduled: list[int] = []
         self._finished: list[tuple[str, str]] = []
+        # What is finished and was not told of: episode, video and metadata.
+        self._news: list[tuple[int, Path, Path]] = []
         self._broken: list[str] = []
         # Number, base name of the trajectory without extension, and the video.
         self._deferred: list[tuple[int, str, Path]] = []
@@ -38,7 +41,7 @@ class EpisodeVideos:
         if recorder.broken:
             self._broken.append(names[1])
         elif recorder.finished:
-            self._finished.append(names)
+            self._add_finished(Path(recorder.path), Path(recorder.metadata_path))
 
     def add_deferred(
         self, episode_id: int, trajectory: Path, video: DeferredVideo
@@ -54,6 +57,16 @@ class EpisodeVideos:
         """
         self._look_for_rendered()
         return sorted(self._finished)
+
+    def news(self) -> list[tuple[int, Path, Path]]:
+        """Return what is finished since the last call.
+
+        Returns:
+            The number of the episode, the video and its metadata, of each.
+        """
+        self._look_for_rendered()
+        news, self._news = self._news, []
+        return news
 
     def broken(self) -> list[str]:
         """Return the names of the metadata of videos that were given up."""
@@ -86,5 +99,9 @@ class EpisodeVideos:
             elif is_broken(metadata_path(video)):
                 self._broken.append(metadata_path(video).name)
             else:
-                self._finished.append((video.name, metadata_path(video).name))
+                self._add_finished(video, metadata_path(video))
         self._deferred = waiting
+
+    def _add_finished(self, video: Path, about: Path) -> None:
+        self._finished.append((video.name, about.name))
+        self._news.append((episode_of(video.name) or 0, video, about))

@@ -13,7 +13,7 @@ __all__ = ["Faults", "What"]
 
 logger = logging.getLogger(__name__)
 
-What = Literal["video", "trajectory", "statistics", "journal", "model"]
+What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker"]
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,18 @@ class Faults:
         """
         if not self._warns:
             return False
-        fault = _Fault(episode_id, what, str(error))
-        if fault not in self._faults:
-            self._faults.append(fault)
+        if self.note(what, str(error), episode_id=episode_id):
             of = "" if episode_id is None else f" of episode {episode_id}"
             logger.warning("Not recorded whole: %s%s. %s", what, of, error)
         return True
+
+    def note(self, what: What, reason: str, *, episode_id: int | None) -> bool:
+        """Note a fault for the manifest; return whether it is a new one."""
+        fault = _Fault(episode_id, what, reason)
+        is_new = fault not in self._faults
+        if is_new:
+            self._faults.append(fault)
+        return is_new
 
     def listed(self) -> list[dict[str, Any]]:
         """Return them as the manifest lists them."""

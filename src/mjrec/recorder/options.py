@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from ..errors import InvalidArgument
 from ..frames import check_quality
 from ..rates import to_rate
+from .tracking import FinishedEpisode, Tracker
 
 __all__ = [
     "DEFERRED",
@@ -27,6 +29,8 @@ __all__ = [
 
 DEFERRED, LIVE, OFF = "deferred", "live", "off"
 RAISE, WARN = "raise", "warn"
+# Not gym's own, which would be taken for a monitor's files.
+_NAME_PREFIX = re.compile(r"(?!openaigym)[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", re.ASCII)
 _MODES = {None: "t", "training": "t", "evaluation": "e"}
 
 
@@ -54,13 +58,21 @@ class RecorderOptions:
     allow_early_reset: bool = False
     on_error: str = RAISE
     strict: bool = False
+    keep: str | Callable[[Sequence[FinishedEpisode]], Iterable[int]] | None = None
+    step_trigger: Callable[[int], Any] | None = None
+    video_length: int | None = None
+    name_prefix: str | None = None
+    episode_info: bool = False
+    annotate: bool = False
+    tiled: bool = False
+    trackers: Tracker | Sequence[Tracker] = ()
 
     def __post_init__(self) -> None:
         type_of_mode(self.mode)
         for name in ("fps", "max_fps"):
             if getattr(self, name) is not None:
                 to_rate(getattr(self, name), name=name)
-        for name in ("observations", "strict"):
+        for name in ("observations", "strict", "episode_info", "annotate", "tiled"):
             if not isinstance(getattr(self, name), bool):
                 raise InvalidArgument(
                     f"{name} must be True or False, got {getattr(self, name)!r}."
@@ -88,6 +100,53 @@ class RecorderOptions:
                 "trajectory_callable must be a function from an episode's number to a "
                 f"bool, True, False or None, got {chosen!r}."
             )
+        self._check_clips()
+        self._check_trackers()
+
+    def _check_clips(self) -> None:
+        if self.step_trigger is not None:
+            if not callable(self.step_trigger):
+                raise InvalidArgument(
+                    "step_trigger must be a function from the number of steps taken so "
+                    f"far to a bool, got {self.step_trigger!r}."
+                )
+            if self.video_callable is not None:
+                raise InvalidArgument(
+                    "step_trigger chooses videos by steps and video_callable by "
+                    "episodes: give one of them."
+                )
+        length = self.video_length
+        if length is not None and (not _is_whole(length) or length < 1):
+            raise InvalidArgument(
+                "video_length must be a positive whole number of steps, or None for "
+                f"videos until the end of the episode, got {length!r}."
+            )
+        prefix = self.name_prefix
+        if prefix is not None and not (
+            isinstance(prefix, str) and _NAME_PREFIX.fullmatch(prefix)
+        ):
+            raise InvalidArgument(
+                "name_prefix becomes part of file names: it must be 1 to 100 letters, "
+                "digits, '_', '-' and '.', begin with a letter, digit or '_', and not "
+                f"with openaigym, got {prefix!r}."
+            )
+
+    def _check_trackers(self) -> None:
+        given = self.trackers
+        several = isinstance(given, Sequence) and not isinstance(given, str)
+        for tracker in self.all_trackers if several else (given,):
+            if not isinstance(tracker, Tracker):
+                raise InvalidArgument(
+                    "trackers must be a mjrec.trackers.Tracker or a sequence of them, "
+                    f"got {tracker!r} of type {type(tracker).__name__}."
+                )
+
+    @property
+    def all_trackers(self) -> tuple[Tracker, ...]:
+        """The trackers, be it one or several."""
+        if isinstance(self.trackers, Tracker):
+            return (self.trackers,)
+        return tuple(self.trackers)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,7 +35,9 @@ from .faults import Faults, What
 from .opening import OpenDirectory, open_directory
 from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
 from .stats_recorder import StatsRecorder, reward_to_float
-from .subject import Subject, check_pictures, what_is_missing
+from .subject import EpisodePictures, Subject, check_pictures, what_is_missing
+from .told_trackers import ToldTrackers
+from .tracking import FinishedEpisode, Run
 from .trajectory_recorder import Pace, TrajectoryRecorder
 from .versions import versions
 from .video_recorder import VideoRecorder, can_give_pictures
@@ -94,6 +96,9 @@ class Recorder:
         self._ending: dict[str, Any] | None = None
         # What the last step said.
         self._flags = {"terminated": False, "truncated": False}
+        self._success: bool | None = None
+        # The last one that is over.
+        self._finished: FinishedEpisode | None = None
         self._place: OpenDirectory = open_directory(
             directory,
             force=options.force,
@@ -118,6 +123,16 @@ class Recorder:
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
+        self._trackers = ToldTrackers(
+            Run(
+                directory=self.directory,
+                infix=str(self._place.infix),
+                env_id=subject.env_id,
+                env_index=subject.env_index,
+            ),
+            options.all_trackers,
+            on_fault=self._note_tracker_fault,
+        )
         self._pace = Pace(
             clock=subject.clock, declared=subject.declared, max_fps=options.max_fps
         )
@@ -125,8 +140,8 @@ class Recorder:
         self._blocks: RowBlocks | None = None
         self._said: set[str] = set()
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
-        # The same, where it is drawn live.
-        self._live_video: VideoRecorder | None = None
+        # The same, where it is drawn live, and those of further cameras.
+        self._live_videos: tuple[VideoRecorder, ...] = ()
         self.closed = False
 
     @property
@@ -227,10 +242,11 @@ class Recorder:
             if not self._tolerates("video", error):
                 raise
             # Where it is only the first picture, states are recorded all the same.
-            if self._live_video is not None:
-                self._live_video.give_up(str(error))
+            if self._live_videos:
+                for video in self._live_videos:
+                    video.give_up(str(error))
             else:
-                self._begin_live_video(episode_id, enabled=False)
+                self._begin_live_videos(episode_id, enabled=False)
         if self._options.write_upon_reset:
             try:
                 self._write_results()
@@ -270,6 +286,7 @@ class Recorder:
         truncated: bool,
         picture: bool = True,
         observation: Any = None,
+        success: bool | None = None,
     ) -> None:
         """Record a step that the environment has just taken.
 
@@ -280,6 +297,8 @@ class Recorder:
             picture: False where the environment has reset itself already, and its
                 picture belongs to the next episode.
             observation: what the step returned.
+            success: at the end of an episode, what the environment says of it; None
+                where it says nothing.
         """
         reward = reward_to_float(reward)
         done = bool(terminated or truncated)
@@ -290,6 +309,7 @@ class Recorder:
                 "terminated": bool(terminated),
                 "truncated": bool(truncated),
             }
+            self._success = success
         self.stats_recorder.count(reward, done)
         try:
             if done:
@@ -304,11 +324,12 @@ class Recorder:
                         )
                     except (PicturesDiffer, FileNotWritten) as error:
                         self._stop_recording(self._trajectory, error)
-                if self._live_video is not None:
-                    self._take_picture(self._live_video, is_there=picture, last=done)
+                for video in self._live_videos:
+                    self._take_picture(video, is_there=picture, last=done)
             finally:
                 if done:
                     self._end_episode()
+                    self._tell_of_episode()
 
     def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
         """End the running episode, and wait until all videos are rendered.
@@ -374,6 +395,10 @@ class Recorder:
             if not self._faults.tolerates("model", error, episode_id=None):
                 raise
 
+    def add_video(self, video: VideoRecorder) -> None:
+        """List one more video of an episode, which is closed, in the manifest."""
+        self._videos.add_live(video)
+
     def failures(self) -> Mapping[str, str]:
         """Return why videos could not be rendered, by their names."""
         return self._ended.failures
@@ -381,6 +406,8 @@ class Recorder:
     def _let_go(self) -> None:
         # Where it fails, all stays open, and the next close tries again. That is an
         # error in any case: no simulation is disturbed, and nothing else would say it.
+        self._tell_of_videos()
+        self._trackers.end()
         self._write_results()
         self.closed = True
         self.stats_recorder.closed = True
@@ -421,7 +448,8 @@ class Recorder:
         if self._states is not None and (keeps or deferred):
             start = self._states.begin_episode()
             deferred = deferred and self._can_be_deferred(start)
-        self._trajectory = self._live_video = self.video_recorder = None
+        self._trajectory = self.video_recorder = None
+        self._live_videos = ()
         if keeps or deferred:
             self._trajectory = self._new_trajectory(
                 episode_id,
@@ -436,26 +464,43 @@ class Recorder:
                 self._video_path(episode_id), self._trajectory
             )
         else:
-            self._begin_live_video(episode_id, enabled=wanted)
+            self._begin_live_videos(episode_id, enabled=wanted)
 
-    def _begin_live_video(self, episode_id: int, *, enabled: bool) -> None:
-        self.video_recorder = recorder = VideoRecorder(
-            self._subject.pictures,
-            base_path=self._video_path(episode_id),
-            metadata={"episode_id": episode_id, **self._live_video_facts()},
+    def _begin_live_videos(self, episode_id: int, *, enabled: bool) -> None:
+        path = self._video_path(episode_id)
+        main = self._live_video(path, self._subject.pictures, enabled=enabled)
+        self.video_recorder = main
+        if not main.enabled:
+            return
+        further = self._subject.further_pictures
+        self._live_videos = (
+            main,
+            *(
+                self._live_video(path.with_name(f"{path.name}.{name}"), pictures)
+                for name, pictures in further.items()
+            ),
+        )
+        for pictures in (self._subject.pictures, *further.values()):
+            pictures.begin_episode()
+        for video in self._live_videos:
+            video.capture_frame()
+
+    def _live_video(
+        self, base_path: Path, pictures: EpisodePictures, *, enabled: bool = True
+    ) -> VideoRecorder:
+        return VideoRecorder(
+            pictures,
+            base_path=base_path,
+            metadata=self._live_video_facts(),
             enabled=enabled,
             fps=self._options.fps,
             max_fps=self._options.max_fps,
             frame_hashes=True,
             clock=self._subject.clock,
             declared=self._subject.declared,
-            facts=self._subject.pictures.facts,
+            facts=pictures.facts,
             strict=self._options.strict,
         )
-        if recorder.enabled:
-            self._live_video = recorder
-            self._subject.pictures.begin_episode()
-        recorder.capture_frame()
 
     def _new_trajectory(
         self,
@@ -487,7 +532,6 @@ class Recorder:
         video: str | None,
         is_kept: bool,
     ) -> dict[str, Any]:
-        options = self._options
         return {
             "episode_id": episode_id,
             "infix": str(self._place.infix),
@@ -501,17 +545,26 @@ class Recorder:
             "scene": None if start is None else start.scene,
             "refusal": None if start is None else start.refusal,
             "kept": is_kept,
-            "video": None
-            if video is None
-            else {
-                "name": self._video_path(episode_id).name + ".mp4",
-                "quality": options.quality,
-                "fps": None if options.fps is None else str(options.fps),
-                "max_fps": None if options.max_fps is None else str(options.max_fps),
-                "recording": video,
-                "reason": self._choice.reason if video == LIVE else None,
-            },
+            "video": None if video is None else self._promise(episode_id, video),
         }
+
+    def _promise(self, episode_id: int, recording: str) -> dict[str, Any]:
+        """Return what a trajectory says of its video."""
+        options = self._options
+        promise: dict[str, Any] = {
+            "name": self._video_path(episode_id).name + ".mp4",
+            "quality": options.quality,
+            "fps": None if options.fps is None else str(options.fps),
+            "max_fps": None if options.max_fps is None else str(options.max_fps),
+            "recording": recording,
+            "reason": self._choice.reason if recording == LIVE else None,
+        }
+        if self._subject.cameras:
+            promise["cameras"] = list(self._subject.cameras)
+            promise["tiled"] = options.tiled
+        if options.annotate:
+            promise["annotate"] = True
+        return promise
 
     def _video_path(self, episode_id: int) -> Path:
         return self.directory / video_prefix(self._place.infix, episode_id)
@@ -618,26 +671,29 @@ class Recorder:
                 self._trajectory.take_frame()
             except PicturesDiffer as error:
                 self._stop_frames(self._trajectory, error)
-        if self._live_video is not None:
+        for video in self._live_videos:
             try:
-                self._live_video.capture_last()
+                video.capture_last()
             except Exception as error:
                 if not self._tolerates("video", error):
                     raise
-                self._live_video.give_up(str(error))
+                video.give_up(str(error))
 
     def _journal_episode(self) -> None:
-        stats = self.stats_recorder
+        self._finished = episode = self._finished_episode()
         try:
             self._journal.append(
                 JournalEntry(
-                    episode_id=self._next_episode_id - 1,
-                    length=stats.episode_lengths[-1],
-                    reward=stats.episode_rewards[-1],
-                    type=stats.episode_types[-1],
-                    end_time=stats.timestamps[-1],
-                    **self._flags,
-                    **self._episode_start,
+                    episode_id=episode.episode_id,
+                    length=episode.length,
+                    reward=episode.reward,
+                    type=episode.type,
+                    start_time=episode.start_time,
+                    end_time=episode.end_time,
+                    seed=episode.seed,
+                    options=episode.options,
+                    terminated=episode.terminated,
+                    truncated=episode.truncated,
                 )
             )
         except OSError as error:
@@ -646,13 +702,46 @@ class Recorder:
             if not self._tolerates("journal", named):
                 raise named from error
 
+    def _finished_episode(self) -> FinishedEpisode:
+        stats = self.stats_recorder
+        return FinishedEpisode(
+            episode_id=self._next_episode_id - 1,
+            length=stats.episode_lengths[-1],
+            reward=stats.episode_rewards[-1],
+            type=stats.episode_types[-1],
+            success=self._success,
+            end_time=stats.timestamps[-1],
+            total_steps=stats.total_steps,
+            **self._flags,
+            **self._episode_start,
+        )
+
+    def _tell_of_episode(self) -> None:
+        if not self._trackers:
+            return
+        assert self._finished is not None
+        video = self.video_recorder
+        has_video = video is not None and video.enabled
+        self._trackers.episode(self._finished, has_video=has_video)
+        self._tell_of_videos()
+
+    def _tell_of_videos(self) -> None:
+        if self._trackers:
+            self._trackers.videos(self._videos.news())
+
+    def _note_tracker_fault(self, name: str, error: Exception) -> None:
+        self._faults.note(
+            "tracker", f"{name}: {error}", episode_id=self._next_episode_id - 1
+        )
+
     def _tolerates(self, what: What, error: BaseException) -> bool:
         """Note what of the running episode is lost; tell whether to go on."""
         return self._faults.tolerates(what, error, episode_id=self._next_episode_id - 1)
 
     def _discard_episode(self) -> None:
-        if self.video_recorder is not None:
-            self.video_recorder.discard()
+        for video in (self.video_recorder, *self._live_videos):
+            if video is not None:
+                video.discard()
         trajectory, self._trajectory = self._trajectory, None
         if trajectory is not None:
             trajectory.discard()
@@ -673,8 +762,9 @@ class Recorder:
         try:
             self._end_trajectory(facts)
         finally:
-            if self._live_video is not None:
-                self._end_live_video(self._live_video, facts)
+            with contextlib.ExitStack() as ends:
+                for video in reversed(self._live_videos):
+                    ends.callback(self._end_live_video, video, facts)
 
     def _end_trajectory(self, facts: Mapping[str, Any]) -> None:
         trajectory = self._trajectory
@@ -733,6 +823,7 @@ class Recorder:
         """Return what is known of a live video from its episode's beginning."""
         reason = self._choice.reason
         return {
+            "episode_id": self._next_episode_id - 1,
             **({} if reason is None else {"recording_reason": reason}),
             "type": self.stats_recorder.episode_type,
             "env_id": self._env_info["env_id"],
