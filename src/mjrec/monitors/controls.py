@@ -8,10 +8,10 @@ import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from ..environments.scenes import Scenes
-from ..errors import NotPicklable, RenderError
+from ..errors import RenderError
 from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
 from ..recorder.ended_trajectories import Rendering
@@ -24,6 +24,7 @@ from ..recorder.subject import EpisodePictures, Subject
 from ..recorder.video_recorder import VideoRecorder
 from ..rendering.render_service import RenderService
 from ..simulation.inside import simulation_time
+from .lifetime import MonitorLifetime
 from .rendering_choice import rendering_choice
 from .waiting import waiting_display
 
@@ -34,7 +35,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class MonitorControls:
+class MonitorControls(MonitorLifetime):
     """The part of a monitor that does not depend on the framework.
 
     Attributes:
@@ -129,30 +130,8 @@ class MonitorControls:
         if wait:
             self._raise_failures()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc_info: Any) -> Literal[False]:
-        _, first, _ = exc_info
-        if first is not None:
-            self._recorder.note_error(first)
-        try:
-            # Whoever leaves by an exception does not wait for videos.
-            self.close(wait=first is None)
-        except Exception as second:
-            if first is None:
-                raise
-            # What went wrong first is what the user needs to see.
-            first.add_note(f"Closing the monitor failed too: {second}")
-        return False
-
-    def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
-        raise NotPicklable(
-            f"A {type(self).__name__} cannot be pickled or copied: it writes files, "
-            "and two would write the same ones. Make it in the process that uses it, "
-            "inside the function that makes the environment: "
-            "lambda: mjrec.Monitor(gymnasium.make(...), directory, resume=True)."
-        )
+    def _note_error(self, error: BaseException) -> None:
+        self._recorder.note_error(error)
 
     def _reset_by(self, reset: Callable[[], T]) -> T:
         """Return what the environment's reset returns; note it where it raises."""
@@ -185,14 +164,19 @@ class MonitorControls:
         scenes: Scenes,
         options: RecorderOptions,
         close_environment: Callable[[Any], None],
+        env_index: int | None = None,
+        rendering: Callable[[Path], Rendering] | None = None,
     ) -> None:
-        """Open the directory; from here on the environment is this monitor's."""
-        self._options = options
+        """Open the directory; from here on the environment is this monitor's.
+
+        What renders is made by `rendering`, or is a service of this monitor's own.
+        """
         choice = rendering_choice(options.render, scenes, env_id)
-        self._recorder = Recorder(
+        self._open(
             directory,
-            subject=Subject(
+            Subject(
                 env_id=env_id,
+                env_index=env_index,
                 pictures=pictures,
                 clock=functools.partial(simulation_time, env),
                 declared=functools.partial(declared_rate, env),
@@ -202,7 +186,25 @@ class MonitorControls:
                 random_state=scenes.random_state,
             ),
             options=options,
-            rendering=_rendering(options) if choice.mode == DEFERRED else None,
+            rendering=rendering or _rendering(options),
+            close_environment=functools.partial(close_environment, env),
+        )
+
+    def _open(
+        self,
+        directory: str | os.PathLike[str],
+        subject: Subject,
+        *,
+        options: RecorderOptions,
+        rendering: Callable[[Path], Rendering] | None,
+        close_environment: Callable[[], None],
+    ) -> None:
+        self._options = options
+        self._recorder = Recorder(
+            directory,
+            subject=subject,
+            options=options,
+            rendering=rendering if subject.rendering.mode == DEFERRED else None,
             finish_log=_finish_log,
         )
         self._guard = ExitGuard(
@@ -210,8 +212,8 @@ class MonitorControls:
             functools.partial(
                 _close,
                 self._recorder,
-                (pictures, scenes.states),
-                functools.partial(close_environment, env),
+                (subject.pictures, subject.states),
+                close_environment,
             ),
             at_exit=functools.partial(_note_last_error, self._recorder),
         )
