@@ -17,7 +17,7 @@ import os
 import struct
 import threading
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -64,7 +64,9 @@ __all__ = [
     "RowBlocks",
     "TrajectoryLogWriter",
     "checksum_seed",
+    "facts_record",
     "padded",
+    "write_all",
 ]
 
 # The line is padded, so that every record begins at a multiple of 8 bytes.
@@ -331,7 +333,7 @@ class TrajectoryLogWriter:
             ClosedError: after `close` or `discard`.
         """
         self._check_open()
-        record = _record(FACTS, _json(facts))
+        record = facts_record(facts)
         with self._lock:
             self._tail.facts += record
 
@@ -463,7 +465,7 @@ class TrajectoryLogWriter:
         try:
             descriptor = self._open() if self._descriptor is None else self._descriptor
             try:
-                _write_all(descriptor, parts, offset)
+                write_all(descriptor, parts, offset)
             except OSError:
                 # A reader takes what is whole in any case, and the next try begins at
                 # the same place.
@@ -608,6 +610,11 @@ def _beginning(facts: Mapping[str, Any], layout_text: str) -> bytes:
     return line.ljust(FIRST_LINE_SIZE - 1) + b"\n" + _record(HEADER, header)
 
 
+def facts_record(facts: Mapping[str, Any]) -> bytes:
+    """Return the record by which a log learns facts."""
+    return _record(FACTS, _json(facts))
+
+
 def _record(kind: bytes, *parts: bytes) -> bytes:
     length = sum(len(part) for part in parts)
     if length > LONGEST_RECORD:
@@ -659,8 +666,14 @@ def _json(values: Mapping[str, Any]) -> bytes:
         return dumps(dict(values)).encode()
 
 
-def _write_all(descriptor: int, parts: list[_Bytes], offset: int) -> None:
-    """Write all parts; on a full disk the system may have written some of it."""
+def write_all(
+    descriptor: int, parts: Sequence[bytes | bytearray | memoryview], offset: int
+) -> None:
+    """Write all parts, one behind the other, from `offset` on.
+
+    Raises:
+        OSError: the disk is full; the system may have written some of it.
+    """
     left = sum(len(part) for part in parts)
     written = os.pwritev(descriptor, parts, offset) if parts else 0
     if written == left:

@@ -49,7 +49,7 @@ from .trajectory_log import (
 )
 from .trajectory_reader import TrajectoryReader
 
-__all__ = ["TrajectoryLogReader"]
+__all__ = ["TrajectoryLogReader", "end_of_records"]
 
 _KINDS = frozenset((HEADER, STEP, FRAME, CHANGE, FACTS))
 
@@ -203,6 +203,26 @@ class TrajectoryLogReader(TrajectoryReader):
     def _check_open(self) -> None:
         if self._file.closed:
             raise ClosedError(f"The trajectory {self.path} is closed.")
+
+
+def end_of_records(descriptor: int) -> int:
+    """Return where the next record of an open log belongs: behind the last whole one.
+
+    Whether what the records hold is as it was written is not looked at.
+
+    Raises:
+        ValueError: it is no log, or something else than a part of a record stands
+            behind the last whole one.
+    """
+    window = _Window(descriptor)
+    _check_first_line(bytes(window.read(0, FIRST_LINE_SIZE)))
+    end = FIRST_LINE_SIZE
+    for record in _records(window):
+        if record.whole:
+            end = record.offset + padded(record.length)
+        elif record.kind not in (*_KINDS, b"") or record.length > LONGEST_RECORD:
+            raise ValueError("it is damaged")
+    return end
 
 
 def _check_first_line(line: bytes) -> None:
