@@ -171,7 +171,9 @@ class MonitorControls(MonitorLifetime):
 
         What renders is made by `rendering`, or is a service of this monitor's own.
         """
-        choice = rendering_choice(options.render, scenes, env_id)
+        choice = rendering_choice(
+            options.render, scenes, env_id, has_clips=options.has_clips
+        )
         self._open(
             directory,
             Subject(

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -13,10 +15,12 @@ from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
 from ..environments.gymnasium_scenes import gymnasium_scenes
+from ..recorder.ended_trajectories import Rendering
 from ..recorder.options import RecorderOptions
 from .controls import MonitorControls
+from .success import success_in
 
-__all__ = ["GymnasiumMonitor"]
+__all__ = ["GymnasiumMonitor", "env_id_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +50,9 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         height: int | None = None,
         width: int | None = None,
         env_id: str | None = None,
+        env_index: int | None = None,
+        rendering: Callable[[Path], Rendering] | None = None,
+        close_environment: Callable[[Any], None] = close_environment,
     ) -> None:
         super().__init__(env)
         # gym's own convention: the step that ends an episode begins the next.
@@ -57,10 +64,12 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         self._start(
             env,
             directory,
-            env_id=env_id or _env_id(env),
+            env_id=env_id or env_id_of(env),
+            env_index=env_index,
             pictures=gymnasium_pictures(env, **view),
             scenes=gymnasium_scenes(env, **view),
             options=options,
+            rendering=rendering,
             close_environment=close_environment,
         )
 
@@ -81,6 +90,7 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._recorder.closed:
             return self.env.reset(seed=seed, options=options)
         result = self._reset_by(lambda: self.env.reset(seed=seed, options=options))
+        self._began = time.perf_counter()
         self._begin(seed=seed, options=options, observation=result[0])
         return result
 
@@ -103,29 +113,47 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         except BaseException as error:
             recorder.note_error(error)
             raise
-        observation, reward, terminated, truncated, _ = result
-        resets_itself = self._same_step_autoreset and bool(terminated or truncated)
+        observation, reward, terminated, truncated, info = result
+        done = bool(terminated or truncated)
+        resets_itself = self._same_step_autoreset and done
         recorder.step(
             reward,
             terminated=terminated,
             truncated=truncated,
             picture=not resets_itself,
             observation=observation,
+            success=success_in(info) if done else None,
         )
+        if done and self._options.episode_info:
+            self._add_episode_info(info)
         if resets_itself:
             self._recorder.before_reset()
+            self._began = time.perf_counter()
             self._begin(observation=observation)
         return result
+
+    def _add_episode_info(self, info: dict[str, Any]) -> None:
+        stats = self.stats_recorder
+        info.setdefault(
+            "episode",
+            {
+                "r": stats.episode_rewards[-1],
+                "l": stats.episode_lengths[-1],
+                "t": round(time.perf_counter() - self._began, 6),
+            },
+        )
 
     def _reset_by_step(
         self, action: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         result = self._reset_by(lambda: self.env.step(action))
+        self._began = time.perf_counter()
         self._begin(observation=result[0])
         return result
 
 
-def _env_id(env: gymnasium.Env[Any, Any]) -> str:
+def env_id_of(env: gymnasium.Env[Any, Any]) -> str:
+    """Return the name in an environment's spec; `(unknown:ClassName)` without one."""
     if env.spec is not None:
         return env.spec.id
     unknown = f"(unknown:{type(env.unwrapped).__name__})"

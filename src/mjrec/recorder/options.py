@@ -121,6 +121,11 @@ class RecorderOptions:
                 "video_length must be a positive whole number of steps, or None for "
                 f"videos until the end of the episode, got {length!r}."
             )
+        if self.has_clips and self.render in (DEFERRED, OFF):
+            raise InvalidArgument(
+                "Videos that are counted in steps (step_trigger, video_length) are "
+                f'drawn live: use render="live" or None, got {self.render!r}.'
+            )
         prefix = self.name_prefix
         if prefix is not None and not (
             isinstance(prefix, str) and _NAME_PREFIX.fullmatch(prefix)
@@ -140,6 +145,11 @@ class RecorderOptions:
                     "trackers must be a mjrec.trackers.Tracker or a sequence of them, "
                     f"got {tracker!r} of type {type(tracker).__name__}."
                 )
+
+    @property
+    def has_clips(self) -> bool:
+        """Whether videos are counted in steps, and not each of one episode."""
+        return self.step_trigger is not None or self.video_length is not None
 
     @property
     def all_trackers(self) -> tuple[Tracker, ...]:

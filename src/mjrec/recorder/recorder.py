@@ -27,6 +27,7 @@ from ..formats.trajectory_log import RowBlocks
 from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
+from .clips import Clips
 from .deferred_video import DeferredVideo
 from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
@@ -77,10 +78,13 @@ class Recorder:
         finish_log: Callable[[Path], object],
     ) -> None:
         self._schedule = to_schedule(options.video_callable)
+        if options.step_trigger is not None:
+            self._schedule = disable_videos
         self._choice = subject.rendering
         if self._choice.mode == OFF:
             self._schedule = disable_videos
-        if self._schedule is not disable_videos and self._choice.mode == LIVE:
+        draws = self._schedule is not disable_videos or options.has_clips
+        if draws and self._choice.mode == LIVE:
             check_pictures(subject)
         self._subject = subject
         self._states = subject.states
@@ -142,6 +146,7 @@ class Recorder:
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
         # The same, where it is drawn live, and those of further cameras.
         self._live_videos: tuple[VideoRecorder, ...] = ()
+        self._clips = self._new_clips() if options.has_clips else None
         self.closed = False
 
     @property
@@ -275,6 +280,8 @@ class Recorder:
         # The usual case first: this is asked at every step.
         if self._is_forked or stats.done is not False or stats.closed:
             self._refuse_step()
+        if self._clips is not None:
+            self._clips.before_step(stats.total_steps)
         if self._trajectory is not None:
             self._trajectory.before_step(action)
 
@@ -326,6 +333,8 @@ class Recorder:
                         self._stop_recording(self._trajectory, error)
                 for video in self._live_videos:
                     self._take_picture(video, is_there=picture, last=done)
+                if self._clips is not None:
+                    self._clips.step(is_there=picture, done=done)
             finally:
                 if done:
                     self._end_episode()
@@ -379,6 +388,8 @@ class Recorder:
     def _end_by_close(self) -> None:
         try:
             self._take_last_picture()
+            if self._clips is not None:
+                self._clips.close(self._ending or {"reason": CLOSE})
         finally:
             try:
                 self._end_episode()
@@ -387,6 +398,30 @@ class Recorder:
                 # may end with the process.
                 if self._states is not None:
                     self._finish_models(self._states)
+
+    def _new_clips(self) -> Clips:
+        def begin(steps: int | None) -> VideoRecorder:
+            episode_id = self._next_episode_id - 1
+            path = self._video_path(episode_id)
+            if steps is not None:
+                path = path.with_name(f"{path.name}.step{steps:06d}")
+            self._subject.pictures.begin_episode()
+            video = self._live_video(path, self._subject.pictures)
+            video.metadata.update(
+                first_step=self.stats_recorder.total_steps, last_episode_id=episode_id
+            )
+            return video
+
+        def tolerates(error: Exception) -> bool:
+            return self._tolerates("video", error)
+
+        return Clips(
+            length=self._options.video_length,
+            trigger=self._options.step_trigger,
+            begin=begin,
+            on_end=self.add_video,
+            tolerates=tolerates,
+        )
 
     def _finish_models(self, states: StateSource) -> None:
         try:
@@ -442,6 +477,10 @@ class Recorder:
 
     def _begin_episode(self, episode_id: int, observation: Any) -> None:
         wanted = self._decide(episode_id)
+        if self._clips is not None:
+            self._clips.reset(episode_id, is_chosen=wanted)
+            # The episode has no video of its own.
+            wanted = False
         keeps = self._keeps_trajectory(episode_id, has_video=wanted)
         deferred = wanted and self._choice.mode == DEFERRED
         start = None
