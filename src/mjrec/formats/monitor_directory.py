@@ -11,6 +11,7 @@
     ├── openaigym.video.<infix>.video000027.meta.json   ... and all about it
     ├── openaigym.video.<infix>.video000027.framehash   ... and its pictures' hashes
     ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
+    ├── openaigym.video.<infix>.video000027.side.mp4    a further camera's
     ├── openaigym.trajectory.<infix>.episode000027.log  a recorded episode in flight
     ├── openaigym.trajectory.<infix>.episode000027.h5   ... and finished
     ├── openaigym.trajectory.<infix>.episode000027.log.damaged  that nobody can read

@@ -8,6 +8,7 @@ besides: of the episode, of the pictures, of what went wrong.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -19,12 +20,17 @@ from .video_writer import VideoFile
 __all__ = [
     "StepRuns",
     "file_facts",
+    "finished_videos",
     "is_broken",
     "is_done",
     "metadata_path",
     "playback_speed",
     "timing_facts",
 ]
+
+
+# Of a file's name, as `video_names` makes them.
+_PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)
 
 
 class StepRuns:
@@ -120,6 +126,29 @@ def metadata_path(video: Path) -> Path:
     return video.with_suffix(".meta.json")
 
 
+def finished_videos(video: Path) -> list[tuple[str, str]]:
+    """Return the names of an episode's videos that are there, each with its metadata's.
+
+    The first one comes first, and is there. Its metadata, which is written last of all,
+    names those of further cameras (`further_videos`); it may be anybody's, so only
+    names of that very episode count.
+
+    Args:
+        video: the first video.
+    """
+    names = [(video.name, metadata_path(video).name)]
+    try:
+        said = read_object(metadata_path(video)).get("further_videos")
+    except (OSError, ValueError):
+        return names
+    for name in said if isinstance(said, list) else ():
+        if isinstance(name, str) and _is_further(name, video):
+            further = video.with_name(name)
+            if further.is_file() and metadata_path(further).is_file():
+                names.append((name, metadata_path(further).name))
+    return list(dict.fromkeys(names))
+
+
 def is_done(video: Path) -> bool:
     """Tell whether nothing is left to do about a video: it is there, or given up."""
     metadata = metadata_path(video)
@@ -132,3 +161,9 @@ def is_broken(metadata: Path) -> bool:
         return bool(read_object(metadata).get("broken"))
     except (OSError, ValueError):
         return False
+
+
+def _is_further(name: str, video: Path) -> bool:
+    begin, end = f"{video.stem}.", ".mp4"
+    part = name.removeprefix(begin).removesuffix(end)
+    return name == f"{begin}{part}{end}" and _PART.fullmatch(part) is not None

@@ -11,6 +11,7 @@ from pathlib import Path
 from ..errors import DirectoryInUse
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import is_manifest, iter_monitor_files
+from ..formats.second_names import is_called_like_second, second_names
 
 __all__ = ["clear_monitor_files", "detect_monitor_files", "detect_training_manifests"]
 
@@ -46,8 +47,9 @@ def detect_monitor_files(directory: str | os.PathLike[str]) -> list[str]:
 def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
     """Remove the files of all monitors in `directory`, also unfinished ones.
 
-    Nothing else is removed: no directory, and no file that only begins like a
-    monitor's.
+    Also the second names of videos (`rl-video-episode-27.mp4`), where they lead to one
+    of these files. Nothing else is removed: no directory, and no file that only begins
+    like a monitor's.
 
     Raises:
         DirectoryInUse: a monitor that is still open writes there. Nothing was
@@ -60,10 +62,34 @@ def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
                 f"Cannot clear {directory}: a monitor that is still open writes there "
                 f"(it holds {path.name}). Close it first, or use another directory."
             )
-    # Manifests and journals first: if this is interrupted, none lists what is gone.
-    for path in sorted(paths, key=lambda path: not _is_listing(path.name)):
+    # Names that would lead nowhere first, then manifests and journals: if this is
+    # interrupted, none lists what is gone.
+    listings_first = sorted(paths, key=lambda path: not _is_listing(path.name))
+    for path in (*_second_names(Path(directory), paths), *listings_first):
         path.unlink(missing_ok=True)
     logger.info("Removed %d monitor files from %s.", len(paths), directory)
+
+
+def _second_names(directory: Path, paths: Iterable[Path]) -> list[Path]:
+    """Return the other names in a directory of these files, and copies of them."""
+    # What a monitor's file itself is a link to is somebody else's.
+    files = {file for path in paths if (file := _file(path, follow=False))}
+    links = [
+        path
+        for path in (directory.iterdir() if files else ())
+        if is_called_like_second(path.name) and _file(path, follow=True) in files
+    ]
+    copies = (path for video in paths for path in second_names(video))
+    return list(dict.fromkeys([*links, *copies]))
+
+
+def _file(path: Path, *, follow: bool) -> tuple[int, int] | None:
+    """Return which file a name leads to; None where it leads to none."""
+    try:
+        stat = path.stat(follow_symlinks=follow)
+    except OSError:
+        return None
+    return stat.st_dev, stat.st_ino
 
 
 def _is_listing(name: str) -> bool:

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Videos under a second name, such as `rl-video-episode-27.mp4`.
+
+The metadata of an episode's first video says which name that is (`also_named`). It is
+a link in the same directory, given last of all, so that no video is under it that is
+not whole. The further videos of the episode, and the metadata of each, are called
+alike.
+
+What is there under such a name and is not the very file belongs to somebody else, and
+is neither replaced nor removed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import filecmp
+import itertools
+import logging
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from ..atomic_files import temporary_path
+from .json_fields import read_object
+from .monitor_directory import episode_of, iter_monitor_files
+from .video_metadata import finished_videos, metadata_path
+from .video_names import is_second_name, second_name_of, without_part
+
+__all__ = [
+    "give_all_second_names",
+    "give_second_names",
+    "is_called_like_second",
+    "second_names",
+    "take_second_names",
+]
+
+logger = logging.getLogger(__name__)
+
+
+def give_all_second_names(directory: Path) -> None:
+    """Give the videos of a directory their second names, where these are missing.
+
+    Where that cannot be done, the log has a warning.
+    """
+    for path in iter_monitor_files(directory):
+        if path.name.endswith(".mp4") and metadata_path(path).exists():
+            give_second_names(path)
+
+
+def give_second_names(video: Path) -> None:
+    """Give a finished video, and what belongs to it, its second name, if it has one.
+
+    Where another file is in the way, or there can be no link, the log has a warning.
+
+    Args:
+        video: the first video of an episode. Others have none of their own.
+    """
+    for file, link in _second_names(video):
+        try:
+            _link(file, link)
+        except OSError as error:
+            logger.warning("%s could not be called %s: %s.", file.name, link, error)
+
+
+def take_second_names(video: Path) -> None:
+    """Remove the second names of a video and of what belongs to it.
+
+    To be called before any of these files is replaced or removed.
+
+    Args:
+        video: the first video of an episode.
+
+    Raises:
+        OSError: one cannot be removed.
+    """
+    for link in second_names(video):
+        link.unlink(missing_ok=True)
+
+
+def is_called_like_second(name: str) -> bool:
+    """Tell whether `name` could be a second name, also of a further camera."""
+    for ending in (".mp4", ".meta.json"):
+        if name.endswith(ending):
+            video = f"{name.removesuffix(ending)}.mp4"
+            return is_second_name(video) or is_second_name(without_part(video))
+    return False
+
+
+def second_names(video: Path) -> list[Path]:
+    """Return the second names that a video and what belongs to it have now.
+
+    Args:
+        video: the first video of an episode.
+    """
+    return [link for file, link in _second_names(video) if _is_same(file, link)]
+
+
+def _second_names(video: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield the files of an episode that have a second name, each with that."""
+    second = _said_of(video)
+    if second is None:
+        return
+    for name in itertools.chain.from_iterable(finished_videos(video)):
+        link = second_name_of(name, second, first=video.name)
+        file = video.with_name(name)
+        # What is a link itself may lead anywhere.
+        if link is not None and file.is_file() and not file.is_symlink():
+            yield file, video.with_name(link)
+
+
+def _said_of(video: Path) -> str | None:
+    """Return the second name in a video's metadata, which may be anybody's."""
+    if video.suffix != ".mp4" or episode_of(video.name) is None:
+        return None
+    try:
+        name = read_object(metadata_path(video)).get("also_named")
+    except (OSError, ValueError):
+        return None
+    return name if isinstance(name, str) and is_second_name(name) else None
+
+
+def _link(file: Path, link: Path) -> None:
+    if os.path.lexists(link):
+        if not _is_same(file, link):
+            logger.warning(
+                "%s is there already and is another file than %s, which was to have "
+                "that name too. It is left alone; rename one of them.",
+                link,
+                file.name,
+            )
+        return
+    try:
+        link.hardlink_to(file)
+    except FileExistsError:
+        # Somebody else was quicker.
+        return
+    except OSError:
+        _link_otherwise(file, link)
+
+
+def _link_otherwise(file: Path, link: Path) -> None:
+    """Make a symbolic link, or a copy where the file system knows no links at all."""
+    try:
+        link.symlink_to(file.name)
+    except FileExistsError:
+        return
+    except OSError:
+        _copy(file, link)
+
+
+def _copy(file: Path, link: Path) -> None:
+    unfinished = temporary_path(link)
+    try:
+        shutil.copyfile(file, unfinished)
+        # Claimed, so that nothing is replaced that is anybody else's.
+        with contextlib.suppress(FileExistsError):
+            link.open("xb").close()
+            unfinished.replace(link)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _is_same(file: Path, link: Path) -> bool:
+    """Tell whether a name leads to a file, or to a copy of it."""
+    try:
+        return link.samefile(file) or (
+            link.is_file()
+            and not link.is_symlink()
+            and filecmp.cmp(file, link, shallow=False)
+        )
+    except OSError:
+        return False

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Videos have a second name where one was asked for, and nothing of anybody is lost."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+
+from mjrec import clear_monitor_files
+from mjrec.formats.second_names import (
+    give_all_second_names,
+    give_second_names,
+    take_second_names,
+)
+from mjrec.formats.video_metadata import finished_videos
+
+STEM = "openaigym.video.0.7.video000027"
+SECOND = "rl-video-episode-27"
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """An episode with a further camera, as far as files go."""
+    return write_episode(tmp_path)
+
+
+def write_episode(directory: Path, **metadata: Any) -> Path:
+    for name in (f"{STEM}.mp4", f"{STEM}.side.mp4"):
+        (directory / name).write_bytes(name.encode())
+    (directory / f"{STEM}.side.meta.json").write_text("{}")
+    said = {
+        "also_named": f"{SECOND}.mp4",
+        "further_videos": [f"{STEM}.side.mp4"],
+        **metadata,
+    }
+    (directory / f"{STEM}.meta.json").write_text(json.dumps(said))
+    return directory / f"{STEM}.mp4"
+
+
+def seconds(directory: Path) -> list[str]:
+    return sorted(p.name for p in directory.iterdir() if "openaigym" not in p.name)
+
+
+ALL = [f"{SECOND}.{end}" for end in ("meta.json", "mp4", "side.meta.json", "side.mp4")]
+
+
+def test_all_of_an_episode_has_a_second_name(video: Path) -> None:
+    """A link: the files take no more room, and the second call changes nothing."""
+    for _ in range(2):
+        give_second_names(video)
+        assert seconds(video.parent) == ALL
+    assert video.with_name(f"{SECOND}.mp4").samefile(video)
+    take_second_names(video)
+    assert seconds(video.parent) == []
+
+
+def test_missing_names_come_back(video: Path) -> None:
+    """All that a directory lacks."""
+    give_second_names(video)
+    video.with_name(ALL[0]).unlink()
+    give_all_second_names(video.parent)
+    assert seconds(video.parent) == ALL
+
+
+def _refuse(*_: Any, **__: Any) -> NoReturn:
+    raise PermissionError("no links here")
+
+
+@pytest.mark.parametrize("refused", [["hardlink_to"], ["hardlink_to", "symlink_to"]])
+def test_without_hard_links_another_way_is_found(
+    refused: list[str],
+    video: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A symbolic link, or a copy; either goes with its file."""
+    for name in refused:
+        monkeypatch.setattr(Path, name, _refuse)
+    for _ in range(2):
+        give_second_names(video)
+        assert seconds(video.parent) == ALL
+    link = video.with_name(f"{SECOND}.side.mp4")
+    assert link.read_bytes() == f"{STEM}.side.mp4".encode()
+    assert link.is_symlink() == (len(refused) == 1)
+    clear_monitor_files(video.parent)
+    assert list(video.parent.iterdir()) == []
+    assert not caplog.records
+
+
+def test_somebody_elses_file_stays(
+    video: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is said which one is in the way, and nobody removes it either."""
+    mine = video.with_name(f"{SECOND}.mp4")
+    mine.write_text("mine")
+    give_second_names(video)
+    assert f"{SECOND}.mp4 is there already" in caplog.text
+    assert seconds(video.parent) == ALL
+    take_second_names(video)
+    clear_monitor_files(video.parent)
+    assert [path.name for path in video.parent.iterdir()] == [mine.name]
+    assert mine.read_text() == "mine"
+
+
+@pytest.mark.parametrize("way", ["hardlink_to", "symlink_to"])
+def test_clearing_removes_links_to_the_files(way: str, video: Path) -> None:
+    """Also where the metadata is gone that would say so; not other links."""
+    getattr(video.with_name(f"{SECOND}.mp4"), way)(video)
+    os.link(video, video.with_name("my favourite.mp4"))
+    video.with_suffix(".meta.json").unlink()
+    clear_monitor_files(video.parent)
+    assert [path.name for path in video.parent.iterdir()] == ["my favourite.mp4"]
+
+
+@pytest.mark.parametrize(
+    "name", ["../x-episode-1.mp4", "x.mp4", "openaigym.x-episode-1.mp4", 5, None]
+)
+def test_a_name_that_is_none_is_passed_over(
+    name: Any, tmp_path: Path, names: Callable[[Path], list[str]]
+) -> None:
+    """Metadata may be anybody's."""
+    directory = tmp_path / "recordings"
+    directory.mkdir()
+    video = write_episode(directory, also_named=name)
+    give_second_names(video)
+    assert seconds(directory) == []
+    assert names(tmp_path) == ["recordings"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(
+            "../x.mp4",
+            "x.mp4",
+            f"{STEM}.mp4",
+            f"{STEM}.mp4/../x.mp4",
+            7,
+            f"{STEM}..mp4",
+        ),
+        *(f"{STEM}.gone.mp4", f"{STEM[:-1]}8.side.mp4"),
+    ],
+)
+def test_only_files_of_the_episode_are_its_videos(name: Any, tmp_path: Path) -> None:
+    """And only those that are there."""
+    (tmp_path / "x.mp4").write_text("")
+    video = write_episode(tmp_path, further_videos=[name, f"{STEM}.side.mp4"])
+    assert finished_videos(video) == [
+        (f"{STEM}.mp4", f"{STEM}.meta.json"),
+        (f"{STEM}.side.mp4", f"{STEM}.side.meta.json"),
+    ]
+
+
+def test_what_leads_elsewhere_gets_no_name(tmp_path: Path) -> None:
+    """A video that is a link may lead out of the directory."""
+    video = write_episode(tmp_path)
+    video.unlink()
+    video.symlink_to("/etc/hostname")
+    give_second_names(video)
+    assert f"{SECOND}.mp4" not in seconds(tmp_path)
