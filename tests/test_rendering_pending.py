@@ -22,6 +22,7 @@ from mjrec import GLError, load_results
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import Infix, lock_name, video_lock_name
 from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.trajectory_log_facts import append_facts
 from mjrec.formats.video_metadata import is_done
 from mjrec.rendering import crew
 from mjrec.rendering.finishing import EpisodeFinisher, finish_pending
@@ -122,6 +123,20 @@ def test_a_given_up_video_is_not_pending(tmp_path: Path) -> None:
     [outcome] = finish(tmp_path)
     assert outcome.failure is None
     assert look_at(tmp_path, KEY) is None
+
+
+def test_an_undecided_episode_is_its_monitors(tmp_path: Path) -> None:
+    """Its monitor may still delete it; what a dead one left undecided is pending."""
+    log = write_log(tmp_path, candidate=True)
+    lock = Lock(tmp_path / lock_name(INFIX), "")
+    assert finish(tmp_path) == []
+    assert log.exists()
+    append_facts(log, {"candidate": False})
+    assert look_at(tmp_path, KEY) is not None
+    append_facts(log, {"candidate": True})
+    lock.release()
+    [outcome] = finish(tmp_path)
+    assert outcome.is_video
 
 
 def test_a_running_episode_is_its_monitors(tmp_path: Path) -> None:

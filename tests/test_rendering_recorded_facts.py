@@ -52,6 +52,7 @@ VIDEO = {"name": "x.mp4", "recording": "deferred"}
         ("stride", 2.0),
         ("stride", None),
         ("kept", 1),
+        ("candidate", "yes"),
         ("scene", "all"),
         ("model", []),
         ("model", {"mjb": "x" * 300}),

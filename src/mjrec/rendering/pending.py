@@ -118,8 +118,9 @@ def recorded_episodes(directory: Path) -> list[EpisodeKey]:
 def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
     """Return what is left to do about an episode; None where it is nothing.
 
-    An episode that is still running is nobody's business but its monitor's: its log
-    does not say how it ended, and somebody holds the monitor's lock.
+    An episode that is still running, or of which its monitor has not decided yet
+    whether it gets a video, is nobody's business but its monitor's: its log does not
+    say how it ended, or calls it a candidate, and somebody holds the monitor's lock.
 
     Raises:
         UnreadableFile: its trajectory is damaged, or of a newer format, or says what
@@ -135,7 +136,7 @@ def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
         return None
     with open_for_rendering(trajectory) as reader:
         facts = reader.header.facts
-        if is_log and "complete" not in facts and _is_open(directory, key.infix):
+        if is_log and _is_monitors(facts) and _is_open(directory, key.infix):
             return None
         video = _deferred_video(trajectory, facts)
         if not is_log and video is None:
@@ -176,6 +177,10 @@ def remove_unfinished(video: Path) -> None:
             begin = f".{final.name}."
             if path.name.startswith(begin) and _PART.fullmatch(path.name, len(begin)):
                 path.unlink(missing_ok=True)
+
+
+def _is_monitors(facts: Mapping[str, Any]) -> bool:
+    return "complete" not in facts or bool(facts.get("candidate", False))
 
 
 def _is_open(directory: Path, infix: Infix) -> bool:

@@ -43,7 +43,8 @@ def open_for_rendering(path: Path) -> TrajectoryReader:
     """Open a trajectory, as `open_trajectory` does, and check its facts.
 
     Afterwards `rate`, `timestep`, `scene`, `model` and `video` are there as they
-    should be, or None, or missing; `stride` and `kept` as they should be, or missing.
+    should be, or None, or missing; `stride`, `kept` and `candidate` as they should be,
+    or missing.
 
     Raises:
         UnreadableFile: of `open_trajectory`; or a fact is of a kind that it cannot be.
@@ -63,6 +64,7 @@ def _check(facts: Mapping[str, Any]) -> None:
         field(facts, key, optional(_rate), default=None)
     field(facts, "stride", _stride, default=1)
     field(facts, "kept", boolean, default=True)
+    field(facts, "candidate", boolean, default=False)
     for key in ("refusal", "broken_reason", "reason"):
         field(facts, key, optional(text), default=None)
     for key in ("scene", "exception"):
@@ -86,6 +88,7 @@ def _video(value: Any) -> Mapping[str, Any]:
     field(video, "quality", _one_of(*QUALITIES), default="full")
     field(video, "recording", _one_of(*_RECORDINGS), default="live")
     field(video, "reason", optional(text), default=None)
+    field(video, "selection", optional(mapping), default=None)
     for key in ("fps", "max_fps"):
         field(video, key, optional(_asked_rate), default=None)
     return video
