@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""TensorBoard's event files, written by its own package.
+
+Its `EventFileWriter` is not used: it has a thread that a fork would leave behind,
+writes from time to time only, and loads TensorFlow where that is installed. Import this
+module only where tensorboard is known to be there.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import os
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from tensorboard.compat.proto import event_pb2, summary_pb2, tensor_pb2, types_pb2
+from tensorboard.plugins.text.metadata import create_summary_metadata
+from tensorboard.summary.writer.record_writer import RecordWriter
+
+from ..errors import DirectoryNotWritable
+from .append_only_file import AppendOnlyFile, make_directory
+
+__all__ = ["EventFile"]
+
+# Where a GIF has its width and height.
+_GIF_SIZE = struct.Struct("<HH")
+_GIF_SIZE_AT = 6
+
+
+class EventFile:
+    """An event file in a new directory, in which each event is at once.
+
+    Several threads may write.
+
+    Args:
+        directory: to be made. Where it is there, it gets a number behind its name:
+            TensorBoard stops reading the first of two files of one directory.
+
+    Raises:
+        DirectoryNotWritable: the directory cannot be made.
+        FileNotWritten: the disk is full.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = _make_new(directory)
+        now = time.time()
+        name = f"events.out.tfevents.{now:010.0f}.{socket.gethostname()}.{os.getpid()}"
+        self._file = AppendOnlyFile([self.directory / name])
+        self._lock = threading.Lock()
+        self._write(event_pb2.Event(wall_time=now, file_version="brain.Event:2"))
+
+    def write_scalars(
+        self, values: Mapping[str, float], *, step: int, wall_time: float
+    ) -> None:
+        """Write numbers by their tags."""
+        self._write_summary(
+            *(
+                summary_pb2.Summary.Value(tag=tag, simple_value=value)
+                for tag, value in values.items()
+            ),
+            step=step,
+            wall_time=wall_time,
+        )
+
+    def write_gif(self, tag: str, gif: bytes, *, step: int, wall_time: float) -> None:
+        """Write an animated picture."""
+        width, height = _GIF_SIZE.unpack_from(gif, _GIF_SIZE_AT)
+        image = summary_pb2.Summary.Image(
+            height=height, width=width, colorspace=3, encoded_image_string=gif
+        )
+        value = summary_pb2.Summary.Value(tag=tag, image=image)
+        self._write_summary(value, step=step, wall_time=wall_time)
+
+    def write_text(self, tag: str, text: str, *, step: int, wall_time: float) -> None:
+        """Write a text, which is shown as Markdown."""
+        tensor = tensor_pb2.TensorProto(
+            dtype=types_pb2.DT_STRING, string_val=[text.encode()]
+        )
+        metadata = create_summary_metadata(display_name=tag, description="")
+        value = summary_pb2.Summary.Value(tag=tag, metadata=metadata, tensor=tensor)
+        self._write_summary(value, step=step, wall_time=wall_time)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _write_summary(
+        self, *values: summary_pb2.Summary.Value, step: int, wall_time: float
+    ) -> None:
+        summary = summary_pb2.Summary(value=values)
+        self._write(event_pb2.Event(wall_time=wall_time, step=step, summary=summary))
+
+    def _write(self, event: event_pb2.Event) -> None:
+        # In memory: the check sum of a large one takes a while.
+        record = io.BytesIO()
+        RecordWriter(record).write(event.SerializeToString())
+        with self._lock:
+            self._file.append(record.getvalue())
+
+
+def _make_new(directory: Path) -> Path:
+    make_directory(directory.parent)
+    for path in _names(directory):
+        try:
+            path.mkdir()
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise DirectoryNotWritable(path, error.strerror) from error
+        break
+    return path
+
+
+def _names(directory: Path) -> Iterator[Path]:
+    yield directory
+    for number in itertools.count(2):
+        yield directory.with_name(f"{directory.name}-{number}")

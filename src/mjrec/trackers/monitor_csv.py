@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stable-Baselines3's `monitor.csv`, for its readers and plots.
+
+::
+
+    #{"t_start": 1700000000.0, "env_id": "Hopper-v5"}
+    r,l,t
+    21.5,14,0.93
+
+`r` is the sum of the rewards, `l` the number of steps, and `t` the end of the episode
+in seconds since `t_start`, which is wall clock.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from .. import json_text
+from ..formats.monitor_directory import FILE_PREFIX
+from ..recorder.tracking import FinishedEpisode, Run, Tracker
+from .append_only_file import AppendOnlyFile
+
+__all__ = ["MonitorCsvTracker"]
+
+# What Stable-Baselines3 looks for: every file of a directory whose name ends so.
+_ENDING = "monitor.csv"
+
+
+class MonitorCsvTracker(Tracker):
+    """Writes what `stable_baselines3.common.monitor.load_results` reads.
+
+    Each run has a file of its own: every sub-environment, and every run that adds to
+    earlier recordings. `load_results` reads all files of a directory and puts the
+    episodes in the order of their ends. A file that is there is never written to.
+
+    A row is on disk as soon as its episode has ended, whole or not at all.
+
+    Args:
+        path: a directory that is there, or a file's name, to which `.monitor.csv` is
+            added unless it ends in `monitor.csv`, and a number where it is taken:
+            `logs/a.monitor.csv`, `logs/a.1.monitor.csv` ... None is the monitor
+            directory. In a directory the name is
+            `openaigym.episodes.<infix>.monitor.csv`.
+    """
+
+    def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
+        # Absolute, because the working directory may be another one by then.
+        self._path = None if path is None else Path(path).absolute()
+        self._files: dict[Run, _CsvFile] = {}
+
+    def begin(self, run: Run) -> None:
+        """Make the run's file.
+
+        Raises:
+            DirectoryNotWritable: the directory cannot be made or written to.
+            FileNotWritten: the disk is full.
+        """
+        self._files[run] = _CsvFile(self._names(run), env_id=run.env_id)
+
+    def episode(self, run: Run, episode: FinishedEpisode) -> None:
+        """Write the episode's row.
+
+        Raises:
+            FileNotWritten: the disk is full; the file is as it was before.
+        """
+        self._files[run].write_episode(episode)
+
+    def end(self, run: Run) -> None:
+        """Close the run's file."""
+        self._files.pop(run).close()
+
+    def _names(self, run: Run) -> Iterator[Path]:
+        """Yield the names that the run's file may have, best first."""
+        path = run.directory if self._path is None else self._path
+        if path == run.directory or path.is_dir():
+            path /= f"{FILE_PREFIX}.episodes.{run.infix}.{_ENDING}"
+        base = path.name.removesuffix(_ENDING).removesuffix(".")
+        yield path.with_name(f"{base}.{_ENDING}" if base else _ENDING)
+        for number in itertools.count(1):
+            # A name without a base is given by the number.
+            yield path.with_name(f"{base}.{number}.{_ENDING}".removeprefix("."))
+
+
+class _CsvFile:
+    """A file with its header, and a row for each episode."""
+
+    def __init__(self, names: Iterator[Path], *, env_id: str) -> None:
+        self._t_start = time.time()
+        self._file = AppendOnlyFile(names)
+        header = json_text.dumps({"t_start": self._t_start, "env_id": env_id})
+        self._file.append(f"#{header}\nr,l,t\n".encode())
+
+    def write_episode(self, episode: FinishedEpisode) -> None:
+        seconds = round(episode.end_time - self._t_start, 6)
+        # NumPy's numbers would be written with their types.
+        row = float(episode.reward), int(episode.length), float(seconds)
+        self._file.append((",".join(map(repr, row)) + "\n").encode())
+
+    def close(self) -> None:
+        self._file.close()

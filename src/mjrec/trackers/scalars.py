@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the services are told of an episode, and under which names."""
+
+from __future__ import annotations
+
+from ..recorder.tracking import FinishedEpisode
+
+__all__ = ["group_of", "scalars_of"]
+
+
+def group_of(episode: FinishedEpisode | None) -> str:
+    """Return what comes before the slash; of no episode, that of training."""
+    return "evaluation" if episode and episode.type == "e" else "training"
+
+
+def scalars_of(episode: FinishedEpisode) -> dict[str, float]:
+    """Return an episode's numbers by their names."""
+    scalars = {"return": float(episode.reward), "length": float(episode.length)}
+    if episode.success is not None:
+        scalars["success"] = float(episode.success)
+    return scalars

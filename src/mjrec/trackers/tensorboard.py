@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""TensorBoard: curves of the episodes, and the videos as animated pictures."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..formats.json_fields import field, integer, read_object, text, unreadable
+from ..recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
+from ..worker_thread import WorkerThread
+from .preview import animated_gif
+from .required_packages import require
+from .scalars import group_of, scalars_of
+
+if TYPE_CHECKING:
+    from .event_file import EventFile
+
+__all__ = ["TensorBoardTracker"]
+
+# Videos that wait for their previews; what is kept of each is a name.
+_MOST_WAITING = 100
+
+
+class TensorBoardTracker(Tracker):
+    """Writes event files that TensorBoard shows.
+
+    Scalars, over the steps of the run: `training/return`, `training/length` and, where
+    the environment says it, `training/success`; those of evaluation episodes begin with
+    `evaluation/`. TensorBoard plays no videos (its issue 39): a finished mp4 file is
+    shown as a small animated GIF, `training/video` under Images, and its name under
+    Text. The GIF is made from the file, on a thread beside the simulation.
+
+    Each monitor, so each sub-environment too, is a run of its own in TensorBoard, in a
+    directory of its own: TensorBoard reads only one of several files that grow in one
+    directory. Events are on disk at once.
+
+    Args:
+        log_dir: above the runs' directories; None is `tensorboard` in the monitor
+            directory. A run is called `<infix>` there, and
+            `<monitor directory's name>.<infix>` in a `log_dir`; `.env<i>` follows for
+            a sub-environment.
+
+    Raises:
+        MissingDependency: tensorboard is not installed.
+    """
+
+    def __init__(self, log_dir: str | os.PathLike[str] | None = None) -> None:
+        require("tensorboard", purpose="TensorBoardTracker", extra="tensorboard")
+        # Absolute, because the working directory may be another one by then.
+        self._log_dir = None if log_dir is None else Path(log_dir).absolute()
+        self._runs: dict[Run, _TensorBoardRun] = {}
+
+    def begin(self, run: Run) -> None:
+        """Make the run's event file.
+
+        Raises:
+            DirectoryNotWritable: its directory cannot be made.
+            FileNotWritten: the disk is full.
+        """
+        self._runs[run] = _TensorBoardRun(self._directory(run))
+
+    def episode(self, run: Run, episode: FinishedEpisode) -> None:
+        """Write the episode's scalars.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        self._runs[run].write_episode(episode)
+
+    def video(self, run: Run, video: FinishedVideo) -> None:
+        """Write the video's name, and have its preview made.
+
+        Raises:
+            FileNotWritten: the disk is full.
+            EncoderError: ffmpeg failed at the preview of this video or an earlier one.
+            UnreadableFile: the video's metadata is damaged.
+        """
+        self._runs[run].write_video(video)
+
+    def end(self, run: Run) -> None:
+        """Wait for the previews, and close the run's event file.
+
+        Raises:
+            Error: as `video`, of the previews that were still to be made.
+        """
+        self._runs.pop(run).close()
+
+    def _directory(self, run: Run) -> Path:
+        name = run.infix if run.env_index is None else f"{run.infix}.env{run.env_index}"
+        if self._log_dir is None:
+            return run.directory / "tensorboard" / name
+        # Two monitors of one process have the same infix in their two directories.
+        return self._log_dir / f"{run.directory.name}.{name}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Preview:
+    """A preview that is to be made, and where it belongs."""
+
+    path: Path
+    frame_count: int
+    fps: Fraction
+    group: str
+    step: int
+
+
+def _preview(video: FinishedVideo, episode: FinishedEpisode | None) -> _Preview:
+    frame_count, fps = _rate(video.metadata_path)
+    return _Preview(
+        path=video.path,
+        frame_count=frame_count,
+        fps=fps,
+        group=group_of(episode),
+        step=episode.total_steps if episode else 0,
+    )
+
+
+def _rate(metadata_path: Path) -> tuple[int, Fraction]:
+    """Return a video's number of frames, and how many are shown in a second."""
+    with unreadable(metadata_path):
+        metadata = read_object(metadata_path)
+        fps = Fraction(field(metadata, "fps", text))
+        return field(metadata, "frame_count", integer), fps
+
+
+class _TensorBoardRun:
+    """The event file of a run, and the thread that makes previews for it."""
+
+    def __init__(self, directory: Path) -> None:
+        # Not at the top: it imports tensorboard.
+        from .event_file import EventFile
+
+        self._file: EventFile = EventFile(directory)
+        self._last_episode: FinishedEpisode | None = None
+        # Started by the first video; most runs of a vector environment have none.
+        self._previews: WorkerThread[_Preview] | None = None
+
+    def write_episode(self, episode: FinishedEpisode) -> None:
+        self._last_episode = episode
+        group = group_of(episode)
+        values = {f"{group}/{k}": v for k, v in scalars_of(episode).items()}
+        self._file.write_scalars(
+            values, step=episode.total_steps, wall_time=episode.end_time
+        )
+
+    def write_video(self, video: FinishedVideo) -> None:
+        preview = _preview(video, video.episode or self._last_episode)
+        self._file.write_text(
+            f"{preview.group}/video_file",
+            f"episode {video.episode_id}: `{video.path.name}`, "
+            f"{preview.frame_count} frames at {float(preview.fps):g} fps, "
+            f"in `{video.path.parent}`",
+            step=preview.step,
+            wall_time=time.time(),
+        )
+        if self._previews is None:
+            self._previews = WorkerThread(
+                self._write_preview, capacity=_MOST_WAITING, name="previews"
+            )
+        self._previews.put(preview)
+
+    def close(self) -> None:
+        try:
+            if self._previews is not None:
+                self._previews.close()
+        finally:
+            self._file.close()
+
+    def _write_preview(self, preview: _Preview) -> None:
+        gif = animated_gif(
+            preview.path, frame_count=preview.frame_count, fps=preview.fps
+        )
+        self._file.write_gif(
+            f"{preview.group}/video", gif, step=preview.step, wall_time=time.time()
+        )
