@@ -20,10 +20,11 @@ from ..recorder.exit_guard import ExitGuard
 from ..recorder.options import DEFERRED, WARN, RecorderOptions
 from ..recorder.recorder import Recorder
 from ..recorder.stats_recorder import StatsRecorder
-from ..recorder.subject import EpisodePictures, Subject
+from ..recorder.subject import Subject
 from ..recorder.video_recorder import VideoRecorder
 from ..rendering.render_service import RenderService
 from ..simulation.inside import simulation_time
+from .cameras import CameraPictures
 from .lifetime import MonitorLifetime
 from .rendering_choice import rendering_choice
 from .waiting import waiting_display
@@ -160,7 +161,7 @@ class MonitorControls(MonitorLifetime):
         directory: str | os.PathLike[str],
         *,
         env_id: str,
-        pictures: EpisodePictures,
+        view: CameraPictures,
         scenes: Scenes,
         options: RecorderOptions,
         close_environment: Callable[[Any], None],
@@ -179,7 +180,9 @@ class MonitorControls(MonitorLifetime):
             Subject(
                 env_id=env_id,
                 env_index=env_index,
-                pictures=pictures,
+                pictures=view.pictures,
+                further_pictures=view.further,
+                cameras=view.cameras,
                 clock=functools.partial(simulation_time, env),
                 declared=functools.partial(declared_rate, env),
                 rendering=choice,
@@ -214,7 +217,7 @@ class MonitorControls(MonitorLifetime):
             functools.partial(
                 _close,
                 self._recorder,
-                (subject.pictures, subject.states),
+                (subject.pictures, *subject.further_pictures.values(), subject.states),
                 close_environment,
             ),
             at_exit=functools.partial(_note_last_error, self._recorder),

@@ -15,6 +15,7 @@ from ..environments.no_pictures import NoPictureSource
 from ..environments.scenes import Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
+from .cameras import camera_pictures
 from .controls import MonitorControls
 
 __all__ = ["DmEnvMonitor"]
@@ -58,13 +59,23 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
     ) -> None:
         self._env = env
         self.seed: Any = None
-        view = {"camera": camera, "height": height, "width": width}
+        if options.episode_info:
+            raise InvalidArgument(
+                "episode_info adds to the info of Gymnasium's steps, and dm_env's time "
+                "steps have none. The journal has every episode's return and length."
+            )
+        size = {"height": height, "width": width}
+        view = camera_pictures(
+            camera,
+            lambda each: _pictures(env, camera=each, **size),
+            tiled=options.tiled,
+        )
         self._start(
             env,
             directory,
             env_id=env_id or _env_id(env),
-            pictures=_pictures(env, **view),
-            scenes=_scenes(env, env_id=env_id, **view),
+            view=view,
+            scenes=_scenes(env, env_id=env_id, camera=view.camera, **size),
             options=options,
             close_environment=operator.methodcaller("close"),
         )

@@ -17,6 +17,7 @@ from ..environments.gymnasium_pictures import close_environment, gymnasium_pictu
 from ..environments.gymnasium_scenes import gymnasium_scenes
 from ..recorder.ended_trajectories import Rendering
 from ..recorder.options import RecorderOptions
+from .cameras import camera_pictures
 from .controls import MonitorControls
 from .success import success_in
 
@@ -60,14 +61,19 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         self._next_step_autoreset = any(
             isinstance(wrapper, gymnasium.wrappers.Autoreset) for wrapper in _chain(env)
         )
-        view = {"camera": camera, "height": height, "width": width}
+        size = {"height": height, "width": width}
+        view = camera_pictures(
+            camera,
+            lambda each: gymnasium_pictures(env, camera=each, **size),
+            tiled=options.tiled,
+        )
         self._start(
             env,
             directory,
             env_id=env_id or env_id_of(env),
             env_index=env_index,
-            pictures=gymnasium_pictures(env, **view),
-            scenes=gymnasium_scenes(env, **view),
+            view=view,
+            scenes=gymnasium_scenes(env, camera=view.camera, **size),
             options=options,
             rendering=rendering,
             close_environment=close_environment,

@@ -10,7 +10,12 @@ from typing import Any
 
 from ..formats.monitor_directory import episode_of
 from ..formats.pending_videos import pending_video, with_reason
-from ..formats.video_metadata import is_broken, is_done, metadata_path
+from ..formats.video_metadata import (
+    finished_videos,
+    is_broken,
+    is_done,
+    metadata_path,
+)
 from .deferred_video import DeferredVideo
 from .video_recorder import VideoRecorder
 
@@ -99,7 +104,8 @@ class EpisodeVideos:
             elif is_broken(metadata_path(video)):
                 self._broken.append(metadata_path(video).name)
             else:
-                self._add_finished(video, metadata_path(video))
+                for name, about in finished_videos(video):
+                    self._add_finished(video.with_name(name), video.with_name(about))
         self._deferred = waiting
 
     def _add_finished(self, video: Path, about: Path) -> None:

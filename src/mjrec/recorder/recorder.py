@@ -13,6 +13,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+from ..annotation import Caption
 from ..errors import Error, FileNotWritten, NoPictures, PicturesDiffer
 from ..formats.journal import JournalEntry, JournalWriter
 from ..formats.manifest import Manifest, write_manifest
@@ -23,6 +24,7 @@ from ..formats.monitor_directory import (
     trajectory_prefix,
     video_prefix,
 )
+from ..formats.second_names import give_second_names
 from ..formats.trajectory_log import RowBlocks
 from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
@@ -127,6 +129,8 @@ class Recorder:
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
+        # The simulated time of the reset, where it is to be written on pictures.
+        self._reset_clock: float | None = None
         self._trackers = ToldTrackers(
             Run(
                 directory=self.directory,
@@ -234,6 +238,7 @@ class Recorder:
             self._end_episode(otherwise=RESET)
         self._ending = None
         self.stats_recorder.after_reset()
+        self._reset_clock = self._subject.clock() if self._options.annotate else None
         self._episode_start = {
             "start_time": self._reset_time,
             "seed": seed,
@@ -406,11 +411,18 @@ class Recorder:
             if steps is not None:
                 path = path.with_name(f"{path.name}.step{steps:06d}")
             self._subject.pictures.begin_episode()
+            named = ("episode", episode_id) if steps is None else ("step", steps)
             video = self._live_video(path, self._subject.pictures)
             video.metadata.update(
-                first_step=self.stats_recorder.total_steps, last_episode_id=episode_id
+                first_step=self.stats_recorder.total_steps,
+                last_episode_id=episode_id,
+                **self._second_name(*named),
             )
             return video
+
+        def end(video: VideoRecorder) -> None:
+            self.add_video(video)
+            _name_again(video)
 
         def tolerates(error: Exception) -> bool:
             return self._tolerates("video", error)
@@ -419,7 +431,7 @@ class Recorder:
             length=self._options.video_length,
             trigger=self._options.step_trigger,
             begin=begin,
-            on_end=self.add_video,
+            on_end=end,
             tolerates=tolerates,
         )
 
@@ -508,6 +520,7 @@ class Recorder:
     def _begin_live_videos(self, episode_id: int, *, enabled: bool) -> None:
         path = self._video_path(episode_id)
         main = self._live_video(path, self._subject.pictures, enabled=enabled)
+        main.metadata.update(self._second_name("episode", episode_id))
         self.video_recorder = main
         if not main.enabled:
             return
@@ -539,6 +552,18 @@ class Recorder:
             declared=self._subject.declared,
             facts=pictures.facts,
             strict=self._options.strict,
+            caption=self._caption if self._options.annotate else None,
+        )
+
+    def _caption(self) -> Caption:
+        """Return what is written on the picture of this moment."""
+        stats = self.stats_recorder
+        began, now = self._reset_clock, self._subject.clock()
+        return Caption(
+            episode_id=self._next_episode_id - 1,
+            step=stats.steps or 0,
+            time=None if began is None or now is None else now - began,
+            reward=stats.rewards or 0.0,
         )
 
     def _new_trajectory(
@@ -603,7 +628,16 @@ class Recorder:
             promise["tiled"] = options.tiled
         if options.annotate:
             promise["annotate"] = True
-        return promise
+        return {**promise, **self._second_name("episode", episode_id)}
+
+    def _second_name(self, what: str, number: int) -> dict[str, str]:
+        """Return what a video is called besides, for its metadata."""
+        prefix = self._options.name_prefix
+        if prefix is None:
+            return {}
+        if self._subject.env_index is not None:
+            prefix = f"{prefix}-env-{self._subject.env_index}"
+        return {"also_named": f"{prefix}-{what}-{number}.mp4"}
 
     def _video_path(self, episode_id: int) -> Path:
         return self.directory / video_prefix(self._place.infix, episode_id)
@@ -802,6 +836,8 @@ class Recorder:
             self._end_trajectory(facts)
         finally:
             with contextlib.ExitStack() as ends:
+                for video in self._live_videos[:1]:
+                    ends.callback(_name_again, video)
                 for video in reversed(self._live_videos):
                     ends.callback(self._end_live_video, video, facts)
 
@@ -900,6 +936,12 @@ class Recorder:
             "faults": self._faults.listed(),
             "versions": dict(versions()),
         }
+
+
+def _name_again(video: VideoRecorder) -> None:
+    """Give the finished videos of an episode their second names, if they have any."""
+    if video.finished and video.path is not None and "also_named" in video.metadata:
+        give_second_names(Path(video.path))
 
 
 # Asking the system for the process's number at every step takes as long as counting it.

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 from .. import json_text
+from ..annotation import Caption, annotated, check_annotation, pillow_version
 from ..atomic_files import write_text
 from ..blank_frames import BlankFrames
 from ..errors import InvalidArgument, InvalidFrame
@@ -85,8 +86,11 @@ class VideoRecorder:
         facts: returns more for the metadata, asked for once, after the last frame.
         strict: whether images that show nothing (all black, of one colour each, or all
             the same) are an error of `close`; else they are a warning.
+        caption: returns what is written on the images of this moment; None where
+            nothing is.
 
     Raises:
+        MissingDependency: there is no Pillow to write captions with.
         InvalidArgument: both `path` and `base_path` are given, or the extension is
             another.
 
@@ -114,7 +118,11 @@ class VideoRecorder:
         declared: Callable[[], Fraction] | None = None,
         facts: Callable[[], Mapping[str, Any]] | None = None,
         strict: bool = False,
+        caption: Callable[[], Caption] | None = None,
     ) -> None:
+        if caption is not None:
+            check_annotation()
+        self._caption = caption
         self.env = env
         self.enabled = bool(enabled) and can_give_pictures(env)
         self.broken = False
@@ -299,7 +307,7 @@ class VideoRecorder:
         checked = check_frame(frame, size=self._size)
         self._size = (checked.shape[0], checked.shape[1])
         self._blank_frames.add(checked)
-        return checked
+        return checked if self._caption is None else annotated(checked, self._caption())
 
     def _add(self, frame: Any) -> None:
         if self._writer is not None:
@@ -452,8 +460,10 @@ class VideoRecorder:
             encoder = {"backend": "TextEncoder", "version": 1}
             return {"encoder_version": encoder, **description}
         if isinstance(self._writer, VideoWriter) and self._writer.result is not None:
-            file = file_facts(self._writer.result)
-            return {**description, **file, **self._blank_frames.facts()}
+            facts = {**file_facts(self._writer.result), **self._blank_frames.facts()}
+            if self._caption is not None:
+                facts["annotated"] = {"pillow": pillow_version()}
+            return {**description, **facts}
         return description
 
 

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pictures of a monitor with one camera or several."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import InvalidArgument
+from ..formats.video_names import further_parts
+from ..frame_grid import grid_frame, grid_shape
+from ..frames import Frame
+from ..recorder.subject import EpisodePictures
+from ..rendering.views import plain_camera
+
+__all__ = ["CameraPictures", "camera_pictures"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPictures:
+    """What is drawn, and from where.
+
+    Attributes:
+        camera: the only one, or the first: the one that scenes are recorded with.
+        pictures: what the first video of an episode shows.
+        further: what the others show, by a part of their names.
+        cameras: all, for JSON, where there are several. None is what the environment
+            itself shows.
+    """
+
+    camera: Any
+    pictures: EpisodePictures
+    further: Mapping[str, EpisodePictures] = field(default_factory=dict)
+    cameras: tuple[Any, ...] = ()
+
+
+def camera_pictures(
+    camera: Any, pictures_from: Callable[[Any], EpisodePictures], *, tiled: bool
+) -> CameraPictures:
+    """Return the pictures from a camera, or from each of several.
+
+    Args:
+        camera: a name, a number, an `mujoco.MjvCamera`, None for what the environment
+            itself shows, or a list of these.
+        pictures_from: makes the pictures from one camera.
+        tiled: those of several cameras side by side, in one video.
+
+    Raises:
+        InvalidArgument: the list is empty, or has one camera twice, or None in another
+            place than the first; or there is nothing to lay side by side.
+        UnknownName: the model has no such camera.
+    """
+    several = isinstance(camera, Sequence) and not isinstance(camera, str)
+    cameras = list(camera) if several else [camera]
+    if several:
+        _check(cameras)
+    if len(cameras) == 1:
+        if tiled:
+            raise InvalidArgument(
+                "tiled=True lays the pictures of several cameras, or those of the "
+                "sub-environments of a vector environment, side by side, and here is "
+                f"one of each: got camera={camera!r}. Give camera=[...]."
+            )
+        return CameraPictures(camera=cameras[0], pictures=pictures_from(cameras[0]))
+    plain = [None if each is None else plain_camera(each) for each in cameras]
+    sources = [pictures_from(each) for each in cameras]
+    if tiled:
+        return CameraPictures(
+            camera=cameras[0], pictures=_Grid(sources), cameras=tuple(plain)
+        )
+    parts = further_parts(plain)
+    return CameraPictures(
+        camera=cameras[0],
+        pictures=sources[0],
+        further=dict(zip(parts, sources[1:], strict=True)),
+        cameras=tuple(plain),
+    )
+
+
+def _check(cameras: list[Any]) -> None:
+    if not cameras:
+        raise InvalidArgument(
+            "camera=[] is no camera: name one or more, or give None for what the "
+            "environment itself shows."
+        )
+    plain = [None if each is None else plain_camera(each) for each in cameras]
+    if None in plain[1:]:
+        raise InvalidArgument(
+            "In a list of cameras only the first may be None, what the environment "
+            f"itself shows, got {cameras!r}."
+        )
+    twice = [each for place, each in enumerate(plain) if each in plain[:place]]
+    if twice:
+        raise InvalidArgument(f"The camera {twice[0]!r} is there twice in {cameras!r}.")
+
+
+class _Grid:
+    """The pictures of several cameras side by side."""
+
+    render_mode = "rgb_array"
+
+    def __init__(self, sources: Sequence[EpisodePictures]) -> None:
+        self._sources = sources
+
+    def render(self) -> Frame:
+        return grid_frame([np.asarray(source.render()) for source in self._sources])
+
+    def begin_episode(self) -> None:
+        for source in self._sources:
+            source.begin_episode()
+
+    def facts(self) -> dict[str, Any]:
+        all_facts = [source.facts() for source in self._sources]
+        rows, columns = grid_shape(len(self._sources))
+        return {
+            **all_facts[0],
+            "pictures": "scene",
+            "camera": [facts.get("camera") for facts in all_facts],
+            "tiled": True,
+            "rows": rows,
+            "columns": columns,
+        }
+
+    def close(self) -> None:
+        for source in self._sources:
+            source.close()
