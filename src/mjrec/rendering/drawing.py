@@ -6,16 +6,17 @@ This is what a worker does; whoever wants many pictures lets several workers do 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..errors import InvalidArgument
+from ..frame_grid import grid_frame, grid_shape
 from ..frames import Frame
 from ..simulation.cameras import Camera, camera_from_members
+from ..simulation.eyes import Eye
 from ..simulation.given_states import GivenStates
 from ..simulation.mujoco_warnings import log_mujoco_warnings
 from ..simulation.recorded_scene import RecordedScene
@@ -54,6 +55,8 @@ class TrajectoryDrawing:
     Args:
         path: of the trajectory; its model is looked for beside it.
         view: what of them is to be other than recorded.
+        cameras: several in place of that of the view; None among them is as recorded.
+            A picture is then all that they show, in a grid.
 
     Raises:
         UnreadableFile: of the trajectory or its model.
@@ -63,37 +66,51 @@ class TrajectoryDrawing:
         GLError: nothing can be drawn here.
     """
 
-    def __init__(self, path: Path, view: View) -> None:
+    def __init__(
+        self,
+        path: Path,
+        view: View,
+        *,
+        cameras: Sequence[PlainCamera | None] | None = None,
+    ) -> None:
         self._reader = open_for_rendering(path)
         try:
             check_has_pictures(self._reader)
             scene = RecordedScene(self._reader)
-            as_recorded = view.camera is None
-            self._pictures = _Pictures(
-                scene,
-                SceneRenderer(
-                    scene.model,
-                    height=_or(view.height, scene.view.height),
-                    width=_or(view.width, scene.view.width),
-                    camera=scene.view.camera
-                    if view.camera is None
-                    else _camera(scene.model, view.camera),
-                    scene_option=scene.view.option,
-                    max_geom=scene.view.max_geom,
-                    quality=view.quality
-                    or _recorded_quality(self._reader.header.facts),
-                    fresh=scene.view.fresh,
-                ),
-                before=scene.previous_cameras if as_recorded else np.zeros((2, 3)),
-            )
         except BaseException:
             self._reader.close()
             raise
+        self._pictures = _Pictures(scene)
+        try:
+            for camera in [view.camera] if cameras is None else cameras:
+                self._pictures.eyes.append(self._eye(scene, view, camera))
+        except BaseException:
+            self.close()
+            raise
+
+    def _eye(self, scene: RecordedScene, view: View, camera: PlainCamera | None) -> Eye:
+        recorded = scene.view
+        chosen = recorded.camera if camera is None else _camera(scene.model, camera)
+        return Eye(
+            SceneRenderer(
+                scene.model,
+                height=_or(view.height, recorded.height),
+                width=_or(view.width, recorded.width),
+                camera=chosen,
+                scene_option=recorded.option,
+                max_geom=recorded.max_geom,
+                quality=view.quality or _recorded_quality(self._reader.header.facts),
+                fresh=recorded.fresh,
+            ),
+            # Of a camera as recorded it is known how the pictures have moved it.
+            camera=None if camera is None else chosen,
+            before=scene.previous_cameras if camera is None else np.zeros((2, 3)),
+        )
 
     @property
     def size(self) -> tuple[int, int]:
         """`(height, width)` of the pictures."""
-        return self._pictures.renderer.size
+        return self._pictures.size
 
     @property
     def gl_strings(self) -> dict[str, str]:
@@ -111,8 +128,8 @@ class TrajectoryDrawing:
         return self._pictures.draw(index, out)
 
     def close(self) -> None:
-        """Close the file and free the renderer. Idempotent."""
-        self._pictures.renderer.close()
+        """Close the file and free the renderers. Idempotent."""
+        self._pictures.close()
         self._reader.close()
 
 
@@ -132,22 +149,23 @@ class StatesDrawing:
         scene = GivenStates(directory, spec)
         assert view.height is not None
         assert view.width is not None
-        self._pictures = _Pictures(
-            scene,
-            SceneRenderer(
-                scene.model,
-                height=view.height,
-                width=view.width,
-                camera=_camera(scene.model, _or(view.camera, -1)),
-                quality=view.quality or "full",
-            ),
-            before=np.zeros((2, 3)),
+        camera = _camera(scene.model, _or(view.camera, -1))
+        renderer = SceneRenderer(
+            scene.model,
+            height=view.height,
+            width=view.width,
+            camera=camera,
+            quality=view.quality or "full",
+        )
+        self._pictures = _Pictures(scene)
+        self._pictures.eyes.append(
+            Eye(renderer, camera=camera, before=np.zeros((2, 3)))
         )
 
     @property
     def size(self) -> tuple[int, int]:
         """`(height, width)` of the pictures."""
-        return self._pictures.renderer.size
+        return self._pictures.size
 
     @property
     def gl_strings(self) -> dict[str, str]:
@@ -160,7 +178,7 @@ class StatesDrawing:
 
     def close(self) -> None:
         """Free the renderer. Idempotent."""
-        self._pictures.renderer.close()
+        self._pictures.close()
 
 
 def open_drawing(drawing: Mapping[str, Any]) -> Drawing:
@@ -168,12 +186,14 @@ def open_drawing(drawing: Mapping[str, Any]) -> Drawing:
 
     Args:
         drawing: `trajectory` (a path), or `states` (a directory) and `spec`; and
-            `view`.
+            `view`; and, of a trajectory, `cameras`.
     """
     log_mujoco_warnings()
     view = View(**drawing["view"])
     if "trajectory" in drawing:
-        return TrajectoryDrawing(Path(drawing["trajectory"]), view)
+        return TrajectoryDrawing(
+            Path(drawing["trajectory"]), view, cameras=drawing.get("cameras")
+        )
     return StatesDrawing(Path(drawing["states"]), drawing["spec"], view)
 
 
@@ -190,18 +210,28 @@ class _Scene(Protocol):
 class _Pictures:
     """Draws a scene so that each picture is as if all before had been drawn.
 
-    An infinite plane depends on where the cameras were in the picture before.
+    An infinite plane depends on where the cameras were in the picture before, and a
+    camera that follows a body on all pictures before.
+
+    Args:
+        scene: what is drawn.
+
+    Attributes:
+        eyes: whose pictures they are, in a grid where there are several.
     """
 
-    def __init__(
-        self, scene: _Scene, renderer: SceneRenderer, *, before: ArrayLike
-    ) -> None:
+    def __init__(self, scene: _Scene) -> None:
+        self.eyes: list[Eye] = []
         self._scene = scene
-        self.renderer = renderer
-        self._before = before
-        # The picture whose cameras the renderer has in mind.
+        # The picture whose cameras the renderers have in mind.
         self._last: int | None = None
         self._context_is_old = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        height, width = self.eyes[0].renderer.size
+        rows, columns = grid_shape(len(self.eyes))
+        return rows * height, columns * width
 
     def draw(self, index: int, out: Frame | None) -> Frame:
         if not 0 <= index < self._scene.count:
@@ -209,27 +239,48 @@ class _Pictures:
                 f"There is no picture {index}: there are {self._scene.count}, numbered "
                 "from 0."
             )
-        if self._last is None or index != self._last + 1:
-            self._prepare(index)
-        self._last = None
+        last, self._last = self._last, None
+        if last is None or index != last + 1:
+            self._prepare(index, last)
         self._bring_to(index)
         if self._context_is_old:
-            self.renderer.model_changed()
+            for eye in self.eyes:
+                eye.renderer.model_changed()
             self._context_is_old = False
-        frame = self.renderer.render(self._scene.data, out=out)
+        frame = self._render(out)
         self._last = index
         return frame
 
     def gl_strings(self) -> dict[str, str]:
-        vendor, renderer, version = self.renderer.gl_strings
+        vendor, renderer, version = self.eyes[0].renderer.gl_strings
         return {"gl_vendor": vendor, "gl_renderer": renderer, "gl_version": version}
 
-    def _prepare(self, index: int) -> None:
-        if index == 0:
-            self.renderer.camera_positions = self._before
-        else:
-            self._bring_to(index - 1)
-            self.renderer.look(self._scene.data)
+    def close(self) -> None:
+        for eye in self.eyes:
+            eye.renderer.close()
+
+    def _render(self, out: Frame | None) -> Frame:
+        if len(self.eyes) == 1:
+            return self.eyes[0].renderer.render(self._scene.data, out=out)
+        frames = [eye.renderer.render(self._scene.data) for eye in self.eyes]
+        grid = grid_frame(frames)
+        if out is None:
+            return grid
+        np.copyto(out, grid)
+        return out
+
+    def _prepare(self, index: int, last: int | None) -> None:
+        """Bring the cameras to where they are before a picture."""
+        start = max(0, index - 1)
+        if any(eye.is_following for eye in self.eyes):
+            start = 0 if last is None or last >= index else last + 1
+        if start == 0:
+            for eye in self.eyes:
+                eye.begin()
+        for earlier in range(start, index):
+            self._bring_to(earlier)
+            for eye in self.eyes:
+                eye.renderer.look(self._scene.data)
 
     def _bring_to(self, index: int) -> None:
         self._context_is_old |= self._scene.bring_to(index)
