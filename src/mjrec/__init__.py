@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from .monitors import Monitor as Monitor
     from .monitors.dm_env_monitor import DmEnvMonitor as DmEnvMonitor
     from .monitors.gymnasium_monitor import GymnasiumMonitor as GymnasiumMonitor
+    from .monitors.vector_monitor import VectorMonitor as VectorMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
     from .recovery import Recovery as Recovery
@@ -76,6 +77,7 @@ _LAZY = {
     "StatsRecorder": "recorder.stats_recorder",
     "Terminated": "signals",
     "Trajectory": "simulation.trajectories",
+    "VectorMonitor": "monitors.vector_monitor",
     "VideoRecorder": "recorder.video_recorder",
     "VideoWriter": "formats.video_writer",
     "capped_cubic_video_schedule": "schedules",
@@ -132,6 +134,7 @@ __all__ = [
     "UnknownName",
     "UnreadableFile",
     "UntrustedModel",
+    "VectorMonitor",
     "VideoRecorder",
     "VideoWriter",
     "capped_cubic_video_schedule",

@@ -15,7 +15,12 @@ from ..simulation.inside import simulation_in
 if TYPE_CHECKING:
     from ..simulation.scene_pictures import ScenePictures
 
-__all__ = ["EnvironmentPictures", "close_environment", "gymnasium_pictures"]
+__all__ = [
+    "EnvironmentPictures",
+    "close_environment",
+    "free_viewers",
+    "gymnasium_pictures",
+]
 
 
 def gymnasium_pictures(
@@ -120,7 +125,13 @@ class EnvironmentPictures:
 
 
 def close_environment(env: gymnasium.Env[Any, Any]) -> None:
-    """Close an environment, and first free what lies in its OpenGL contexts.
+    """Close an environment, and first free what lies in its OpenGL contexts."""
+    free_viewers(env)
+    env.close()
+
+
+def free_viewers(env: gymnasium.Env[Any, Any]) -> None:
+    """Free what lies in an environment's OpenGL contexts; it is to be closed next.
 
     Gymnasium leaves that to the garbage collector, which frees it in whichever context
     is current then, and so blackens somebody else's pictures.
@@ -129,7 +140,6 @@ def close_environment(env: gymnasium.Env[Any, Any]) -> None:
         with _current(viewer):
             viewer.con.free()
             viewer.free()
-    env.close()
 
 
 @contextlib.contextmanager

@@ -19,6 +19,7 @@ from ..recovery import recover
 if TYPE_CHECKING:
     from .dm_env_monitor import DmEnvMonitor
     from .gymnasium_monitor import GymnasiumMonitor
+    from .vector_monitor import VectorMonitor
 
 __all__ = ["Monitor"]
 
@@ -58,7 +59,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     tiled: bool = False,
     trackers: Tracker | Sequence[Tracker] = (),
     env_id: str | None = None,
-) -> GymnasiumMonitor | DmEnvMonitor:
+) -> GymnasiumMonitor | VectorMonitor | DmEnvMonitor:
     """Record what happens to an environment into a monitor directory.
 
     Use what this returns instead of `env`, and close it, best with `with`::
@@ -160,7 +161,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             `dm_control/<domain>-<task>`.
 
     Returns:
-        A `GymnasiumMonitor` or a `DmEnvMonitor`.
+        A `GymnasiumMonitor`, a `VectorMonitor` or a `DmEnvMonitor`.
 
     Raises:
         InvalidArgument: `env` is neither, or an argument cannot be.
@@ -228,15 +229,15 @@ def _recover(directory: str | os.PathLike[str]) -> None:
             logger.info("%s", recovery)
 
 
-def _monitor_class(env: Any) -> type[GymnasiumMonitor] | type[DmEnvMonitor]:
+def _monitor_class(
+    env: Any,
+) -> type[GymnasiumMonitor] | type[VectorMonitor] | type[DmEnvMonitor]:
     # An instance of a framework's class exists only where the framework is loaded.
     gymnasium = sys.modules.get("gymnasium")
     if gymnasium is not None and isinstance(env, gymnasium.vector.VectorEnv):
-        raise InvalidArgument(
-            f"{type(env).__name__} is a vector environment, and Monitor records one "
-            "environment: put Monitor around each of them, inside the functions that "
-            "make them, with resume=True for all."
-        )
+        from .vector_monitor import VectorMonitor
+
+        return VectorMonitor
     if gymnasium is not None and isinstance(env, gymnasium.Env):
         from .gymnasium_monitor import GymnasiumMonitor
 
@@ -247,6 +248,7 @@ def _monitor_class(env: Any) -> type[GymnasiumMonitor] | type[DmEnvMonitor]:
 
         return DmEnvMonitor
     raise InvalidArgument(
-        "Monitor goes around a Gymnasium environment (gymnasium.Env) or a dm_env one "
+        "Monitor goes around a Gymnasium environment (gymnasium.Env), a vector "
+        "environment (gymnasium.vector.VectorEnv) or a dm_env one "
         f"(dm_env.Environment), got {type(env).__module__}.{type(env).__qualname__}."
     )
