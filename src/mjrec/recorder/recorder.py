@@ -8,13 +8,19 @@ import logging
 import os
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from ..annotation import Caption
-from ..errors import Error, FileNotWritten, NoPictures, PicturesDiffer
+from ..errors import (
+    DirectoryNotWritable,
+    Error,
+    FileNotWritten,
+    NoPictures,
+    PicturesDiffer,
+)
 from ..formats.journal import JournalEntry, JournalWriter
 from ..formats.manifest import Manifest, write_manifest
 from ..formats.monitor_directory import (
@@ -35,8 +41,10 @@ from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
 from .episode_videos import EpisodeVideos
 from .faults import Faults, What
+from .kept_videos import KeptVideos
 from .opening import OpenDirectory, open_directory
 from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
+from .selection import Standing, selection_from
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import EpisodePictures, Subject, check_pictures, what_is_missing
 from .told_trackers import ToldTrackers
@@ -80,6 +88,9 @@ class Recorder:
         finish_log: Callable[[Path], object],
     ) -> None:
         self._schedule = to_schedule(options.video_callable)
+        selection = None if options.keep is None else selection_from(options.keep)
+        if selection is not None:
+            self._schedule = selection
         if options.step_trigger is not None:
             self._schedule = disable_videos
         self._choice = subject.rendering
@@ -117,6 +128,11 @@ class Recorder:
         self._ended = EndedTrajectories(
             rendering(self.directory) if rendering else None, finish_log
         )
+        self._kept: KeptVideos | None = None
+        if selection is not None:
+            self._kept = KeptVideos(selection, videos=self._videos, ended=self._ended)
+        # Whether the running episode's trajectory stays also without a video.
+        self._stays = False
         self._next_episode_id = self._place.first_episode_id
         self._episode_start: dict[str, Any] = {}
         self._journal = JournalWriter(
@@ -391,18 +407,17 @@ class Recorder:
         logger.info("Finished writing results. They are in %s.", self.directory)
 
     def _end_by_close(self) -> None:
-        try:
+        with contextlib.ExitStack() as ends:
+            if self._states is not None:
+                # A trajectory without its model is worth nothing, and what stores it
+                # may end with the process.
+                ends.callback(self._finish_models, self._states)
+            if self._kept is not None:
+                ends.callback(self._settle, self._kept.decide)
+            ends.callback(self._end_episode)
             self._take_last_picture()
             if self._clips is not None:
                 self._clips.close(self._ending or {"reason": CLOSE})
-        finally:
-            try:
-                self._end_episode()
-            finally:
-                # A trajectory without its model is worth nothing, and what stores it
-                # may end with the process.
-                if self._states is not None:
-                    self._finish_models(self._states)
 
     def _new_clips(self) -> Clips:
         def begin(steps: int | None) -> VideoRecorder:
@@ -494,6 +509,7 @@ class Recorder:
             # The episode has no video of its own.
             wanted = False
         keeps = self._keeps_trajectory(episode_id, has_video=wanted)
+        self._stays = keeps and not self._depends_on_video()
         deferred = wanted and self._choice.mode == DEFERRED
         start = None
         if self._states is not None and (keeps or deferred):
@@ -610,6 +626,7 @@ class Recorder:
             "refusal": None if start is None else start.refusal,
             "kept": is_kept,
             "video": None if video is None else self._promise(episode_id, video),
+            **({} if self._kept is None else {"candidate": video is not None}),
         }
 
     def _promise(self, episode_id: int, recording: str) -> dict[str, Any]:
@@ -628,6 +645,8 @@ class Recorder:
             promise["tiled"] = options.tiled
         if options.annotate:
             promise["annotate"] = True
+        if self._kept is not None:
+            promise["selection"] = self._kept.facts()
         return {**promise, **self._second_name("episode", episode_id)}
 
     def _second_name(self, what: str, number: int) -> dict[str, str]:
@@ -669,7 +688,7 @@ class Recorder:
         """Ask the schedule; only once for a number, which resets may share."""
         if self._decision[0] != episode_id:
             self._decision = (episode_id, bool(self._schedule(episode_id)))
-            if self._decision[1]:
+            if self._decision[1] and self._kept is None:
                 self._videos.scheduled.append(episode_id)
         return self._decision[1]
 
@@ -678,6 +697,11 @@ class Recorder:
         if chosen is None:
             return has_video or self.stats_recorder.episode_type == "e"
         return bool(chosen(episode_id)) if callable(chosen) else chosen
+
+    def _depends_on_video(self) -> bool:
+        """Whether a trajectory of the running episode is kept for its video only."""
+        is_asked = self._options.trajectory_callable is not None
+        return not is_asked and self.stats_recorder.episode_type != "e"
 
     def _will_keep(self) -> bool:
         """Whether the episode that the coming reset begins may have a trajectory."""
@@ -815,15 +839,46 @@ class Recorder:
         for video in (self.video_recorder, *self._live_videos):
             if video is not None:
                 video.discard()
+        self._discard_trajectory()
+
+    def _discard_trajectory(self) -> None:
         trajectory, self._trajectory = self._trajectory, None
         if trajectory is not None:
             trajectory.discard()
+            self._blocks = trajectory.blocks
 
     def _how_it_ended(self, otherwise: str) -> dict[str, Any]:
         """Return whether the running episode is complete, and what ended it."""
+        if self.stats_recorder.done and self._lacks_last_step():
+            return {"complete": False, "reason": INTERRUPT}
         if self.stats_recorder.done:
             return {"complete": True, **self._flags}
         return {"complete": False, **(self._ending or {"reason": otherwise})}
+
+    def _lacks_last_step(self) -> bool:
+        """Whether Ctrl-C has come between the counting of a step and its row."""
+        trajectory = self._trajectory
+        if trajectory is None or trajectory.is_stopped:
+            return False
+        return trajectory.steps < (self.stats_recorder.steps or 0)
+
+    def _standing(self, *, is_complete: bool) -> Standing:
+        """Return how the running episode stands, which is over."""
+        if self._kept is None or not self._decision[1]:
+            # What the schedule has said is final.
+            return Standing.CHOSEN
+        return self._kept.judge(
+            self._next_episode_id - 1,
+            self._finished_episode() if is_complete else None,
+        )
+
+    def _settle(self, do: Callable[[], None]) -> None:
+        """Do something about recordings that are not decided."""
+        try:
+            do()
+        except (DirectoryNotWritable, FileNotWritten) as error:
+            if not self._tolerates("trajectory", error):
+                raise
 
     def _end_episode(self, *, otherwise: str = CLOSE) -> None:
         """Finish the running episode's trajectory and video, if there are any.
@@ -832,30 +887,44 @@ class Recorder:
             otherwise: why, where it is not over and nothing was raised.
         """
         facts = self._how_it_ended(otherwise)
+        standing = self._standing(is_complete=facts["complete"])
         try:
-            self._end_trajectory(facts)
+            self._end_trajectory(facts, standing)
         finally:
             with contextlib.ExitStack() as ends:
+                # Run from the last to the first: the metadata of the first video is
+                # the sign that all are there.
                 for video in self._live_videos[:1]:
-                    ends.callback(_name_again, video)
-                for video in reversed(self._live_videos):
-                    ends.callback(self._end_live_video, video, facts)
+                    if standing is Standing.CHOSEN:
+                        ends.callback(_name_again, video)
+                    ends.callback(self._end_live_video, video, facts, standing)
+                    ends.callback(_name_further, video, self._live_videos[1:])
+                for video in self._live_videos[1:]:
+                    ends.callback(self._end_live_video, video, facts, standing)
+        if self._kept is not None:
+            self._settle(self._kept.settle)
 
-    def _end_trajectory(self, facts: Mapping[str, Any]) -> None:
+    def _end_trajectory(self, facts: Mapping[str, Any], standing: Standing) -> None:
         trajectory = self._trajectory
         if trajectory is None:
             return
-        stats = self.stats_recorder
-        is_short = trajectory.steps < (stats.steps or 0) and not trajectory.is_stopped
-        if is_short and facts["complete"]:
-            # Ctrl-C has come between the counting of the last step and its row.
-            facts = {"complete": False, "reason": INTERRUPT}
+        if standing is Standing.DROPPED and not self._stays:
+            self._discard_trajectory()
+            return
+        episode_id = self._next_episode_id - 1
+        video = self.video_recorder
+        deferred = video if isinstance(video, DeferredVideo) else None
+        promise = self._promise(episode_id, DEFERRED if deferred else LIVE)
+        verdict: Mapping[str, Any] = {}
+        if self._kept is not None and self._decision[1]:
+            verdict = self._kept.verdict(standing, promise)
         try:
             trajectory.end(
                 {
                     **facts,
+                    **verdict,
                     "length": trajectory.steps,
-                    "reward": stats.rewards,
+                    "reward": self.stats_recorder.rewards,
                     "end_time": time.time(),
                 }
             )
@@ -867,19 +936,32 @@ class Recorder:
         if not trajectory.is_there:
             # The disk was too full for a single row: there is nothing to promise.
             return
-        if isinstance(self.video_recorder, DeferredVideo):
-            self.video_recorder.close()
-            self._videos.add_deferred(
-                self._next_episode_id - 1, trajectory.path, self.video_recorder
+        if deferred is not None:
+            deferred.close()
+        if self._kept is not None and standing is Standing.CANDIDATE:
+            self._kept.hold_trajectory(
+                episode_id,
+                trajectory.path,
+                promise=promise,
+                stays=self._stays,
+                deferred=deferred,
             )
+            return
+        if deferred is not None and standing is Standing.CHOSEN:
+            self._videos.add_deferred(episode_id, trajectory.path, deferred)
         self._ended.add(trajectory.path)
 
     def _end_live_video(
-        self, recorder: VideoRecorder, facts: Mapping[str, Any]
+        self, recorder: VideoRecorder, facts: Mapping[str, Any], standing: Standing
     ) -> None:
         """Finish a video that was drawn live; what is known goes with it."""
         if not recorder.enabled or recorder.closed:
             return
+        if standing is Standing.DROPPED:
+            recorder.discard()
+            return
+        if self._kept is not None and standing is Standing.CHOSEN:
+            recorder.metadata["selection"] = self._kept.chosen_facts()
         stats = self.stats_recorder
         if "complete" not in recorder.metadata:
             # Else an end that was interrupted is taken up again.
@@ -891,7 +973,9 @@ class Recorder:
             if not self._tolerates("video", error):
                 raise
         finally:
-            if recorder.closed:
+            if recorder.closed and self._kept and standing is Standing.CANDIDATE:
+                self._kept.hold_live(self._next_episode_id - 1, recorder)
+            elif recorder.closed:
                 self._videos.add_live(recorder)
 
     def _live_video_facts(self) -> dict[str, Any]:
@@ -906,6 +990,7 @@ class Recorder:
             "options": self._episode_start.get("options"),
             "recording": LIVE,
             "versions": dict(versions()),
+            **({} if self._kept is None else {"selection": self._kept.facts()}),
         }
 
     def _write_results(self) -> None:
@@ -922,13 +1007,15 @@ class Recorder:
 
     def _details(self) -> dict[str, Any]:
         """Return what gym's manifests do not say."""
+        kept = self._kept
         return {
             "format_version": _FORMAT_VERSION,
             "schedule": {
                 "name": schedule_name(self._schedule),
                 # It decided about every number from first to next; these got a yes.
-                "recorded": self._videos.scheduled,
+                "recorded": self._videos.scheduled if kept is None else kept.recorded,
             },
+            **({} if kept is None else {"keep": kept.details()}),
             "first_episode_id": self._place.first_episode_id,
             "next_episode_id": self._next_episode_id,
             "pending": self._videos.pending(self.failures()),
@@ -942,6 +1029,13 @@ def _name_again(video: VideoRecorder) -> None:
     """Give the finished videos of an episode their second names, if they have any."""
     if video.finished and video.path is not None and "also_named" in video.metadata:
         give_second_names(Path(video.path))
+
+
+def _name_further(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:
+    """Let the metadata of an episode's first video name the others."""
+    names = [Path(v.path).name for v in others if v.finished and v.path is not None]
+    if names:
+        first.metadata["further_videos"] = names
 
 
 # Asking the system for the process's number at every step takes as long as counting it.

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`episode_info=True`, and what is known of success."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.wrappers import RecordEpisodeStatistics
+
+import mjrec
+from mjrec.monitors.success import success_in
+
+
+def last_info(env: Any) -> list[dict[str, Any]]:
+    """Run CartPole to its end; return the info of every step."""
+    env.reset(seed=3)
+    infos, done = [], False
+    while not done:
+        *_, terminated, truncated, info = env.step(1)
+        infos.append(info)
+        done = terminated or truncated
+    return infos
+
+
+def monitor(directory: Path, env: Any = None, **options: Any) -> Any:
+    made = gymnasium.make("CartPole-v1") if env is None else env
+    return mjrec.Monitor(made, directory, video_callable=False, **options)
+
+
+def test_last_step_has_what_gymnasium_gives(tmp_path: Path) -> None:
+    """Keys, types and values are those of RecordEpisodeStatistics."""
+    theirs = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))
+    expected = last_info(theirs)[-1]["episode"]
+    with monitor(tmp_path, episode_info=True) as env:
+        *before, last = last_info(env)
+    assert not any("episode" in info for info in before)
+    assert list(last["episode"]) == list(expected) == ["r", "l", "t"]
+    assert (last["episode"]["r"], last["episode"]["l"]) == (
+        expected["r"],
+        expected["l"],
+    )
+    assert 0 < last["episode"]["t"] < 60
+
+
+def test_time_is_that_of_the_episode(tmp_path: Path) -> None:
+    """Not of the run: a second episode is no longer than it took."""
+    with monitor(tmp_path, episode_info=True) as env:
+        first = last_info(env)[-1]["episode"]["t"]
+        spent = sum(last_info(env)[-1]["episode"]["t"] for _ in range(20))
+    assert spent < 20 * 60
+    assert first > 0
+
+
+def test_key_that_is_there_stays(tmp_path: Path) -> None:
+    """The environment below, or a wrapper of it, has said it already."""
+    inner = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))
+    with monitor(tmp_path, inner, episode_info=True) as env:
+        episode = last_info(env)[-1]["episode"]
+    assert episode["t"] == inner.time_queue[-1]
+
+
+def test_gymnasiums_own_goes_around_a_monitor(tmp_path: Path) -> None:
+    """It asserts that the key is absent, which is why it is off by default."""
+    with monitor(tmp_path) as env:
+        assert last_info(RecordEpisodeStatistics(env))[-1]["episode"]["l"] > 0
+    with (
+        monitor(tmp_path / "on", episode_info=True) as env,
+        pytest.raises(AssertionError),
+    ):
+        last_info(RecordEpisodeStatistics(env))
+
+
+@pytest.mark.dm_control
+def test_time_steps_have_no_info_to_add_to(tmp_path: Path) -> None:
+    """An option that would do nothing is an error."""
+    from dm_control import suite
+
+    with pytest.raises(mjrec.InvalidArgument, match="episode_info"):
+        mjrec.Monitor(suite.load("cartpole", "swingup"), tmp_path, episode_info=True)
+
+
+@pytest.mark.parametrize(
+    ("info", "expected"),
+    [
+        ({}, None),
+        ({"is_success": True}, True),
+        ({"is_success": 0.0}, False),
+        ({"is_success": np.float32(1)}, True),
+        ({"success": np.array([False])}, False),
+        ({"is_success": False, "success": True}, False),
+        ({"is_success": None, "success": True}, True),
+        ({"success": "no"}, None),
+        ({"success": np.zeros(2)}, None),
+    ],
+)
+def test_success_is_what_the_info_says(info: dict[str, Any], expected: Any) -> None:
+    """Under either name; what is no truth value says nothing."""
+    assert success_in(info) is expected

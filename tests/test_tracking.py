@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What trackers are told."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from recordings import frames_of, manifest_of
+
+import mjrec
+from mjrec.recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
+
+
+class Listening(Tracker):
+    """Writes down all that it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, Any]] = []
+        self.runs: list[Run] = []
+
+    def begin(self, run: Run) -> None:
+        self._note(run, "begin", None)
+
+    def episode(self, run: Run, episode: FinishedEpisode) -> None:
+        self._note(run, "episode", episode)
+
+    def video(self, run: Run, video: FinishedVideo) -> None:
+        assert video.path.exists()
+        assert video.metadata_path.exists()
+        self._note(run, "video", video)
+
+    def end(self, run: Run) -> None:
+        self._note(run, "end", None)
+
+    def _note(self, run: Run, what: str, facts: Any) -> None:
+        self.runs.append(run)
+        self.told.append((what, facts))
+
+    def of(self, what: str) -> list[Any]:
+        return [facts for told, facts in self.told if told == what]
+
+
+class Failing(Tracker):
+    """Has lost its server."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def episode(self, run: Run, episode: FinishedEpisode) -> None:
+        self.calls += 1
+        raise ConnectionError("no server")
+
+
+def record(directory: Path, env_id: str, *, episodes: int = 2, **options: Any) -> Any:
+    """Record short episodes; return the monitor, closed."""
+    made = gymnasium.make(env_id, max_episode_steps=3)
+    options = {"height": 32, "width": 32, "render": "live", **options}
+    with mjrec.Monitor(made, directory, lambda _: True, **options) as env:
+        for episode in range(episodes):
+            env.reset(seed=episode)
+            done = False
+            while not done:
+                *_, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape))
+                done = terminated or truncated
+    return env
+
+
+def test_tracker_is_told_every_episode_and_live_video(tmp_path: Path) -> None:
+    """In order, with the facts of each, and of which run."""
+    tracker = Listening()
+    env = record(tmp_path, "InvertedPendulum-v5", trackers=tracker)
+    assert [what for what, _ in tracker.told] == [
+        *("begin", "episode", "video", "episode", "video", "end"),
+    ]
+    first, second = tracker.of("episode")
+    assert (first.episode_id, first.length, first.reward) == (0, 3, 3.0)
+    assert (first.truncated, first.seed, second.seed) == (True, 0, 1)
+    assert (first.total_steps, second.total_steps) == (3, 6)
+    assert [video.episode for video in tracker.of("video")] == [first, second]
+    assert {run.infix for run in tracker.runs} == {env.infix}
+    assert {run.directory for run in tracker.runs} == {tmp_path}
+    assert {run.env_id for run in tracker.runs} == {"InvertedPendulum-v5"}
+
+
+def test_tracker_is_told_deferred_videos_when_they_are_there(tmp_path: Path) -> None:
+    """At the latest in close; each once, whole."""
+    tracker = Listening()
+    record(tmp_path, "HalfCheetah-v5", render="deferred", trackers=[tracker])
+    videos = tracker.of("video")
+    assert [video.episode_id for video in videos] == [0, 1]
+    assert [len(frames_of(video.path)) for video in videos] == [4, 4]
+    assert tracker.told[-1][0] == "end"
+
+
+def test_pending_videos_are_not_told(tmp_path: Path) -> None:
+    """There is nothing to upload yet."""
+    tracker = Listening()
+    record(tmp_path, "HalfCheetah-v5", render="deferred", workers=0, trackers=tracker)
+    assert len(tracker.of("episode")) == 2
+    assert not tracker.of("video")
+
+
+def test_tracker_that_raises_is_dismissed_and_the_rest_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The log has why, the manifest too, and the others are told all."""
+    failing, listening = Failing(), Listening()
+    with caplog.at_level(logging.ERROR, "mjrec"):
+        record(tmp_path, "InvertedPendulum-v5", trackers=[failing, listening])
+    assert failing.calls == 1
+    assert len(listening.of("episode")) == 2
+    assert "Failing has failed" in caplog.text
+    [fault] = manifest_of(tmp_path)["mjrec"]["faults"]
+    assert fault == {
+        "episode_id": 0,
+        "what": "tracker",
+        "reason": "Failing: no server",
+    }
+
+
+def test_interruption_in_a_tracker_is_an_interruption(tmp_path: Path) -> None:
+    """Ctrl-C is never taken for a fault of whoever was running."""
+
+    class Slow(Tracker):
+        def episode(self, run: Run, episode: FinishedEpisode) -> None:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(tmp_path, "InvertedPendulum-v5", trackers=Slow())
+    assert mjrec.load_results(tmp_path)["episode_lengths"] == [3]
+
+
+@pytest.mark.parametrize("given", [5, "wandb", [Listening(), print], Listening])
+def test_what_is_no_tracker_is_told_before_anything_is_made(
+    tmp_path: Path, given: Any
+) -> None:
+    """One error that names what was given."""
+    with pytest.raises(mjrec.InvalidArgument, match="trackers must be"):
+        mjrec.Monitor(
+            gymnasium.make("InvertedPendulum-v5"),
+            tmp_path / "run",
+            video_callable=False,
+            trackers=given,
+        )
+    assert not (tmp_path / "run").exists()
