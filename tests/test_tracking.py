@@ -65,7 +65,8 @@ def record(directory: Path, env_id: str, *, episodes: int = 2, **options: Any) -
             env.reset(seed=episode)
             done = False
             while not done:
-                *_, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape))
+                step = env.step(np.zeros(env.action_space.shape))
+                *_, terminated, truncated, _ = step
                 done = terminated or truncated
     return env
 
