@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import InvalidArgument
 from ..frames import check_quality
 from ..rates import to_rate
+from .selection import selection_from
 from .tracking import FinishedEpisode, Tracker
 
 __all__ = [
@@ -101,6 +102,7 @@ class RecorderOptions:
                 f"bool, True, False or None, got {chosen!r}."
             )
         self._check_clips()
+        self._check_keep()
         self._check_trackers()
 
     def _check_clips(self) -> None:
@@ -134,6 +136,26 @@ class RecorderOptions:
                 "name_prefix becomes part of file names: it must be 1 to 100 letters, "
                 "digits, '_', '-' and '.', begin with a letter, digit or '_', and not "
                 f"with openaigym, got {prefix!r}."
+            )
+
+    def _check_keep(self) -> None:
+        if self.keep is None:
+            return
+        selection_from(self.keep)
+        if self.video_callable is not None:
+            raise InvalidArgument(
+                "keep chooses episodes when they have ended and video_callable before "
+                "they begin: give one of them."
+            )
+        if self.has_clips:
+            raise InvalidArgument(
+                "keep chooses videos of whole episodes, and step_trigger and "
+                "video_length make videos that are counted in steps: give one of them."
+            )
+        if self.render == OFF:
+            raise InvalidArgument(
+                "keep chooses which episodes get a video, and with "
+                'render="off" there are none: leave one of them out.'
             )
 
     def _check_trackers(self) -> None:

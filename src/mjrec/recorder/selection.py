@@ -47,6 +47,8 @@ class Standing(enum.Enum):
 class Selection(ABC):
     """Chooses among the finished episodes of one run.
 
+    It is a schedule too: of every episode that may be chosen when it has ended.
+
     Attributes:
         name: of the rule, as the manifest has it.
         holds_all: every episode is a candidate until `close`.
@@ -56,6 +58,8 @@ class Selection(ABC):
 
     def __init__(self, name: str) -> None:
         self.name = name
+        # Under which a schedule is written into the manifest.
+        self.__qualname__ = f"keep:{name}"
         # The number of the last one, and how many there were.
         self._counted = (-1, 0)
 
@@ -63,6 +67,10 @@ class Selection(ABC):
     def finished(self) -> int:
         """How many episodes it was told of."""
         return self._counted[1]
+
+    def __call__(self, episode_id: int) -> bool:
+        """Tell whether an episode is to be recorded, as if it got a video."""
+        return not self.is_full
 
     @property
     def is_full(self) -> bool:
