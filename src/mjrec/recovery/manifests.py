@@ -28,7 +28,7 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.stats_file import StatsFile, read_stats_file, write_stats_file
-from ..formats.video_metadata import is_broken, is_done
+from ..formats.video_metadata import finished_videos, is_broken, is_done
 from ..results.recorded_environment import GYM_VERSION
 from ..results.sources import MonitorResults
 from .known_episodes import KnownEpisodes
@@ -183,9 +183,9 @@ def _manifest(
     for episode_id in sorted({*files.videos, *files.metadata}):
         names = _names_of_video(remains, episode_id)
         if names is not None and is_broken(remains.directory / names[1]):
-            broken.append(names[1])
+            broken += [about for _, about in _all_videos(remains, names)]
         elif names is not None and (remains.directory / names[0]).exists():
-            finished.append(names)
+            finished += _all_videos(remains, names)
     first = known.first_episode_id or 0
     pending = [
         _pending(remains, episode_id, old_details)
@@ -220,6 +220,11 @@ def _names_of_video(remains: Remains, episode_id: int) -> tuple[str, str] | None
         if (remains.directory / f"{prefix}{extension}").exists():
             return f"{prefix}{extension}", metadata
     return f"{prefix}.mp4", metadata
+
+
+def _all_videos(remains: Remains, first: tuple[str, str]) -> list[tuple[str, str]]:
+    """Return the names of an episode's first video and of its further cameras'."""
+    return finished_videos(remains.directory / first[0])
 
 
 def _pending(

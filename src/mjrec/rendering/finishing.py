@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Self
 
 from ..errors import BlankVideo, Error, GLError
+from ..formats.second_names import give_all_second_names
 from ..formats.trajectory_file import finish_trajectory
 from ..formats.video_writer import VideoFile
 from .crew import Crew
@@ -43,7 +44,7 @@ def finish_pending(
 
     Nothing is yielded of an episode that nothing was to be done about. What another
     process is at is left to it. Manifests of monitors that are closed are kept true,
-    also where an earlier run could not.
+    and second names of videos are given, also where an earlier run could not.
 
     Args:
         directory: the monitor directory.
@@ -63,6 +64,7 @@ def finish_pending(
         while finisher:
             _, outcome = finisher.finish_next()
             yield outcome
+    give_all_second_names(directory)
     reconcile(directory)
 
 
@@ -125,9 +127,9 @@ class EpisodeFinisher:
             if episode is None:
                 return False
         self._waiting[key] = episode
-        if episode is None or episode.video is not None:
-            frames = 0 if episode is None else episode.frame_count
-            self._count(videos=1, frames=frames)
+        videos, frames = _work(episode)
+        if videos:
+            self._count(videos=videos, frames=frames)
         return True
 
     def is_ready(self) -> bool:
@@ -143,13 +145,13 @@ class EpisodeFinisher:
         episode = self._waiting.pop(key)
         before = self.progress
         outcome = self._finish(key)
-        if episode is None or episode.video is not None:
+        videos, frames = _work(episode)
+        if videos:
             # Also the frames that were not drawn: nobody waits for them any more.
-            frames = 0 if episode is None else episode.frame_count
             self.progress = replace(
                 self.progress, frames_done=before.frames_done + frames
             )
-            self._count(videos_done=1)
+            self._count(videos_done=videos)
         return key, outcome
 
     def rest(self) -> None:
@@ -199,8 +201,12 @@ class EpisodeFinisher:
         outcome = Outcome(name=path.name, directory=self._directory)
         if episode.video is not None:
             outcome = replace(outcome, name=episode.video.name)
-            remove_unfinished(episode.video)
+            for video in (episode.video, *episode.further_videos):
+                remove_unfinished(video)
             outcome = self._rendered(path, outcome)
+            if outcome.is_video:
+                names = tuple(video.name for video in episode.further_videos)
+                outcome = replace(outcome, further_videos=names)
         if not episode.is_kept:
             for suffix in (".log", ".h5"):
                 path.with_suffix(suffix).unlink(missing_ok=True)
@@ -236,6 +242,11 @@ class EpisodeFinisher:
         except GLError as error:
             self._gl_failure = error
             raise
+
+
+def _work(episode: PendingEpisode | None) -> tuple[int, int]:
+    """Return how many videos and frames an episode is; one that is not known is one."""
+    return (1, 0) if episode is None else (episode.video_count, episode.frame_count)
 
 
 def _has_model(episode: PendingEpisode | None) -> bool:

@@ -17,7 +17,9 @@ class Outcome:
         name: of the file.
         directory: where it is, or was to be.
         is_video: a video was rendered.
-        frame_count: how many frames it has.
+        frame_count: how many frames it has, and each of the further ones.
+        further_videos: the names of those that were rendered with it, of further
+            cameras.
         failure: why it could not be done; None where it was, or needed nothing. Of a
             video that was rendered: that it shows nothing.
         is_elsewhere: another process is at it.
@@ -29,3 +31,4 @@ class Outcome:
     frame_count: int = 0
     failure: str | None = None
     is_elsewhere: bool = False
+    further_videos: tuple[str, ...] = ()

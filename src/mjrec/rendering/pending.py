@@ -32,7 +32,7 @@ from ..formats.monitor_directory import (
 from ..formats.trajectory_file import find_trajectory
 from ..formats.video_metadata import is_done, metadata_path
 from .recorded_facts import open_for_rendering
-from .videos import video_path
+from .videos import further_video_paths, video_path
 
 __all__ = [
     "EpisodeKey",
@@ -84,7 +84,8 @@ class PendingEpisode:
         key: which one.
         trajectory: its file.
         video: what is to be rendered; None where nothing is.
-        frame_count: how many frames the trajectory has.
+        further_videos: what is to be rendered besides, of further cameras.
+        frame_count: how many frames are to be rendered, of all of these.
         is_kept: the trajectory stays once the video is there.
         model_file: what has to be there for rendering, if it is known.
     """
@@ -95,6 +96,12 @@ class PendingEpisode:
     frame_count: int
     is_kept: bool
     model_file: Path | None
+    further_videos: tuple[Path, ...] = ()
+
+    @property
+    def video_count(self) -> int:
+        """How many videos are to be rendered."""
+        return int(self.video is not None) + len(self.further_videos)
 
     @property
     def is_log(self) -> bool:
@@ -141,13 +148,15 @@ def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
         video = _deferred_video(trajectory, facts)
         if not is_log and video is None:
             return None
+        further = () if video is None else further_video_paths(trajectory, facts)
         return PendingEpisode(
             key=key,
             # Where both are there, somebody died between making one and removing the
             # other, and finishing the log does what is left of that.
             trajectory=trajectory.with_suffix(".log") if is_log else trajectory,
             video=video,
-            frame_count=0 if video is None else reader.frame_count,
+            further_videos=tuple(further),
+            frame_count=0 if video is None else reader.frame_count * (1 + len(further)),
             is_kept=facts.get("kept", True),
             model_file=_model_file(directory, facts),
         )

@@ -18,14 +18,17 @@ from ..formats.json_fields import (
     boolean,
     field,
     integer,
+    list_of,
     mapping,
     optional,
     text,
     unreadable,
 )
 from ..formats.trajectory_file import TrajectoryReader, open_trajectory
+from ..formats.video_names import is_second_name
 from ..frames import QUALITIES
 from ..rates import to_rate
+from .views import PlainCamera, plain_camera
 
 __all__ = ["open_for_rendering"]
 
@@ -37,6 +40,8 @@ _ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/\d{1,40})?", re.ASCII)
 _BASE_NAME = re.compile(r"[\w.-]{1,200}", re.ASCII)
 _RECORDINGS = ("deferred", "live")
 _MOST_STEPS_A_FRAME = 10**12
+# Each may have a file of its own.
+_MOST_CAMERAS = 100
 
 
 def open_for_rendering(path: Path) -> TrajectoryReader:
@@ -91,7 +96,24 @@ def _video(value: Any) -> Mapping[str, Any]:
     field(video, "selection", optional(mapping), default=None)
     for key in ("fps", "max_fps"):
         field(video, key, optional(_asked_rate), default=None)
+    field(video, "cameras", optional(_cameras), default=None)
+    for key in ("tiled", "annotate"):
+        field(video, key, boolean, default=False)
+    field(video, "also_named", optional(_second_name), default=None)
     return video
+
+
+def _cameras(value: Any) -> tuple[PlainCamera, ...]:
+    cameras = list_of(plain_camera)(value)
+    if not 1 <= len(cameras) <= _MOST_CAMERAS:
+        raise ValueError(f"{len(cameras)} is no number of cameras")
+    return cameras
+
+
+def _second_name(value: Any) -> str:
+    if not is_second_name(text(value)):
+        raise ValueError(f"{value!r:.80} is no second name of a video")
+    return str(value)
 
 
 def _rate(value: Any) -> Fraction:

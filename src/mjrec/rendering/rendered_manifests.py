@@ -30,7 +30,12 @@ from ..formats.monitor_directory import (
     manifest_name,
 )
 from ..formats.pending_videos import with_reason
-from ..formats.video_metadata import is_broken, is_done, metadata_path
+from ..formats.video_metadata import (
+    finished_videos,
+    is_broken,
+    is_done,
+    metadata_path,
+)
 
 __all__ = ["reconcile", "update_manifest"]
 
@@ -114,9 +119,9 @@ def _updated(
         elif not is_done(video):
             waiting.append(with_reason(entry, reasons))
         elif is_broken(metadata_path(video)):
-            broken.append(metadata_path(video).name)
+            broken += [about for _, about in finished_videos(video)]
         else:
-            videos.append((video.name, metadata_path(video).name))
+            videos += finished_videos(video)
     if waiting == list(pending):
         return manifest
     return replace(

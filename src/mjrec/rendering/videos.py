@@ -1,23 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The video of a trajectory: its frames, drawn by workers, in one file.
+"""The videos of a trajectory: its frames, drawn by workers, in a file for each camera.
 
-The frames come in order, whoever drew them, so the file does not depend on the number
-of workers. The metadata comes last: where it is, the video is there and whole.
+The frames come in order, whoever drew them, so a file does not depend on the number
+of workers. The metadata comes last: where it is, the video is there and whole. The
+video of the first camera comes last of all: where it is, all are.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 from .. import json_text
+from ..annotation import Caption, annotated, check_annotation, pillow_version
 from ..atomic_files import write_text
 from ..blank_frames import BlankFrames
 from ..errors import EncoderError, NoPictures, UnreadableFile
 from ..formats.monitor_directory import Infix, episode_of, infix_of, video_prefix
+from ..formats.second_names import give_second_names, take_second_names
 from ..formats.trajectory_reader import TrajectoryReader
 from ..formats.video_metadata import (
     StepRuns,
@@ -25,11 +30,13 @@ from ..formats.video_metadata import (
     metadata_path,
     timing_facts,
 )
+from ..formats.video_names import further_parts, second_name_of, with_part
 from ..formats.video_writer import VideoFile, VideoWriter
 from ..frames import Frame
 from ..rates import to_rate
 from ..recorder.endings import KILLED
 from ..recorder.versions import versions
+from .captions import Captions
 from .recorded_facts import open_for_rendering
 from .recorded_pictures import (
     ChosenFrames,
@@ -37,15 +44,40 @@ from .recorded_pictures import (
     recorded_rate,
     warn_of_other_pictures,
 )
-from .views import View, plain_camera
+from .views import PlainCamera, View, plain_camera
 from .workers import DrawingWorkers
 
-__all__ = ["render_video", "video_path"]
+__all__ = ["further_video_paths", "render_video", "video_path"]
 
 logger = logging.getLogger(__name__)
 
 # Of an episode that ended before its second step: any is as good.
 _RATE_OF_ONE_FRAME = Fraction(30)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Shot:
+    """One video of an episode.
+
+    Attributes:
+        path: the file.
+        view: how it is drawn.
+        cameras: all of them, where they are in one video.
+        facts: what its metadata says that others' does not.
+    """
+
+    path: Path
+    view: View
+    cameras: tuple[PlainCamera | None, ...] | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Written:
+    """A video that is there, and what its frames looked like."""
+
+    file: VideoFile
+    blank: BlankFrames
 
 
 def render_video(
@@ -55,80 +87,117 @@ def render_video(
     view: View | None = None,
     max_fps: float | Fraction | None = None,
     fps: float | Fraction | None = None,
+    annotate: bool | None = None,
     out: Path | None = None,
     strict: bool = False,
     on_frame: Callable[[], object] = lambda: None,
 ) -> VideoFile | None:
     """Render the video of a trajectory, with its frame hashes and its metadata.
 
-    All three have temporary names until they are whole. Those that are there are
-    replaced. If it fails or is interrupted, nothing is left. An encoder that is killed
-    or hangs is given a second try.
+    Where several cameras were recorded, so many videos, or one of all side by side. All
+    files have temporary names until they are whole. Those that are there are replaced.
+    If it fails or is interrupted, nothing is left. An encoder that is killed or hangs
+    is given a second try.
 
     Args:
         trajectory: the file, finished or not.
         workers: who draw.
-        view: from where, how large and how well; as recorded, if None.
+        view: from where, how large and how well; as recorded, if None. With a camera,
+            there is one video, of what that one shows.
         max_fps: the most frames per second of simulated time: frames 0, n, 2n ... of
             those recorded, with the smallest n that fits, and the last.
         fps: frames per second of the file. If None, a second of the video is as much
             simulated time as when the episode was recorded.
-        out: the video; what the trajectory says, in its own directory, if None.
+        annotate: whether episode, step, time and return are written on the frames; as
+            recorded, if None.
+        out: the video, of the first camera or of all side by side; what the trajectory
+            says, in its own directory, if None.
         strict: whether a video that shows nothing is an error; else it is a warning.
-        on_frame: called after every frame, once for each.
+        on_frame: called after every frame, once for each of every video.
 
     Returns:
-        What was written; None where the trajectory says that it broke before there was
-        a frame, which the metadata now says.
+        What was written, of the first camera; None where the trajectory says that it
+        broke before there was a frame, which the metadata now says.
 
     Raises:
         NoPictures: it has no frames.
         UnreadableFile: it is damaged.
-        BlankVideo: `strict`, and the video shows nothing. It is there and stays.
+        MissingDependency: frames are to be written on, and there is no Pillow.
+        BlankVideo: `strict`, and a video shows nothing. All are there and stay.
         FileNotWritten: the disk is full.
         Error: its frames cannot be drawn or encoded.
     """
     view = view or View()
     with open_for_rendering(trajectory) as reader:
         facts = reader.header.facts
-        out = video_path(trajectory, facts) if out is None else out
+        shots = _shots(trajectory, facts, view, out)
         broken = _what_broke(facts)
         if reader.frame_count == 0:
             if broken and facts.get("video"):
-                _write_metadata(
-                    out, {**_episode_facts(reader), "empty": True, **broken}
-                )
+                nothing = {**_episode_facts(reader), "empty": True, **broken}
+                _write_metadata(shots[-1].path, nothing)
                 return None
             raise NoPictures(_why_no_pictures(trajectory, facts))
         warn_of_other_pictures(reader)
         chosen = chosen_frames(reader.frame_count, facts, max_fps)
         stride = facts.get("stride", 1) * chosen.every
         steps = reader.frame_steps[chosen.indices].tolist()
+        captions = _captions(reader, chosen, annotate)
         episode = _episode_facts(reader)
     rate = _usual_fps(facts, chosen) if fps is None else to_rate(fps)
-    file, blank = _write_video(
-        out,
-        lambda: workers.frames(trajectory, chosen.indices, view),
-        fps=rate,
-        on_frame=on_frame,
-    )
-    metadata = {
-        **episode,
-        **timing_facts(
-            StepRuns(steps, stride=stride),
-            fps=file.fps,
-            timestep=_fraction(facts.get("timestep")),
-            stride=stride,
-        ),
-        **file_facts(file),
-        **blank.facts(),
-        **_picture_facts(facts, view),
-        **workers.gl_strings,
-        **broken,
-    }
-    _complete(file, metadata)
-    blank.judge(out, strict=strict)
-    return file
+    if out is None:
+        # They would go on leading to what is replaced now.
+        take_second_names(shots[-1].path)
+
+    def render(shot: _Shot) -> _Written:
+        file, blank = _write_video(
+            shot.path,
+            lambda: _drawn(workers, trajectory, chosen, shot),
+            captions=captions,
+            fps=rate,
+            on_frame=on_frame,
+        )
+        metadata = {
+            **episode,
+            **timing_facts(
+                StepRuns(steps, stride=stride),
+                fps=file.fps,
+                timestep=_fraction(facts.get("timestep")),
+                stride=stride,
+            ),
+            **file_facts(file),
+            **blank.facts(),
+            "pictures": "scene",
+            "quality": view.quality or _recorded(facts).get("quality", "full"),
+            **shot.facts,
+            **({} if captions is None else {"annotated": {"pillow": pillow_version()}}),
+            **workers.gl_strings,
+            **broken,
+        }
+        _complete(file, metadata)
+        return _Written(file=file, blank=blank)
+
+    written = _all_or_none(map(render, shots))
+    if out is None:
+        give_second_names(shots[-1].path)
+    _judge(written, strict=strict)
+    return written[-1].file
+
+
+def further_video_paths(trajectory: Path, facts: Mapping[str, Any]) -> list[Path]:
+    """Return where the videos of a trajectory belong, but that of its first camera.
+
+    Raises:
+        UnreadableFile: as `video_path`.
+    """
+    video = _recorded(facts)
+    cameras = video.get("cameras") or ()
+    if video.get("tiled") or len(cameras) < 2:
+        return []
+    first = video_path(trajectory, facts)
+    return [
+        first.with_name(with_part(first.name, part)) for part in further_parts(cameras)
+    ]
 
 
 def video_path(trajectory: Path, facts: Mapping[str, Any]) -> Path:
@@ -137,7 +206,7 @@ def video_path(trajectory: Path, facts: Mapping[str, Any]) -> Path:
     Raises:
         UnreadableFile: the trajectory names none, or one that is not its own.
     """
-    name = (facts.get("video") or {}).get("name")
+    name = _recorded(facts).get("name")
     infix = Infix.parse(infix_of(trajectory.name) or "")
     number = episode_of(trajectory.name)
     own = infix and number is not None and f"{video_prefix(infix, number)}.mp4"
@@ -149,9 +218,93 @@ def video_path(trajectory: Path, facts: Mapping[str, Any]) -> Path:
     )
 
 
+def _shots(
+    trajectory: Path, facts: Mapping[str, Any], view: View, out: Path | None
+) -> list[_Shot]:
+    """Return the videos that are to be rendered, the first camera's last."""
+    video = _recorded(facts)
+    label = (facts.get("scene") or {}).get("label")
+    cameras = list(video.get("cameras") or ())
+    first = video_path(trajectory, facts) if out is None else out
+    if view.camera is not None:
+        camera = plain_camera(view.camera)
+        return [_Shot(path=first, view=view, facts={"camera": camera})]
+    names = {} if out is not None else _second_name(video, first, first)
+    if video.get("tiled") and len(cameras) > 1:
+        # The first one is as recorded, which is more than its name.
+        tiles = (None, *map(plain_camera, cameras[1:]))
+        said = {"camera": cameras, "tiled": True, **names}
+        return [_Shot(path=first, view=view, cameras=tiles, facts=said)]
+    paths = further_video_paths(trajectory, facts) if out is None else []
+    further = [
+        _Shot(
+            path=path,
+            view=replace(view, camera=plain_camera(camera)),
+            facts={
+                "camera": camera,
+                "first_video": first.name,
+                **_second_name(video, path, first),
+            },
+        )
+        for path, camera in zip(paths, cameras[1:], strict=False)
+    ]
+    said = {"camera": label, **names}
+    if further:
+        said["further_videos"] = [shot.path.name for shot in further]
+    return [*further, _Shot(path=first, view=view, facts=said)]
+
+
+def _second_name(video: Mapping[str, Any], path: Path, first: Path) -> dict[str, str]:
+    second = video.get("also_named")
+    name = second and second_name_of(path.name, second, first=first.name)
+    return {"also_named": name} if name else {}
+
+
+def _captions(
+    reader: TrajectoryReader, chosen: ChosenFrames, annotate: bool | None
+) -> Captions | None:
+    """Return what is to be written on the frames; None where nothing is."""
+    if annotate is None:
+        annotate = _recorded(reader.header.facts).get("annotate", False)
+    if not annotate:
+        return None
+    check_annotation()
+    return Captions(reader, chosen.indices)
+
+
+def _drawn(
+    workers: DrawingWorkers, trajectory: Path, chosen: ChosenFrames, shot: _Shot
+) -> Iterable[Frame]:
+    if shot.cameras is None:
+        return workers.frames(trajectory, chosen.indices, shot.view)
+    return workers.frames(trajectory, chosen.indices, shot.view, cameras=shot.cameras)
+
+
+def _all_or_none(videos: Iterable[_Written]) -> list[_Written]:
+    """Return the videos as they come; after a failure none of them stays."""
+    written: list[_Written] = []
+    try:
+        for video in videos:
+            written.append(video)
+    except BaseException:
+        for video in written:
+            _remove(video.file)
+        raise
+    return written
+
+
+def _judge(videos: Iterable[_Written], *, strict: bool) -> None:
+    """Warn of those that show nothing; with `strict` the first of them is an error."""
+    suspects = [video for video in videos if video.blank.suspicion() is not None]
+    for video in suspects[1:] if strict else suspects:
+        video.blank.judge(video.file.path, strict=False)
+    for video in suspects[:1] if strict else ():
+        video.blank.judge(video.file.path, strict=True)
+
+
 def _usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:
     """Return the rate at which a second of the file is as long as when recorded."""
-    asked = (facts.get("video") or {}).get("fps")
+    asked = _recorded(facts).get("fps")
     rate = recorded_rate(facts) if asked is None else Fraction(asked)
     return (_RATE_OF_ONE_FRAME if rate is None else rate) / chosen.every
 
@@ -160,6 +313,7 @@ def _write_video(
     out: Path,
     draw: Callable[[], Iterable[Frame]],
     *,
+    captions: Captions | None,
     fps: Fraction,
     on_frame: Callable[[], object],
 ) -> tuple[VideoFile, BlankFrames]:
@@ -173,12 +327,12 @@ def _write_video(
             on_frame()
 
     try:
-        return _encode(out, draw(), fps=fps, tell=tell)
+        return _encode(out, draw(), captions=captions, fps=fps, tell=tell)
     except EncoderError as error:
         if not _was_ended(error):
             raise
         logger.warning("The video %s is begun anew: %s", out.name, error)
-    return _encode(out, draw(), fps=fps, tell=tell)
+    return _encode(out, draw(), captions=captions, fps=fps, tell=tell)
 
 
 def _was_ended(error: EncoderError) -> bool:
@@ -190,14 +344,18 @@ def _encode(
     out: Path,
     frames: Iterable[Frame],
     *,
+    captions: Captions | None,
     fps: Fraction,
     tell: Callable[[int], object],
 ) -> tuple[VideoFile, BlankFrames]:
     blank = BlankFrames()
     writer = VideoWriter(out, fps=fps, frame_hashes=True)
     try:
-        for number, frame in enumerate(frames, 1):
-            writer.write(frame)
+        # As many captions as frames, or none at all.
+        said: Iterable[Caption | None] = captions or itertools.repeat(None)
+        for number, (frame, caption) in enumerate(zip(frames, said, strict=False), 1):
+            writer.write(frame if caption is None else annotated(frame, caption))
+            # Without the caption: whatever is written on it, it may show nothing.
             blank.add(frame)
             tell(number)
         # An older video's would not be true of this one.
@@ -217,9 +375,15 @@ def _complete(file: VideoFile, metadata: Mapping[str, Any]) -> None:
         _write_metadata(file.path, metadata)
     except BaseException:
         if not metadata_path(file.path).exists():
-            for path in filter(None, (file.path, file.frame_hash_path)):
-                path.unlink(missing_ok=True)
+            _remove(file)
         raise
+
+
+def _remove(file: VideoFile) -> None:
+    """Remove a video; its metadata first, without which there is none."""
+    for path in (metadata_path(file.path), file.path, file.frame_hash_path):
+        if path is not None:
+            path.unlink(missing_ok=True)
 
 
 def _episode_facts(reader: TrajectoryReader) -> dict[str, Any]:
@@ -241,10 +405,17 @@ def _episode_facts(reader: TrajectoryReader) -> dict[str, Any]:
         **ending,
         **{key: facts.get(key, so_far[key]) for key in so_far},
         **{key: facts.get(key) for key in ("type", "env_id", "seed", "options")},
+        **_selection(facts),
         "recording": "deferred",
         "versions": facts.get("versions"),
         "rendered_with": dict(versions()),
     }
+
+
+def _selection(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return by which rule the episode was chosen, where it was after its end."""
+    selection = _recorded(facts).get("selection")
+    return {} if selection is None else {"selection": selection}
 
 
 def _what_broke(facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -252,16 +423,10 @@ def _what_broke(facts: Mapping[str, Any]) -> dict[str, Any]:
     return {} if reason is None else {"broken_reason": reason, "broken": True}
 
 
-def _picture_facts(facts: Mapping[str, Any], view: View) -> dict[str, Any]:
-    recorded = facts.get("video") or {}
-    scene = facts.get("scene") or {}
-    return {
-        "pictures": "scene",
-        "quality": view.quality or recorded.get("quality", "full"),
-        "camera": scene.get("label")
-        if view.camera is None
-        else plain_camera(view.camera),
-    }
+def _recorded(facts: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what a trajectory says of its video; nothing where it has none."""
+    video: Mapping[str, Any] = facts.get("video") or {}
+    return video
 
 
 def _why_no_pictures(trajectory: Path, facts: Mapping[str, Any]) -> str:

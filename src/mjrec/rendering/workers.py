@@ -23,7 +23,7 @@ from ..patience import Patience
 from ..simulation.model_trust import with_all_models_trusted
 from .carried_errors import unpacked
 from .frame_ring import SLOTS, FrameRing
-from .views import View
+from .views import PlainCamera, View, plain_camera
 from .worker_process import WorkerProcess
 
 __all__ = ["DrawingWorkers"]
@@ -91,7 +91,12 @@ class DrawingWorkers:
         return dict(self._gl_strings)
 
     def frames(
-        self, trajectory: Path, indices: Sequence[int], view: View | None = None
+        self,
+        trajectory: Path,
+        indices: Sequence[int],
+        view: View | None = None,
+        *,
+        cameras: Sequence[PlainCamera | None] | None = None,
     ) -> Iterator[Frame]:
         """Return the pictures of a trajectory, in the order of `indices`.
 
@@ -101,6 +106,8 @@ class DrawingWorkers:
             trajectory: its file.
             indices: the numbers of the frames, from 0; in any order, also repeated.
             view: how they are wanted; None is as recorded.
+            cameras: several in place of that of the view; None among them is as
+                recorded. A picture is then all that they show, in a grid.
 
         Raises:
             UnreadableFile: of the trajectory or its model.
@@ -111,10 +118,12 @@ class DrawingWorkers:
                 what the worker said. Errors at later pictures are raised by the
                 iterator, at their places.
         """
-        drawing = {
+        drawing: dict[str, Any] = {
             "trajectory": str(Path(trajectory).absolute()),
             "view": (view or View()).as_json(),
         }
+        if cameras is not None:
+            drawing["cameras"] = [c if c is None else plain_camera(c) for c in cameras]
         return self.pictures(drawing, indices)
 
     def pictures(
