@@ -16,6 +16,7 @@ import rich.table
 import tyro
 
 from .. import json_text
+from ..formats.video_metadata import finished_videos
 from ..results import Episode, iter_episodes
 from .help_text import flowing_help
 
@@ -73,7 +74,9 @@ def episode_table(episodes: Iterator[Episode]) -> rich.table.Table:
 
 def _video(episode: Episode) -> str:
     if episode.video is not None:
-        return rich.markup.escape(episode.video.name)
+        further = len(_further_videos(episode))
+        more = f" and {further} of further cameras" if further else ""
+        return rich.markup.escape(episode.video.name) + more
     return "pending" if episode.pending else ""
 
 
@@ -85,7 +88,15 @@ def _end(episode: Episode) -> str:
 
 def _fields(episode: Episode) -> dict[str, object]:
     fields = {f.name: getattr(episode, f.name) for f in dataclasses.fields(episode)}
-    return {
+    plain = {
         name: value.name if isinstance(value, Path) else value
         for name, value in fields.items()
     }
+    return {**plain, "further_videos": _further_videos(episode)}
+
+
+def _further_videos(episode: Episode) -> list[str]:
+    """Return the names of the videos of an episode's further cameras."""
+    if episode.video is None or episode.metadata is None:
+        return []
+    return [name for name, _ in finished_videos(episode.video)[1:]]

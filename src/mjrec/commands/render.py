@@ -14,6 +14,7 @@ import rich.console
 import tyro
 
 from .. import json_text
+from ..annotation import check_annotation
 from ..errors import InvalidArgument
 from ..formats.monitor_directory import iter_monitor_files
 from ..formats.trajectory_file import find_trajectory
@@ -61,8 +62,10 @@ class _Report:
         self.directory = outcome.directory
         if outcome.is_video:
             self.videos[outcome.name] = outcome.frame_count
+            further = dict.fromkeys(outcome.further_videos, outcome.frame_count)
+            self.videos.update(further)
             if outcome.failure is not None:
-                self.blank[outcome.name] = outcome.failure
+                self.blank[outcome.blank_video or outcome.name] = outcome.failure
         elif outcome.failure is not None:
             self.failures[outcome.name] = outcome.failure
         elif outcome.is_elsewhere:
@@ -90,6 +93,8 @@ def render(
     max_fps: float | None = None,
     quality: Literal["full", "draft"] | None = None,
     fps: float | None = None,
+    annotate: bool = False,
+    no_annotate: bool = False,
     out: Path | None = None,
     workers: int | None = None,
     strict: bool = False,
@@ -101,8 +106,11 @@ def render(
     Without an option that asks for something other than recorded, the videos that are
     not there yet are rendered, as they were to be. Several of these commands on one
     directory share the work. With one (--camera, --size, --max-fps, --quality, --fps,
-    --out) recorded episodes are rendered once more, into new files beside the
-    originals, which nothing changes: openaigym.video.<...>.video000027.side.mp4.
+    --annotate, --no-annotate, --out) recorded episodes are rendered once more, into new
+    files beside the originals, which nothing changes:
+    openaigym.video.<...>.video000027.side.mp4. Of an episode that was recorded with
+    several cameras that is one video: of --camera, or of the first one, or of all side
+    by side where it was recorded so.
 
     Args:
         target: a monitor directory; or a trajectory or video in one, for that episode
@@ -116,6 +124,8 @@ def render(
             frame is drawn, and the last.
         quality: full, the model's own settings, or draft, several times faster.
         fps: frames per second written into the file; selects nothing.
+        annotate: write episode, step, time and return on the frames.
+        no_annotate: leave the frames without that, where it was recorded so.
         out: the file to write, for one episode; its ending says which kind.
         workers: how many processes draw; one for each CPU that is free, if it is not
             given.
@@ -133,6 +143,7 @@ def render(
         ),
         max_fps=max_fps,
         fps=fps,
+        annotate=_annotation(annotate, no_annotate),
     )
     is_again = variant != Variant() or out is not None
     if pending and is_again:
@@ -166,8 +177,8 @@ def render(
     if report.is_empty and (episode is not None or not target.is_dir()):
         raise InvalidArgument(
             f"No video of {_what(target, episode)} is pending. To render it again, say "
-            "what is to be other (--camera, --size, --max-fps, --quality, --fps) or "
-            "where to write it (--out)."
+            "what is to be other (--camera, --size, --max-fps, --quality, --fps, "
+            "--annotate) or where to write it (--out)."
         )
     if as_json:
         _print_json(report)
@@ -236,10 +247,25 @@ def _collect(
             report.add(outcome)
             if outcome.is_video:
                 frames = _count(outcome.frame_count, "frame")
-                _print(console, f"{outcome.name}: {frames}")
+                for name in (outcome.name, *outcome.further_videos):
+                    _print(console, f"{name}: {frames}")
     except KeyboardInterrupt:
         report.interrupted = True
     return report
+
+
+def _annotation(annotate: bool, no_annotate: bool) -> bool | None:
+    """Return what is asked for; None is as recorded.
+
+    Raises:
+        InvalidArgument: both are.
+        MissingDependency: there is no Pillow to write with.
+    """
+    if annotate and no_annotate:
+        raise InvalidArgument("Give one of --annotate and --no-annotate, or neither.")
+    if annotate:
+        check_annotation()
+    return annotate if annotate or no_annotate else None
 
 
 def _what(target: Path, episode: int | None) -> str:

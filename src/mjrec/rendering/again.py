@@ -4,30 +4,26 @@
 from __future__ import annotations
 
 import logging
-import re
-import urllib.parse
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 
 from ..errors import BlankVideo, Error, GLError, InvalidArgument
+from ..formats.video_names import camera_part, name_part
 from ..rates import to_rate
 from .outcomes import Outcome
 from .pending import EpisodeKey
 from .progress import Progress
 from .recorded_facts import open_for_rendering
 from .recorded_pictures import chosen_frames
-from .videos import render_video
+from .videos import further_video_paths, render_video
 from .views import View
 from .workers import DrawingWorkers
 
 __all__ = ["Variant", "render_again"]
 
 logger = logging.getLogger(__name__)
-
-# Names of cameras that would be taken for another part of a file's name.
-_AMBIGUOUS = re.compile(r"full|draft|\d*x\d*|.*fps|camera-.*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +34,7 @@ class Variant:
         view: from where, how large and how well it is drawn.
         max_fps: the most frames per second of simulated time.
         fps: frames per second of the file.
+        annotate: whether episode, step, time and return are written on the frames.
 
     Raises:
         InvalidArgument: one is no rate.
@@ -46,6 +43,7 @@ class Variant:
     view: View = field(default_factory=View)
     max_fps: float | Fraction | None = None
     fps: float | Fraction | None = None
+    annotate: bool | None = None
 
     def __post_init__(self) -> None:
         for rate in (self.max_fps, self.fps):
@@ -64,11 +62,12 @@ class Variant:
         view = self.view
         size = "x".join(str(side or "") for side in (view.width, view.height))
         parts = (
-            "" if view.camera is None else _camera_name(str(view.camera)),
+            "" if view.camera is None else camera_part(view.camera),
             "" if size == "x" else size,
             view.quality or "",
             "" if self.max_fps is None else f"max{_rate_name(self.max_fps)}fps",
             "" if self.fps is None else f"{_rate_name(self.fps)}fps",
+            {None: "", True: "annotated", False: "plain"}[self.annotate],
         )
         key = EpisodeKey.of(trajectory.name)
         stem = trajectory.stem if key is None else Path(key.video_name).stem
@@ -87,7 +86,8 @@ def render_again(
     """Render recorded episodes another way, and yield what became of each.
 
     Neither the originals nor the manifests change. A video of an earlier call with the
-    same variant is replaced.
+    same variant is replaced. Of an episode that was recorded with several cameras,
+    each with a video of its own, and without one in the variant, the first is drawn.
 
     Args:
         trajectories: of the episodes.
@@ -154,19 +154,25 @@ def _render(
     """
     outcome = Outcome(name=video.name, directory=video.parent)
     try:
+        _check_is_no_original(trajectory, video)
         file = render_video(
             trajectory,
             workers=workers,
             view=variant.view,
             max_fps=variant.max_fps,
             fps=variant.fps,
+            annotate=variant.annotate,
             out=video,
             strict=strict,
             on_frame=on_frame,
         )
     except BlankVideo as error:
         return replace(
-            outcome, is_video=True, frame_count=error.frame_count, failure=str(error)
+            outcome,
+            is_video=True,
+            frame_count=error.frame_count,
+            failure=str(error),
+            blank_video=error.path.name,
         )
     except GLError:
         raise
@@ -186,8 +192,8 @@ def _out_for(
         if variant == Variant():
             raise InvalidArgument(
                 f"The video of {trajectory.name} would be as the original. Say what is "
-                "to be other (camera, size, quality, max_fps, fps), or where to write "
-                "it."
+                "to be other (camera, size, quality, max_fps, fps, annotate), or where "
+                "to write it."
             )
         return trajectory.with_name(variant.name_for(trajectory))
     if not alone:
@@ -205,6 +211,25 @@ def _out_for(
     return out
 
 
+def _check_is_no_original(trajectory: Path, video: Path) -> None:
+    """Raise an error if a video would replace one of a further camera.
+
+    Raises:
+        InvalidArgument: it would.
+    """
+    if video.parent.resolve() != trajectory.parent.resolve():
+        return
+    with open_for_rendering(trajectory) as reader:
+        facts = reader.header.facts
+        originals = further_video_paths(trajectory, facts) if facts.get("video") else []
+    if video.with_suffix(".mp4").name in {path.name for path in originals}:
+        raise InvalidArgument(
+            f"{video.name} is a recorded video: this camera was recorded too. If it is "
+            "not there yet, render what is pending; else say what is to be other "
+            "besides the camera, or where to write it."
+        )
+
+
 def _frame_count(trajectory: Path, variant: Variant) -> int:
     try:
         with open_for_rendering(trajectory) as reader:
@@ -217,16 +242,4 @@ def _frame_count(trajectory: Path, variant: Variant) -> int:
 
 
 def _rate_name(rate: float | Fraction) -> str:
-    return _as_name(f"{float(rate):g}")
-
-
-def _camera_name(camera: str) -> str:
-    name = _as_name(camera)
-    return f"camera-{name}" if _AMBIGUOUS.fullmatch(name) else name
-
-
-def _as_name(text: str) -> str:
-    """Return a text as a part of a file's name."""
-    quoted = urllib.parse.quote(text, safe="")
-    # What `quote` leaves alone and is no letter, digit, `_` or `-`.
-    return quoted.replace(".", "%2E").replace("~", "%7E")
+    return name_part(f"{float(rate):g}")

@@ -224,6 +224,7 @@ class EpisodeFinisher:
                 is_video=True,
                 frame_count=error.frame_count,
                 failure=str(error),
+                blank_video=error.path.name,
             )
         frame_count = 0 if file is None else file.frame_count
         return replace(outcome, is_video=frame_count > 0, frame_count=frame_count)

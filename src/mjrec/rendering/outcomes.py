@@ -20,6 +20,7 @@ class Outcome:
         frame_count: how many frames it has, and each of the further ones.
         further_videos: the names of those that were rendered with it, of further
             cameras.
+        blank_video: the name of the one that shows nothing, where that is the failure.
         failure: why it could not be done; None where it was, or needed nothing. Of a
             video that was rendered: that it shows nothing.
         is_elsewhere: another process is at it.
@@ -32,3 +33,4 @@ class Outcome:
     failure: str | None = None
     is_elsewhere: bool = False
     further_videos: tuple[str, ...] = ()
+    blank_video: str | None = None
