@@ -6,11 +6,13 @@ from __future__ import annotations
 import logging
 import os
 import re
+import time
 from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
 
 import gymnasium
+import numpy as np
 
 from ..errors import InvalidArgument, PicturesDiffer
 from ..rates import rate_from_timestep
@@ -34,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 _VectorEnv = gymnasium.vector.VectorEnv[Any, Any, Any]
 
-_UNSEEN = "its sub-environments are no objects in this process"
+_UNSEEN = "its sub-environments are not objects in this process"
 # How Gymnasium writes an environment that has a spec, under its wrappers.
 _WITH_SPEC = re.compile(r"(?:<\w+)+<([\w./:-]+)>+")
 
@@ -92,6 +94,8 @@ class OutsideRecording(VectorRecording):
         self._frames = frames
         self._observations = options.observations
         self._has_warned = False
+        self._episode_info = options.episode_info
+        self._began = np.zeros(env.num_envs)
         _check_view(env, view)
         choice = _rendering_choice(env, options.render)
         env_id = env_id or _env_id(env)
@@ -130,6 +134,7 @@ class OutsideRecording(VectorRecording):
         result: tuple[Any, dict[str, Any]]
         result = self._env.reset(seed=seed, options=options)
         self._frames.forget()
+        self._began[which] = time.perf_counter()
         observations = self._each_observation(result[0])
         for_each(
             lambda index: self.monitors[index]._begin(
@@ -153,7 +158,25 @@ class OutsideRecording(VectorRecording):
             lambda index: self._record(index, step, is_reset=index in resetting),
             self._open_indices(),
         )
+        if self._episode_info:
+            self._add_episode_info(step)
         return result
+
+    def _add_episode_info(self, step: _Step) -> None:
+        """Say of the episodes that are over what Gymnasium's own wrapper says."""
+        ends = np.array([step.is_end(index) for index in range(len(self.monitors))])
+        if not ends.any() or "episode" in step.infos or "_episode" in step.infos:
+            return
+        took = np.round(time.perf_counter() - self._began, 6)
+        last = [_last_episode(monitor) for monitor in self.monitors]
+        step.infos["episode"] = {
+            "r": np.where(ends, [reward for reward, _ in last], 0.0),
+            "l": np.where(ends, [length for _, length in last], 0),
+            "t": np.where(ends, took, 0.0),
+        }
+        step.infos["_episode"] = ends
+        if step.resets_itself:
+            self._began[ends] = time.perf_counter()
 
     def _open_indices(self) -> list[int]:
         return [
@@ -180,6 +203,7 @@ class OutsideRecording(VectorRecording):
     def _record(self, index: int, step: _Step, *, is_reset: bool) -> None:
         monitor = self.monitors[index]
         if is_reset:
+            self._began[index] = time.perf_counter()
             monitor._begin(observation=step.observations[index])
             return
         done = step.is_end(index)
@@ -234,7 +258,7 @@ class _Step:
         rewards: Any,
         terminations: Any,
         truncations: Any,
-        infos: Mapping[str, Any],
+        infos: dict[str, Any],
         each_observation: list[Any],
         resets_itself: bool,
     ) -> None:
@@ -244,7 +268,7 @@ class _Step:
         self.truncations = truncations
         self.observations = each_observation
         self.resets_itself = resets_itself
-        self._infos = infos
+        self.infos = infos
 
     def is_end(self, index: int) -> bool:
         return bool(self.terminations[index] or self.truncations[index])
@@ -252,13 +276,13 @@ class _Step:
     def last_observation(self, index: int) -> Any:
         """Return the observation that belongs to the episode of the step."""
         if self.resets_itself and self.is_end(index):
-            final = self._infos.get("final_obs")
+            final = self.infos.get("final_obs")
             return self.observations[index] if final is None else final[index]
         return self.observations[index]
 
     def info(self, index: int) -> dict[str, Any]:
         """Return what the step said of one sub-environment, values of it only."""
-        infos: Any = self._infos
+        infos: Any = self.infos
         if self.resets_itself and isinstance(infos.get("final_info"), Mapping):
             infos = infos["final_info"]
         return {
@@ -266,6 +290,14 @@ class _Step:
             for name, values in infos.items()
             if _is_said(infos, name, index) and not isinstance(values, Mapping)
         }
+
+
+def _last_episode(monitor: MonitorControls) -> tuple[float, int]:
+    """Return reward and length of the last episode that is over; zeros before it."""
+    stats = monitor.stats_recorder
+    if not stats.episode_lengths:
+        return 0.0, 0
+    return stats.episode_rewards[-1], stats.episode_lengths[-1]
 
 
 def _is_said(infos: Mapping[str, Any], name: str, index: int) -> bool:

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Vector environments for the tests; they need no simulator."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from recordings import frames_of
+
+MODES = tuple(AutoresetMode)
+NEXT_STEP = AutoresetMode.NEXT_STEP
+SAME_STEP = AutoresetMode.SAME_STEP
+DISABLED = AutoresetMode.DISABLED
+
+
+class VectorCorridor(gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """Several corridors in one object, each of its own length; draws all of them.
+
+    The picture of a corridor is 16 pixels wide for each step that was taken.
+    """
+
+    def __init__(
+        self,
+        lengths: tuple[int, ...] = (2, 3),
+        mode: Any = NEXT_STEP,
+        *,
+        render_mode: str | None = "rgb_array",
+        heights: tuple[int, ...] | None = None,
+    ) -> None:
+        self.num_envs = len(lengths)
+        self.lengths = np.array(lengths)
+        self.metadata = {"render_fps": 10, "autoreset_mode": mode}
+        self.render_mode = render_mode
+        self.heights = heights or (32,) * self.num_envs
+        self.single_observation_space = gymnasium.spaces.Box(0, 99, (1,), np.float64)
+        self.single_action_space = gymnasium.spaces.Discrete(9)
+        self.observation_space = gymnasium.vector.utils.batch_space(
+            self.single_observation_space, self.num_envs
+        )
+        self.action_space = gymnasium.vector.utils.batch_space(
+            self.single_action_space, self.num_envs
+        )
+        self.positions = np.zeros(self.num_envs, int)
+        self.rendered = 0
+        self.closings: list[dict[str, Any]] = []
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        mask = (options or {}).pop("reset_mask", np.ones(self.num_envs, bool))
+        self.positions[mask] = 0
+        return self._observations(), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        mode = self.metadata["autoreset_mode"]
+        begins = (self.positions >= self.lengths) & (mode == NEXT_STEP)
+        self.positions = np.where(begins, 0, self.positions + 1)
+        ends = self.positions >= self.lengths
+        infos: dict[str, Any] = {}
+        if mode == SAME_STEP and ends.any():
+            last = np.full(self.num_envs, None, object)
+            for index in np.flatnonzero(ends):
+                last[index] = self._observations()[index]
+            infos = {
+                "final_obs": last,
+                "_final_obs": ends,
+                "final_info": {"is_success": ends.copy(), "_is_success": ends},
+                "_final_info": ends,
+            }
+            self.positions[ends] = 0
+        rewards = np.where(begins, 0.0, 0.5)
+        return self._observations(), rewards, ends, np.zeros_like(ends), infos
+
+    def render(self) -> Any:
+        self.rendered += 1
+        return tuple(
+            _picture(position, height)
+            for position, height in zip(self.positions, self.heights, strict=True)
+        )
+
+    def close_extras(self, **kwargs: Any) -> None:
+        self.closings.append(kwargs)
+
+    def _observations(self) -> Any:
+        return self.positions[:, None].astype(float)
+
+
+def _picture(position: int, height: int) -> Any:
+    frame = np.zeros((height, 64, 3), np.uint8)
+    frame[:, : 16 * position + 16] = (200, 40, 10)
+    return frame
+
+
+def play(env: Any, steps: int, *, seed: int | None = None) -> None:
+    """Reset, and step so often; reset by mask what nobody else resets."""
+    env.reset(seed=seed)
+    env.action_space.seed(seed)
+    for _ in range(steps):
+        _, _, terminations, truncations, _ = env.step(env.action_space.sample())
+        ends = np.asarray(terminations) | np.asarray(truncations)
+        if env.metadata["autoreset_mode"] == DISABLED and ends.any():
+            env.reset(options={"reset_mask": ends})
+
+
+def path_of(monitor: Any, episode: int, ending: str) -> Path:
+    """Return where a file of a sub-environment's episode is."""
+    name = f"openaigym.video.{monitor.infix}.video{episode:06d}.{ending}"
+    return Path(monitor.directory) / name
+
+
+def shown(path: Path, *, step: int = 4) -> list[int]:
+    """Return the corridor positions that a video shows, by its columns of colour."""
+    columns = [int((frame[0, :, 0] > 128).sum()) for frame in frames_of(path)]
+    return [round(count / step) - 1 for count in columns]
+
+
+def metadata_at(path: Path) -> dict[str, Any]:
+    """Return what a JSON file holds."""
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
+
+
+def hashes_at(path: Path) -> list[str]:
+    """Return the sha256 of each frame, as a framehash file says them."""
+    lines = [line for line in path.read_text().splitlines() if line[:1] != "#"]
+    return [line.rpartition(",")[2].strip() for line in lines]
