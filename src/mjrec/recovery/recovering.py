@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import is_locked, wait_for_lock
+from ..formats.second_names import give_all_second_names
 from .remains import Remains, has_work, is_open, model_leftovers, remains_of
 from .report import Recovery
 
@@ -72,6 +73,7 @@ def recover(
         for remains in dead:
             mending.mend(remains.infix)
         mending.sweep_models()
+        give_all_second_names(path)
     finally:
         lock.release()
     return Recovery(path, tuple(mending.files), tuple(mending.failures), open_monitors)

@@ -103,10 +103,12 @@ def _video(value: Any) -> Mapping[str, Any]:
     return video
 
 
-def _cameras(value: Any) -> tuple[PlainCamera, ...]:
-    cameras = list_of(plain_camera)(value)
+def _cameras(value: Any) -> tuple[PlainCamera | None, ...]:
+    cameras = list_of(optional(plain_camera))(value)
     if not 1 <= len(cameras) <= _MOST_CAMERAS:
         raise ValueError(f"{len(cameras)} is no number of cameras")
+    if None in cameras[1:]:
+        raise ValueError("only the first can be what the environment itself shows")
     return cameras
 
 

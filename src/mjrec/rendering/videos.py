@@ -32,6 +32,7 @@ from ..formats.video_metadata import (
 )
 from ..formats.video_names import further_parts, second_name_of, with_part
 from ..formats.video_writer import VideoFile, VideoWriter
+from ..frame_grid import grid_shape
 from ..frames import Frame
 from ..rates import to_rate
 from ..recorder.endings import KILLED
@@ -233,7 +234,14 @@ def _shots(
     if video.get("tiled") and len(cameras) > 1:
         # The first one is as recorded, which is more than its name.
         tiles = (None, *map(plain_camera, cameras[1:]))
-        said = {"camera": cameras, "tiled": True, **names}
+        rows, columns = grid_shape(len(tiles))
+        said = {
+            "camera": [label, *cameras[1:]],
+            "tiled": True,
+            "rows": rows,
+            "columns": columns,
+            **names,
+        }
         return [_Shot(path=first, view=view, cameras=tiles, facts=said)]
     paths = further_video_paths(trajectory, facts) if out is None else []
     further = [
