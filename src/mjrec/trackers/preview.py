@@ -35,7 +35,7 @@ def animated_gif(path: Path, *, frame_count: int, fps: Fraction) -> bytes:
     Raises:
         EncoderError: ffmpeg failed, or hangs.
     """
-    delay = _delay(frame_count / fps)
+    delay = _delay(frame_count, fps)
     for side in _SIDES:
         gif = _convert(path, side=side, delay=delay, frame_count=frame_count)
         if len(gif) <= _MOST_BYTES:
@@ -43,15 +43,17 @@ def animated_gif(path: Path, *, frame_count: int, fps: Fraction) -> bytes:
     return gif
 
 
-def _delay(seconds: Fraction) -> int:
-    return max(_SHORTEST_DELAY, math.ceil(100 * seconds / _MOST_PICTURES))
+def _delay(frame_count: int, fps: Fraction) -> int:
+    longest = math.ceil(100 * frame_count / fps / _MOST_PICTURES)
+    return max(_SHORTEST_DELAY, math.ceil(100 / fps), longest)
 
 
 def _convert(path: Path, *, side: int, delay: int, frame_count: int) -> bytes:
     skipping = ["-skip_frame", "nokey"] if frame_count >= _MANY_FRAMES else []
     # A palette of the video's own, of which only what changes is stored.
     filters = (
-        f"fps=100/{delay},"
+        # Up, so that even the shortest video has a picture.
+        f"fps=100/{delay}:round=up,"
         f"scale=min(iw\\,{side}):min(ih\\,{side})"
         ":force_original_aspect_ratio=decrease:flags=area,"
         "split[pictures][counted];[counted]palettegen=stats_mode=diff[palette];"

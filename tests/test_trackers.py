@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the trackers have in common."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from finished_files import episode
+
+import mjrec.trackers
+from mjrec.errors import InvalidArgument
+from mjrec.trackers.scalars import group_of, scalars_of
+
+# As if a package were not installed; everything else is there.
+LACK = """
+import sys
+
+class Lack:
+    def find_spec(self, name, path=None, target=None):
+        if name == {package!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Lack())
+"""
+
+
+def run(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=cwd, capture_output=True, text=True
+    )
+
+
+def test_import_loads_no_service(tmp_path: Path) -> None:
+    """Nor does importing each tracker."""
+    answer = run(
+        "import sys; from mjrec.trackers import *; "
+        "print([m for m in ('tensorboard', 'wandb', 'google') if m in sys.modules])",
+        tmp_path,
+    )
+    assert answer.stdout.split() == ["[]"], answer.stderr
+
+
+@pytest.mark.parametrize(
+    ("package", "call"),
+    [
+        ("tensorboard", "TensorBoardTracker('logs')"),
+        ("wandb", "WandbTracker(mode='offline')"),
+    ],
+)
+def test_missing_package_is_named_with_the_way_out(
+    package: str, call: str, tmp_path: Path
+) -> None:
+    """By the constructor, before anything is written."""
+    answer = run(
+        LACK.format(package=package) + f"import mjrec.trackers as t\nt.{call}", tmp_path
+    )
+    assert "mjrec.errors.MissingDependency" in answer.stderr
+    assert (
+        f'{package}, which is not installed. Run: pip install "mjrec[{package}]"'
+        in (answer.stderr)
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_package_that_lacks_another_is_not_called_missing(tmp_path: Path) -> None:
+    """Installing what is there would not help."""
+    answer = run(
+        LACK.format(package="tensorboard.compat")
+        + "import sys, types; sys.path.insert(0, '.')\n"
+        "import mjrec.trackers as t\nt.TensorBoardTracker()",
+        _broken_tensorboard(tmp_path),
+    )
+    assert "ModuleNotFoundError: No module named 'no_such_package'" in answer.stderr
+    assert "MissingDependency" not in answer.stderr
+
+
+def _broken_tensorboard(directory: Path) -> Path:
+    (directory / "tensorboard.py").write_text("import no_such_package\n")
+    return directory
+
+
+def test_unknown_name() -> None:
+    """The package says so like any module."""
+    with pytest.raises(AttributeError, match="no attribute 'Neptune'"):
+        _ = mjrec.trackers.Neptune
+    assert "TensorBoardTracker" in dir(mjrec.trackers)
+
+
+def test_run_and_how_to_make_one_exclude_each_other() -> None:
+    """Nobody can tell which is meant."""
+    with pytest.raises(InvalidArgument, match="got a run and project, tags"):
+        mjrec.trackers.WandbTracker(object(), project="p", tags=["a"])
+
+
+def test_scalars_are_plain_numbers() -> None:
+    """Success stands there only where something is known of it."""
+    assert scalars_of(episode(2)) == {"return": 3.0, "length": 10.0}
+    assert scalars_of(episode(2, success=False))["success"] == 0.0
+    assert group_of(episode(type="e")) == "evaluation"
+    assert group_of(None) == group_of(episode()) == "training"

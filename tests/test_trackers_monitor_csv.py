@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`monitor.csv`, as text; Stable-Baselines3's own readers have tests of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from finished_files import episode
+from full_disk import file_size_limit
+
+from mjrec.errors import DirectoryNotWritable, FileNotWritten
+from mjrec.trackers import MonitorCsvTracker, Run
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return Run(directory=tmp_path / "recordings", infix="0.4711", env_id="Hopper-v5")
+
+
+def names(directory: Path) -> list[str]:
+    return sorted(path.name for path in directory.iterdir())
+
+
+def begin_and_end(tracker: MonitorCsvTracker, run: Run) -> None:
+    tracker.begin(run)
+    tracker.end(run)
+
+
+def test_header_and_rows(run: Run) -> None:
+    """Times count from the header's; rewards are as exact as they were."""
+    before = time.time()
+    tracker = MonitorCsvTracker()
+    tracker.begin(run)
+    tracker.episode(run, episode(reward=np.float32(0.1), length=np.int64(7)))
+    tracker.episode(run, episode(reward=math.nan))
+    tracker.episode(run, episode(reward=-math.inf, end_time=before + 100))
+    tracker.end(run)
+    path = run.directory / "openaigym.episodes.0.4711.monitor.csv"
+    header, columns, *rows = path.read_text().splitlines()
+    start = json.loads(header.removeprefix("#"))
+    assert start["env_id"] == "Hopper-v5"
+    assert before <= start["t_start"] <= time.time()
+    assert columns == "r,l,t"
+    cells = [row.split(",") for row in rows]
+    assert [(r, length) for r, length, _ in cells] == [
+        (str(float(np.float32(0.1))), "7"),
+        ("nan", "10"),
+        ("-inf", "10"),
+    ]
+    assert float(cells[2][2]) == pytest.approx(before + 100 - start["t_start"])
+
+
+def test_each_run_has_a_file_of_its_own(run: Run, tmp_path: Path) -> None:
+    """Sub-environments in one directory, at the same time."""
+    (tmp_path / "logs").mkdir()
+    tracker = MonitorCsvTracker(tmp_path / "logs")
+    runs = [dataclasses.replace(run, env_index=i, infix=f"{i}.4711") for i in range(2)]
+    for one in runs:
+        tracker.begin(one)
+    for number, one in enumerate(reversed(runs)):
+        tracker.episode(one, episode(number))
+        tracker.end(one)
+    texts = [path.read_text() for path in sorted((tmp_path / "logs").iterdir())]
+    assert [text.splitlines()[2].split(",")[0] for text in texts] == ["1.5", "0.0"]
+
+
+@pytest.mark.parametrize(
+    ("path", "made"),
+    [
+        ("logs/a", ["a.1.monitor.csv", "a.2.monitor.csv", "a.monitor.csv"]),
+        ("logs/a.monitor.csv", ["a.1.monitor.csv", "a.2.monitor.csv", "a.monitor.csv"]),
+        ("logs/monitor.csv", ["1.monitor.csv", "2.monitor.csv", "monitor.csv"]),
+    ],
+)
+def test_file_that_is_there_is_never_written_to(
+    run: Run, path: str, made: list[str], tmp_path: Path
+) -> None:
+    """The next free name is taken, one that Stable-Baselines3 finds too."""
+    begin_and_end(MonitorCsvTracker(tmp_path / path), run)
+    [first] = (tmp_path / "logs").iterdir()
+    first.write_text("precious")
+    for _ in range(2):
+        begin_and_end(MonitorCsvTracker(tmp_path / path), run)
+    assert names(tmp_path / "logs") == made
+    assert first.read_text() == "precious"
+
+
+def test_relative_path_stays_where_it_was_named(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though the script goes elsewhere before the first monitor."""
+    monkeypatch.chdir(tmp_path)
+    tracker = MonitorCsvTracker("a")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    begin_and_end(tracker, run)
+    assert (tmp_path / "a.monitor.csv").is_file()
+
+
+def test_directory_that_cannot_be_made_is_named(run: Run, tmp_path: Path) -> None:
+    """A file has its name."""
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(DirectoryNotWritable, match="taken"):
+        MonitorCsvTracker(tmp_path / "taken" / "a").begin(run)
+
+
+def test_full_disk_is_named_and_tears_no_row(run: Run) -> None:
+    """Half a row would be read as another one."""
+    tracker = MonitorCsvTracker()
+    tracker.begin(run)
+    [path] = run.directory.iterdir()
+    whole = path.read_text()
+    with (
+        file_size_limit(len(whole) + 3),
+        pytest.raises(FileNotWritten, match=r"monitor\.csv"),
+    ):
+        tracker.episode(run, episode())
+    assert path.read_text() == whole
+    tracker.episode(run, episode(4))
+    tracker.end(run)
+    assert path.read_text().splitlines()[2].startswith("6.0,10,")
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from finished_files import episode
+from mjrec.trackers import MonitorCsvTracker, Run
+tracker = MonitorCsvTracker()
+run = Run(directory=Path.cwd(), infix="0.1", env_id="x")
+tracker.begin(run)
+tracker.episode(run, episode())
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_killed_process_loses_no_episode(tmp_path: Path) -> None:
+    """A row is on disk when its episode has ended."""
+    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n{KILLED}"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False)
+    assert done.returncode == -signal.SIGKILL
+    [path] = tmp_path.iterdir()
+    assert len(path.read_text().splitlines()) == 3

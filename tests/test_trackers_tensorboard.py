@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Event files, read back by TensorBoard's own reader."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+from finished_files import Finished, episode, record
+from full_disk import file_size_limit
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from mjrec.errors import (
+    DirectoryNotWritable,
+    EncoderError,
+    FileNotWritten,
+    UnreadableFile,
+)
+from mjrec.trackers import TensorBoardTracker
+from mjrec.trackers.preview import animated_gif
+
+
+@pytest.fixture
+def finished(tmp_path: Path, make_corridor: Any, play: Callable[..., None]) -> Finished:
+    """A video of eleven frames at ten a second."""
+    return record(tmp_path / "recordings", make_corridor(10), play)
+
+
+def read(directory: Path) -> EventAccumulator:
+    events = EventAccumulator(str(directory))
+    events.Reload()
+    return events
+
+
+def picture(gif: bytes, index: int) -> Any:
+    with Image.open(io.BytesIO(gif)) as image:
+        image.seek(index)
+        return image.convert("RGB")
+
+
+def test_scalars_stand_over_the_steps_of_the_run(finished: Finished) -> None:
+    """Success only where it is known, evaluation apart, NaN as it is."""
+    tracker, run = TensorBoardTracker(), finished.run
+    tracker.begin(run)
+    tracker.episode(run, episode(0, success=True))
+    tracker.episode(run, episode(1, reward=math.nan))
+    tracker.episode(run, episode(2, type="e"))
+    tracker.end(run)
+    events = read(run.directory / "tensorboard" / "0.4711")
+    returns = events.Scalars("training/return")
+    assert [event.step for event in returns] == [10, 20]
+    assert returns[0].value == 0.0
+    assert math.isnan(returns[1].value)
+    assert [e.value for e in events.Scalars("training/length")] == [10, 10]
+    assert [(e.step, e.value) for e in events.Scalars("training/success")] == [(10, 1)]
+    assert [(e.step, e.value) for e in events.Scalars("evaluation/return")] == [(30, 3)]
+
+
+def test_events_are_there_at_once(finished: Finished) -> None:
+    """A killed process loses none."""
+    tracker = TensorBoardTracker()
+    tracker.begin(finished.run)
+    tracker.episode(finished.run, episode())
+    assert read(finished.run.directory / "tensorboard" / "0.4711").Scalars(
+        "training/return"
+    )
+    tracker.end(finished.run)
+
+
+def test_video_is_played_as_a_gif_of_the_file(finished: Finished) -> None:
+    """It shows the whole episode, moves on, and stands at its episode's step."""
+    tracker, run = TensorBoardTracker(), finished.run
+    tracker.begin(run)
+    tracker.episode(run, episode(0))
+    tracker.episode(run, episode(5))
+    tracker.video(run, finished.video)
+    tracker.end(run)
+    events = read(run.directory / "tensorboard" / "0.4711")
+    [image] = events.Images("training/video")
+    assert (image.step, image.height, image.width) == (10, 32, 48)
+    gif = image.encoded_image_string
+    assert gif.startswith(b"GIF89a")
+    with Image.open(io.BytesIO(gif)) as opened:
+        assert opened.n_frames == 11
+        assert opened.info["duration"] == 100
+        assert opened.info["loop"] == 0
+    # The bar grows by four pixels a step.
+    for step in (0, 5, 10):
+        shown = picture(gif, step)
+        inside, outside = (4 * step + 1, 16), (min(4 * step + 7, 47), 16)
+        assert shown.getpixel(inside)[0] > 150
+        assert shown.getpixel(outside)[0] < 60
+    [text] = events.Tensors("training/video_file")
+    assert finished.video.path.name.encode() in text.tensor_proto.string_val[0]
+    assert text.step == 10
+
+
+def test_video_of_no_episode_stands_at_the_last_step(finished: Finished) -> None:
+    """One that was cut off, for instance."""
+    tracker, run = TensorBoardTracker(), finished.run
+    tracker.begin(run)
+    tracker.episode(run, episode(3))
+    tracker.video(run, dataclasses.replace(finished.video, episode=None))
+    tracker.end(run)
+    events = read(run.directory / "tensorboard" / "0.4711")
+    assert [image.step for image in events.Images("training/video")] == [40]
+
+
+def test_runs_are_told_apart(finished: Finished, tmp_path: Path) -> None:
+    """Sub-environments, and two directories with one infix, in one `log_dir`."""
+    first = finished.run
+    runs = [
+        dataclasses.replace(first, env_index=0),
+        dataclasses.replace(first, env_index=1, infix="1.4711"),
+        dataclasses.replace(first, directory=tmp_path / "evaluation"),
+        dataclasses.replace(first, directory=tmp_path / "b" / "evaluation"),
+    ]
+    tracker = TensorBoardTracker(tmp_path / "logs")
+    for run in runs:
+        tracker.begin(run)
+    for number, run in enumerate(runs):
+        tracker.episode(run, episode(number))
+        tracker.end(run)
+    returns = {
+        path.name: [e.value for e in read(path).Scalars("training/return")]
+        for path in (tmp_path / "logs").iterdir()
+    }
+    assert returns == {
+        "recordings.0.4711.env0": [0.0],
+        "recordings.1.4711.env1": [1.5],
+        "evaluation.0.4711": [3.0],
+        "evaluation.0.4711-2": [4.5],
+    }
+
+
+def test_two_trackers_never_share_an_event_file(finished: Finished) -> None:
+    """TensorBoard would stop reading the first."""
+    for _ in range(2):
+        tracker = TensorBoardTracker()
+        tracker.begin(finished.run)
+        tracker.end(finished.run)
+    parent = finished.run.directory / "tensorboard"
+    assert sorted(path.name for path in parent.iterdir()) == ["0.4711", "0.4711-2"]
+    assert len(list(parent.glob("*/events.out.tfevents.*"))) == 2
+
+
+def test_damaged_video_is_ffmpegs_error(finished: Finished) -> None:
+    """It comes home at the end at the latest, and the events before it stay."""
+    finished.video.path.write_bytes(b"no video")
+    tracker, run = TensorBoardTracker(), finished.run
+    tracker.begin(run)
+    tracker.episode(run, episode())
+    tracker.video(run, finished.video)
+    with pytest.raises(
+        EncoderError, match=r"(?s)No preview .*mp4.*Invalid data"
+    ) as caught:
+        tracker.end(run)
+    assert caught.value.returncode != 0
+    events = read(run.directory / "tensorboard" / "0.4711")
+    assert events.Tags()["scalars"] == ["training/return", "training/length"]
+    assert events.Tags()["images"] == []
+
+
+def test_damaged_metadata_is_named(finished: Finished) -> None:
+    """Without it nobody knows how long the video is."""
+    finished.video.metadata_path.write_text(json.dumps({"fps": "10"}))
+    tracker = TensorBoardTracker()
+    tracker.begin(finished.run)
+    with pytest.raises(UnreadableFile, match=r"meta\.json: it has no 'frame_count'"):
+        tracker.video(finished.run, finished.video)
+    tracker.end(finished.run)
+
+
+def test_directory_that_cannot_be_made_is_named(
+    finished: Finished, tmp_path: Path
+) -> None:
+    """A file has its name."""
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(DirectoryNotWritable, match="taken"):
+        TensorBoardTracker(tmp_path / "taken").begin(finished.run)
+
+
+def test_gif_of_a_long_video_is_bounded(finished: Finished) -> None:
+    """It lasts as long, with fewer pictures."""
+    gif = animated_gif(finished.video.path, frame_count=11, fps=Fraction(1, 25))
+    with Image.open(io.BytesIO(gif)) as image:
+        assert image.n_frames <= 100
+
+
+def test_full_disk_is_named_and_tears_nothing(finished: Finished) -> None:
+    """What came before is read, and so is what comes when there is room again."""
+    tracker, run = TensorBoardTracker(), finished.run
+    tracker.begin(run)
+    tracker.episode(run, episode(0))
+    [path] = (run.directory / "tensorboard" / "0.4711").iterdir()
+    with (
+        file_size_limit(path.stat().st_size + 20),
+        pytest.raises(FileNotWritten, match="tfevents"),
+    ):
+        tracker.episode(run, episode(1))
+    tracker.episode(run, episode(2))
+    tracker.end(run)
+    returns = read(path.parent).Scalars("training/return")
+    assert [event.step for event in returns] == [10, 30]

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weights & Biases, offline: its files are read back."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import wandb
+from finished_files import Finished, episode, record
+from wandb_files import axes, history
+
+from mjrec.trackers import WandbTracker
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Nothing of a user's account or console is touched, and no run is left."""
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.setenv("WANDB_CONSOLE", "off")
+    yield
+    if wandb.run is not None:
+        wandb.run.finish()
+    wandb.teardown()
+
+
+@pytest.fixture
+def finished(tmp_path: Path, make_corridor: Any, play: Callable[..., None]) -> Finished:
+    return record(tmp_path / "recordings", make_corridor(10), play)
+
+
+def offline(directory: Path) -> dict[str, Any]:
+    """Return the arguments of an offline run in `directory`."""
+    return {"project": "p", "mode": "offline", "dir": str(directory)}
+
+
+def log_of(directory: Path) -> Path:
+    # A run that is finished may still be on its way to the disk.
+    wandb.teardown()
+    [path] = directory.glob("wandb/offline-run-*/*.wandb")
+    return path
+
+
+def logged(directory: Path, key: str) -> list[Any]:
+    return [row[key] for row in history(log_of(directory)) if key in row]
+
+
+def test_scalars_have_the_steps_of_the_run_as_their_axis(
+    finished: Finished, tmp_path: Path
+) -> None:
+    """Success only where it is known, evaluation and sub-environments apart."""
+    tracker, run = WandbTracker(**offline(tmp_path)), finished.run
+    second = dataclasses.replace(run, infix="1.4711", env_index=3)
+    for one in (run, second):
+        tracker.begin(one)
+    tracker.episode(run, episode(0, success=True))
+    tracker.episode(run, episode(1))
+    tracker.episode(run, episode(2, type="e"))
+    tracker.episode(second, episode(3))
+    for one in (run, second):
+        tracker.end(one)
+    assert logged(tmp_path, "training/return") == [0.0, 1.5]
+    assert logged(tmp_path, "training/length") == [10, 10]
+    assert logged(tmp_path, "training/success") == [1]
+    assert logged(tmp_path, "training/total_steps")[:2] == [10, 20]
+    assert logged(tmp_path, "evaluation/return") == [3.0]
+    assert logged(tmp_path, "training/env3/return") == [4.5]
+    over = axes(log_of(tmp_path))
+    assert over["training/*"] == "training/total_steps"
+    assert over["training/env3/*"] == "training/env3/total_steps"
+
+
+def test_video_is_the_file_itself_and_may_come_late(
+    finished: Finished, tmp_path: Path
+) -> None:
+    """Byte for byte, at its own episode's step, after later episodes."""
+    tracker, run = WandbTracker(**offline(tmp_path)), finished.run
+    tracker.begin(run)
+    for number in range(3):
+        tracker.episode(run, episode(number))
+    tracker.video(run, finished.video)
+    tracker.episode(run, episode(3))
+    tracker.end(run)
+    assert logged(tmp_path, "training/return") == [0.0, 1.5, 3.0, 4.5]
+    [video] = logged(tmp_path, "training/video")
+    assert video["_type"] == "video-file"
+    assert video["caption"] == "episode 0"
+    files = log_of(tmp_path).parent / "files"
+    copied = files / video["path"]
+    assert copied.read_bytes() == finished.video.path.read_bytes()
+    assert axes(log_of(tmp_path))["training/video"] == "training/video_total_steps"
+    [row] = [row for row in history(log_of(tmp_path)) if "training/video" in row]
+    assert row["training/video_total_steps"] == 10
+
+
+def test_own_run_ends_with_the_last_monitor(finished: Finished, tmp_path: Path) -> None:
+    """Not with the first of two."""
+    tracker, run = WandbTracker(**offline(tmp_path)), finished.run
+    second = dataclasses.replace(run, infix="1.4711")
+    tracker.begin(run)
+    tracker.begin(second)
+    tracker.end(run)
+    tracker.episode(second, episode(1))
+    assert wandb.run is None or not wandb.run._is_finished
+    tracker.end(second)
+    assert wandb.run is None
+    assert logged(tmp_path, "training/return") == [1.5]
+
+
+def test_given_run_stays_open(finished: Finished, tmp_path: Path) -> None:
+    """Its owner goes on logging."""
+    given = wandb.init(**offline(tmp_path))
+    tracker = WandbTracker(given)
+    tracker.begin(finished.run)
+    tracker.episode(finished.run, episode(1))
+    tracker.end(finished.run)
+    given.log({"loss": 0.5})
+    given.finish()
+    assert logged(tmp_path, "training/return") == [1.5]
+    assert logged(tmp_path, "loss") == [0.5]
+
+
+def test_active_run_is_used_and_stays_open(finished: Finished, tmp_path: Path) -> None:
+    """Where a tracker is told nothing."""
+    active = wandb.init(**offline(tmp_path))
+    tracker = WandbTracker()
+    tracker.begin(finished.run)
+    tracker.episode(finished.run, episode(1))
+    tracker.end(finished.run)
+    active.log({"loss": 0.5})
+    active.finish()
+    assert logged(tmp_path, "training/return") == [1.5]
+    assert logged(tmp_path, "loss") == [0.5]
+
+
+def test_asked_for_a_run_it_makes_one_beside_the_active(
+    finished: Finished, tmp_path: Path
+) -> None:
+    """And finishes only its own."""
+    for name in ("theirs", "ours"):
+        (tmp_path / name).mkdir()
+    active = wandb.init(**offline(tmp_path / "theirs"))
+    tracker = WandbTracker(**offline(tmp_path / "ours"))
+    tracker.begin(finished.run)
+    tracker.episode(finished.run, episode(1))
+    tracker.end(finished.run)
+    active.log({"loss": 0.5})
+    active.finish()
+    assert logged(tmp_path / "ours", "training/return") == [1.5]
+    assert logged(tmp_path / "theirs", "training/return") == []
+    assert logged(tmp_path / "theirs", "loss") == [0.5]

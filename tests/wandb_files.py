@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an offline run of Weights & Biases has written.
+
+Its packages have no reader for it since 0.31. The format is LevelDB's log behind a
+header of seven bytes: blocks of 32 KiB, in which a record is one whole piece (1), or a
+first (2), middle ones (3) and a last one (4), each with its check sum and length.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from wandb.proto import wandb_internal_pb2
+
+_HEADER = struct.Struct("<4sHB")
+_PIECE = struct.Struct("<IHB")
+_BLOCK = 1 << 15
+_WHOLE, _FIRST, _LAST = 1, 2, 4
+
+
+def records(path: Path) -> Iterator[Any]:
+    """Yield the records of a `.wandb` file."""
+    for data in _pieces(path.read_bytes()):
+        record = wandb_internal_pb2.Record()
+        record.ParseFromString(data)
+        yield record
+
+
+def history(path: Path) -> list[dict[str, Any]]:
+    """Return what was logged, without W&B's own."""
+    return [
+        _row(record.history.item)
+        for record in records(path)
+        if record.WhichOneof("record_type") == "history"
+    ]
+
+
+def axes(path: Path) -> dict[str, str]:
+    """Return what each metric, or each pattern of metrics, is drawn over."""
+    metrics = [r.metric for r in records(path) if r.HasField("metric")]
+    return {m.name or m.glob_name: m.step_metric for m in metrics if m.step_metric}
+
+
+def _row(items: Iterable[Any]) -> dict[str, Any]:
+    row: dict[str, Any] = {}
+    for item in items:
+        # A video is several items, such as its path.
+        *outer, last = list(item.nested_key) or [item.key]
+        inner = row
+        for key in outer:
+            inner = inner.setdefault(key, {})
+        inner[last] = json.loads(item.value_json)
+    return {key: value for key, value in row.items() if not key.startswith("_")}
+
+
+def _pieces(data: bytes) -> Iterator[bytes]:
+    magic, _, _ = _HEADER.unpack_from(data)
+    assert magic == b":W&B"
+    begun = b""
+    place = _HEADER.size
+    while place < len(data):
+        if _BLOCK - place % _BLOCK < _PIECE.size:
+            place += _BLOCK - place % _BLOCK
+            continue
+        _, length, kind = _PIECE.unpack_from(data, place)
+        place += _PIECE.size
+        begun = (
+            data[place : place + length]
+            if kind in (_WHOLE, _FIRST)
+            else (begun + data[place : place + length])
+        )
+        place += length
+        if kind in (_WHOLE, _LAST):
+            yield begun
