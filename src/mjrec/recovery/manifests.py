@@ -34,6 +34,7 @@ from ..results.sources import MonitorResults
 from .known_episodes import KnownEpisodes
 from .remains import Remains, look_through
 from .report import RecoveredFile
+from .selections import choice_of
 
 __all__ = ["write_results"]
 
@@ -192,13 +193,15 @@ def _manifest(
         for episode_id in sorted(files.trajectories)
         if _is_pending(remains, known, episode_id)
     ]
+    choice = choice_of(remains, known, old_details)
     return Manifest(
         stats=stats_name,
         videos=tuple(finished),
         env_info=_env_info(remains, known),
         mjrec={
             "format_version": _FORMAT_VERSION,
-            "schedule": _schedule(remains, known, old_details),
+            "schedule": _schedule(remains, known, old_details, choice),
+            **({} if choice is None else {"keep": choice}),
             "first_episode_id": old_details.get("first_episode_id", first),
             "next_episode_id": known.last_episode_id + 1,
             "pending": pending,
@@ -256,7 +259,10 @@ def _is_pending(remains: Remains, known: KnownEpisodes, episode_id: int) -> bool
 
 
 def _schedule(
-    remains: Remains, known: KnownEpisodes, old_details: Mapping[str, Any]
+    remains: Remains,
+    known: KnownEpisodes,
+    old_details: Mapping[str, Any],
+    choice: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """Return what can still be told of the schedule: its name only by a manifest."""
     files = remains.files
@@ -275,7 +281,8 @@ def _schedule(
                     recorded.add(episode_id)
             except UnreadableFile:
                 continue
-    return {"name": old.get("name"), "recorded": sorted(recorded)}
+    rule = None if choice is None else f"keep:{choice['rule']}"
+    return {"name": old.get("name") or rule, "recorded": sorted(recorded)}
 
 
 def _env_info(remains: Remains, known: KnownEpisodes) -> Mapping[str, Any]:
