@@ -9,9 +9,11 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parent.parent
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
@@ -149,3 +151,49 @@ def test_example_runs(example: Path, tmp_path: Path) -> None:
     run(sys.executable, copied, cwd=tmp_path)
     assert list((tmp_path / "recordings").iterdir())
     assert example.name in (ROOT / "examples" / "README.md").read_text()
+
+
+def test_command_line_example_runs(tmp_path: Path) -> None:
+    """It keeps as many videos as it says, and lists its episodes."""
+    script = ROOT / "examples" / "command_line" / "evaluate.sh"
+    out = run_shell(str(script), str(tmp_path / "out"), cwd=tmp_path)
+    assert len(list((tmp_path / "out").glob("*.mp4"))) == 2
+    assert out.count("truncated") == 6
+    assert "command_line/" in (ROOT / "examples" / "README.md").read_text()
+
+
+@pytest.mark.dm_control
+def test_workflow_records_and_uploads(tmp_path: Path) -> None:
+    """Its own commands leave what it uploads; the rest is what setup installs too."""
+    workflow = yaml.safe_load((ROOT / "examples" / "ci" / "record.yml").read_text())
+    [job] = workflow["jobs"].values()
+    commands = [step["run"] for step in job["steps"] if "run" in step]
+    for command in [text for text in commands if text.startswith("mjrec")]:
+        run_shell("sh", "-ec", command, cwd=tmp_path)
+    [upload] = [s for s in job["steps"] if "upload-artifact" in s.get("uses", "")]
+    uploaded = tmp_path / upload["with"]["path"]
+    assert len(list(uploaded.rglob("*.mp4"))) == 1
+    # What it installs is what the project has.
+    setup = (ROOT / "scripts" / "setup").read_text()
+    [packages] = [text.split() for text in commands if "apt-get" in text]
+    assert all(name in setup for name in packages if name.startswith("lib"))
+    [extras] = [text for text in commands if text.startswith("pip")]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for extra in re.findall(r"mjrec\[([^]]+)\]", extras)[0].split(","):
+        assert extra in project["optional-dependencies"]
+
+
+def run_shell(*command: str, cwd: Path) -> str:
+    """Run a command that finds `mjrec` where this Python has it."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        command,
+        cwd=cwd,
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=280,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
