@@ -150,7 +150,7 @@ class TiledVideo:
             self._pictures,
             base_path=base,
             metadata={
-                **self._first._recorder._live_video_facts(),
+                **self._first._recorder.live_video_facts(),
                 "tiled": True,
                 "sub_environments": self._pictures.count,
             },

@@ -559,7 +559,7 @@ class Recorder:
         return VideoRecorder(
             pictures,
             base_path=base_path,
-            metadata=self._live_video_facts(),
+            metadata=self.live_video_facts(),
             enabled=enabled,
             fps=self._options.fps,
             max_fps=self._options.max_fps,
@@ -654,8 +654,6 @@ class Recorder:
         prefix = self._options.name_prefix
         if prefix is None:
             return {}
-        if self._subject.env_index is not None:
-            prefix = f"{prefix}-env-{self._subject.env_index}"
         return {"also_named": f"{prefix}-{what}-{number}.mp4"}
 
     def _video_path(self, episode_id: int) -> Path:
@@ -978,7 +976,7 @@ class Recorder:
             elif recorder.closed:
                 self._videos.add_live(recorder)
 
-    def _live_video_facts(self) -> dict[str, Any]:
+    def live_video_facts(self) -> dict[str, Any]:
         """Return what is known of a live video from its episode's beginning."""
         reason = self._choice.reason
         return {
