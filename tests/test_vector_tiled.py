@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+from recordings import frames_of
+
+import mjrec
+from mjrec import InvalidArgument, NoPictures
+from mjrec.frame_grid import grid_frame
+from vector_environments import (
+    DISABLED,
+    NEXT_STEP,
+    SAME_STEP,
+    VectorCorridor,
+    hashes_at,
+    metadata_at,
+    path_of,
+    play,
+)
+
+LENGTHS = (2, 3, 2)
+
+
+@pytest.fixture
+def corridors(make_corridor: Any) -> Any:
+    """Make three corridors in this process, or one object that has three."""
+
+    def make(mode: Any, *, inside: bool) -> Any:
+        if not inside:
+            return VectorCorridor(LENGTHS, mode)
+        each = [lambda n=n: make_corridor(n, size=(32, 64)) for n in LENGTHS]
+        return SyncVectorEnv(each, autoreset_mode=mode)
+
+    return make
+
+
+def tiles_at(path: Path, *, step: int) -> list[list[int]]:
+    """Return the position that each tile of a 2x2 grid of 32x64 pictures shows."""
+    shown = []
+    for frame in frames_of(path):
+        assert frame.shape == (64, 128, 3)
+        tiles = [frame[y, x : x + 64, 0] for y in (16, 48) for x in (0, 64)]
+        shown.append([round(int((row > 128).sum()) / step) - 1 for row in tiles])
+    return shown
+
+
+@pytest.mark.parametrize("inside", [True, False])
+@pytest.mark.parametrize("mode", [NEXT_STEP, DISABLED])
+def test_one_video_shows_all(
+    corridors: Any, tmp_path: Path, mode: Any, inside: bool
+) -> None:
+    """It follows the first's episodes, and is listed in its manifest."""
+    with mjrec.Monitor(corridors(mode, inside=inside), tmp_path, tiled=True) as env:
+        play(env, 8)
+    path = path_of(env.monitors[0], 0, "tiled.mp4")
+    shown = tiles_at(path, step=4 if inside else 16)
+    # The last of the four is the padding.
+    assert shown == [[0, 0, 0, -1], [1, 1, 1, -1], [2, 2, 2, -1]]
+    second = tiles_at(
+        path_of(env.monitors[0], 1, "tiled.mp4"), step=4 if inside else 16
+    )
+    assert [tiles[0] for tiles in second] == [0, 1, 2]
+    said = metadata_at(path.with_suffix(".meta.json"))
+    assert (said["tiled"], said["rows"], said["columns"]) == (True, 2, 2)
+    assert (said["complete"], said["length"], said["reward"]) == (True, 2, 1.0)
+    assert len(hashes_at(path.with_suffix(".framehash"))) == 3
+    infix = env.monitors[0].infix
+    manifest = metadata_at(tmp_path / f"openaigym.manifest.{infix}.manifest.json")
+    names = [Path(video).name for video, _ in manifest["videos"]]
+    assert path.name in names
+    assert path_of(env.monitors[0], 0, "mp4").name in names
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_the_frame_that_a_reset_hides_is_said_to_be_missing(
+    corridors: Any, tmp_path: Path, inside: bool
+) -> None:
+    """In SAME_STEP the first tile shows the reset at last."""
+    with mjrec.Monitor(
+        corridors(SAME_STEP, inside=inside), tmp_path, tiled=True
+    ) as env:
+        play(env, 4)
+    for episode in (0, 1):
+        path = path_of(env.monitors[0], episode, "tiled.mp4")
+        shown = tiles_at(path, step=4 if inside else 16)
+        assert [tiles[0] for tiles in shown] == [0, 1, 0]
+        said = metadata_at(path.with_suffix(".meta.json"))
+        assert said["final_frame"] == "missing"
+        assert (said["complete"], said["length"]) == (True, 2)
+
+
+def test_it_follows_the_schedule(corridors: Any, tmp_path: Path) -> None:
+    """Of the first sub-environment only."""
+    with mjrec.Monitor(
+        corridors(DISABLED, inside=True), tmp_path, lambda n: n == 1, tiled=True
+    ) as env:
+        play(env, 7)
+    names = sorted(path.name for path in tmp_path.glob("*.tiled.mp4"))
+    assert names == [path_of(env.monitors[0], 1, "tiled.mp4").name]
+
+
+def test_a_reset_of_others_adds_no_frame(tmp_path: Path) -> None:
+    """Frames belong to the steps of the first."""
+    vector = VectorCorridor((3, 2), DISABLED)
+    with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
+        env.reset()
+        for _ in range(2):
+            env.step(np.array([0, 0]))
+        env.reset(options={"reset_mask": np.array([False, True])})
+        env.step(np.array([0, 0]))
+    frames = frames_of(path_of(env.monitors[0], 0, "tiled.mp4"))
+    assert len(frames) == 4
+
+
+def test_a_second_reset_replaces_the_picture(corridors: Any, tmp_path: Path) -> None:
+    """A reset before any step leaves no video of its own."""
+    with mjrec.Monitor(corridors(NEXT_STEP, inside=True), tmp_path, tiled=True) as env:
+        env.reset()
+        play(env, 2)
+    assert len(frames_of(path_of(env.monitors[0], 0, "tiled.mp4"))) == 3
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("how", ["reset", "close", "error"])
+def test_a_video_that_is_cut_off_says_so(
+    corridors: Any, tmp_path: Path, how: str
+) -> None:
+    """Its metadata has the reason."""
+    vector = corridors(NEXT_STEP, inside=False)
+    with (
+        contextlib.suppress(RuntimeError),
+        mjrec.Monitor(vector, tmp_path, tiled=True) as env,
+    ):
+        env.reset()
+        env.step(np.array([0, 0, 0]))
+        if how == "reset":
+            env.reset()
+        if how == "error":
+            raise RuntimeError("enough")
+    said = metadata_at(path_of(env.monitors[0], 0, "tiled.meta.json"))
+    assert said["complete"] is False
+    assert said["reason"] == {"error": "exception"}.get(how, how)
+    assert (said["length"], said["frame_count"]) == (1, 2)
+
+
+def test_the_last_picture_is_taken_at_a_lower_rate(
+    corridors: Any, tmp_path: Path
+) -> None:
+    """With `max_fps` the terminal picture is there too."""
+    vector = VectorCorridor((5, 5), NEXT_STEP)
+    with mjrec.Monitor(vector, tmp_path, tiled=True, max_fps=5) as env:
+        play(env, 5)
+    said = metadata_at(path_of(env.monitors[0], 0, "tiled.meta.json"))
+    assert said["frame_count"] == 4
+
+
+def test_pixels_are_those_of_each_environment(tmp_path: Path) -> None:
+    """Each tile is what its own environment's `render()` gives."""
+    view = {"render_mode": "rgb_array", "width": 64, "height": 64}
+    several = [gymnasium.make("Hopper-v5", **view) for _ in range(2)]
+    vector = SyncVectorEnv([lambda e=e: e for e in several])
+    expected = []
+    with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
+        env.reset(seed=4)
+        for _ in range(2):
+            env.step(env.action_space.sample())
+            drawn = grid_frame([each.render() for each in several])
+            expected.append(hashlib.sha256(drawn.tobytes()).hexdigest())
+    path = path_of(env.monitors[0], 0, "tiled.framehash")
+    assert hashes_at(path)[1:] == expected
+
+
+# --- what cannot be ---------------------------------------------------------------
+
+
+def test_it_needs_pictures_of_all(tmp_path: Path) -> None:
+    """Deferred rendering needs none, and a tiled video does."""
+    vector = gymnasium.make_vec("Hopper-v5", 2, "sync")
+    originals = list(vector.envs)
+    with pytest.raises(NoPictures, match='render_mode="rgb_array"'):
+        mjrec.Monitor(vector, tmp_path / "run", tiled=True)
+    assert vector.envs == originals
+    assert not list(tmp_path.iterdir())
+    vector.close()
+
+
+def test_pictures_must_be_of_one_size(tmp_path: Path) -> None:
+    """Said at the first reset, with the way out."""
+    vector = VectorCorridor(heights=(32, 48))
+    with (
+        mjrec.Monitor(vector, tmp_path, tiled=True) as env,
+        pytest.raises(InvalidArgument, match="64x32, 64x48"),
+    ):
+        env.reset()
+
+
+def test_a_bad_picture_can_be_tolerated(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With `on_error="warn"` everything else is recorded."""
+    vector = VectorCorridor(heights=(32, 48))
+    with mjrec.Monitor(vector, tmp_path, tiled=True, on_error="warn") as env:
+        play(env, 3)
+    assert "64x32, 64x48" in caplog.text
+    assert not list(tmp_path.glob("*.tiled.mp4"))
+    assert path_of(env.monitors[1], 0, "mp4").exists()
+
+
+@pytest.mark.parametrize(
+    "choice", [{"keep": "best:1"}, {"step_trigger": lambda n: n == 0}]
+)
+def test_it_follows_whole_episodes(tmp_path: Path, choice: dict[str, Any]) -> None:
+    """What is chosen afterwards, or by steps, it cannot follow."""
+    with pytest.raises(InvalidArgument, match="video_callable"):
+        mjrec.Monitor(VectorCorridor(), tmp_path / "run", tiled=True, **choice)
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_videos_there_is_none(tmp_path: Path) -> None:
+    """Nothing is drawn."""
+    vector = VectorCorridor(render_mode=None)
+    with mjrec.Monitor(vector, tmp_path, False, tiled=True) as env:
+        play(env, 3)
+    assert not list(tmp_path.glob("*.mp4"))
