@@ -172,6 +172,21 @@ def test_fps_and_schedule(mjrec: Any, tmp_path: Path) -> None:
     assert metadata_of(tmp_path, 1)["fps"] == "25/2"
 
 
+def test_keep_names_only_what_was_chosen(mjrec: Any, tmp_path: Path) -> None:
+    """The videos that are there in the end, in the summary and as JSON."""
+    run = (*CHEETAH, "--seed", 0, "--episodes", 3, "--workers", 0, "--keep", "worst:1")
+    _, out, _ = mjrec(*run, "--out", tmp_path / "a")
+    rewards = results_of(tmp_path / "a")["episode_rewards"]
+    worst = rewards.index(min(rewards))
+    assert "1 video:" in out
+    assert [name in out for name in map("video00000{}.mp4".format, range(3))] == [
+        number == worst for number in range(3)
+    ]
+    _, out, _ = mjrec(*run, "--out", tmp_path / "b", "--json")
+    pending = [episode["pending"] for episode in json.loads(out)["episodes"]]
+    assert pending == [number == worst for number in range(3)]
+
+
 @pytest.mark.parametrize("policy", ["zero", "calm_policy:calm", "calm_policy:Built"])
 def test_policies(
     mjrec: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str
@@ -216,6 +231,12 @@ def test_seed_that_was_drawn_is_said(mjrec: Any, tmp_path: Path) -> None:
         (["Nope-v1"], ["Nope-v1", "Hopper-v5"]),
         (["HalfCheetah-v5", "--camera", "side"], ["side", "track"]),
         (["HalfCheetah-v5", "--schedule", "some"], ["some", "every:N"]),
+        (["HalfCheetah-v5", "--keep", "some"], ["some", "worst:N"]),
+        (["HalfCheetah-v5", "--keep", "best:1", "--render", "off"], ["keep", "off"]),
+        (
+            ["HalfCheetah-v5", "--keep", "best:1", "--schedule", "cubic"],
+            ["--keep best:1", "--schedule cubic"],
+        ),
         (["HalfCheetah-v5", "--policy", "greedy"], ["greedy", "random"]),
         (["HalfCheetah-v5", "--policy", "no_such:x"], ["no_such"]),
         (["HalfCheetah-v5", "--size", "0x48"], ["width", "0"]),

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,8 @@ from .environments.policies import (
     working_directory_importable,
 )
 from .errors import GLError, InvalidArgument
+from .formats.manifest import read_manifest
+from .formats.monitor_directory import Infix, infix_of, manifest_name
 from .gl import use_gl
 from .monitors import Monitor
 from .recorder.options import LIVE, OFF, RecorderOptions
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
     from .monitors.dm_env_monitor import DmEnvMonitor
     from .monitors.gymnasium_monitor import GymnasiumMonitor
 
-__all__ = ["Session", "SessionEpisode", "record_session"]
+__all__ = ["Session", "SessionEpisode", "record_session", "with_chosen_videos"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +53,9 @@ class Session:
             and 1000 where it has none.
         policy: `random`, `zero` or `module:name`.
         schedule: which episodes get a video: `cubic`, `all`, `none`, `every:N` or
-            `at:0,5,9`.
+            `at:0,5,9`; None is `cubic`, unless there is `keep`.
+        keep: which episodes get a video, decided when they have ended: `best:N`,
+            `worst:N`, `failures`, `failures:N` or `median`, see `mjrec.Monitor`.
         force: delete the recordings that are in the directory.
         resume: add to the recordings that are in the directory.
         camera: a name or number; None is the model's tracking camera where there is
@@ -74,7 +78,8 @@ class Session:
     episodes: int = 1
     max_steps: int | None = None
     policy: str = "random"
-    schedule: str = "cubic"
+    schedule: str | None = None
+    keep: str | None = None
     force: bool = False
     resume: bool = False
     camera: str | int | None = None
@@ -97,7 +102,8 @@ class SessionEpisode:
         length: number of steps.
         reward: sum of the rewards.
         video: its video, where the schedule chose it: where it is, or will be when
-            it has been rendered.
+            it has been rendered. With `keep` also where it may still be chosen, or
+            not: `with_chosen_videos` tells in the end.
     """
 
     episode_id: int
@@ -124,7 +130,9 @@ def record_session(
             they are is checked before anything is written.
     """
     _check(session)
-    schedule = schedule_from_text(session.schedule)
+    schedule = None
+    if session.keep is None:
+        schedule = schedule_from_text(session.schedule or "cubic")
     with contextlib.ExitStack() as stack:
         drawn = schedule is not disable_videos and session.render != OFF
         named = _environment(session, pictures=drawn)
@@ -137,6 +145,7 @@ def record_session(
             schedule,
             force=session.force,
             resume=session.resume,
+            keep=session.keep,
             fps=session.fps,
             max_fps=session.max_fps,
             render=session.render,
@@ -156,6 +165,27 @@ def record_session(
             yield _recorded(monitor)
 
 
+def with_chosen_videos(episodes: Sequence[SessionEpisode]) -> list[SessionEpisode]:
+    """Return the episodes of a session with `keep`, which has ended.
+
+    They are as before, without the videos that were not chosen.
+
+    Raises:
+        UnreadableFile: the manifest, which tells that, is missing or damaged.
+    """
+    video = next((each.video for each in episodes if each.video), None)
+    if video is None:
+        return list(episodes)
+    infix = Infix.parse(infix_of(video.name) or "")
+    assert infix is not None
+    manifest = read_manifest(video.with_name(manifest_name(infix)))
+    chosen = (manifest.mjrec or {})["schedule"]["recorded"]
+    return [
+        each if each.episode_id in chosen else replace(each, video=None)
+        for each in episodes
+    ]
+
+
 def _check(session: Session) -> None:
     """Check what can be checked before anything is imported or made."""
     if session.episodes < 1:
@@ -168,7 +198,14 @@ def _check(session: Session) -> None:
         render=session.render,
         workers=session.workers,
         quality=session.quality,
+        keep=session.keep,
     )
+    if session.keep is not None and session.schedule is not None:
+        raise InvalidArgument(
+            f"Either keep (--keep {session.keep}) chooses the episodes that get a "
+            f"video, or a schedule does (--schedule {session.schedule}): leave one of "
+            "them out."
+        )
     parse_environment_name(session.environment)
     episode_seeds(session.seed, 0)
 

@@ -15,7 +15,12 @@ import tyro
 
 from .. import json_text
 from ..errors import InvalidArgument
-from ..sessions import Session, SessionEpisode, record_session
+from ..sessions import (
+    Session,
+    SessionEpisode,
+    record_session,
+    with_chosen_videos,
+)
 from .help_text import flowing_help
 from .progress import EpisodeProgress
 from .view_options import camera_of, size_of
@@ -35,7 +40,8 @@ def record(
     max_steps: int | None = None,
     policy: str = "random",
     seed: int | None = None,
-    schedule: str = "cubic",
+    schedule: str | None = None,
+    keep: str | None = None,
     force: bool = False,
     resume: bool = False,
     camera: str | None = None,
@@ -63,7 +69,10 @@ def record(
         seed: S; episode i starts from NumPy's SeedSequence([S, i]). A fresh one, which
             is printed, if it is not given.
         schedule: which episodes get a video: cubic (0, 1, 8, 27 ... and every 1000th),
-            all, none, every:N or at:0,5,9.
+            all, none, every:N or at:0,5,9. If neither it nor keep is given, cubic.
+        keep: which episodes get a video, decided when they have ended: best:N or
+            worst:N (by return), failures or failures:N (the first N), or median.
+            Every episode is recorded, and what is not chosen is deleted.
         force: delete the recordings that are in the directory.
         resume: add to the recordings that are in the directory.
         camera: name or number; the model's tracking camera, where there is one, if it
@@ -94,6 +103,7 @@ def record(
         policy=policy,
         seed=seed,
         schedule=schedule,
+        keep=keep,
         force=force,
         resume=resume,
         camera=camera_of(camera),
@@ -108,6 +118,8 @@ def record(
     )
     console = rich.console.Console(quiet=as_json)
     recorded, interrupted = _run(session, console)
+    if keep is not None:
+        recorded = with_chosen_videos(recorded)
     if as_json:
         _print_json(session, recorded, interrupted=interrupted)
     else:
