@@ -16,11 +16,13 @@ from typing import Any
 
 import gymnasium
 import pytest
+from full_disk import file_size_limit
 from recordings import frames_in, journal_of, manifest_of, metadata_of, videos_in
 
 import mjrec
 from conftest import Corridor
 from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.recorder.tracking import FinishedVideo, Tracker
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.pending import recorded_episodes
 
@@ -324,6 +326,43 @@ def test_live_episodes_that_were_not_completed_leave_nothing(tmp_path: Path) -> 
     assert not list(tmp_path.glob(".*"))
 
 
+class Listener(Tracker):
+    """Notes which videos it is told of, and of which episodes."""
+
+    def __init__(self) -> None:
+        self.videos: list[int] = []
+        self.lengths: list[int] = []
+
+    def video(self, run: Any, video: FinishedVideo) -> None:
+        assert video.path.exists()
+        assert video.episode is not None
+        self.videos.append(video.episode_id)
+        self.lengths.append(video.episode.length)
+
+
+@pytest.mark.parametrize("kind", ["live", "deferred"])
+def test_trackers_are_told_of_the_chosen_only(tmp_path: Path, kind: str) -> None:
+    """Which is when they are chosen."""
+    listener = Listener()
+    env = Walk() if kind == "live" else pendulum()
+    with mjrec.Monitor(
+        env, tmp_path, keep="worst:2", workers=1, trackers=listener
+    ) as env:
+        run(env, 8)
+        assert listener.videos == []
+    assert sorted(listener.videos) == [1, 3]
+    assert sorted(listener.lengths) == [1, 2]
+
+
+def test_second_names_are_given_to_the_chosen_only(tmp_path: Path) -> None:
+    """They are links, which would keep what was deleted."""
+    with mjrec.Monitor(Walk(), tmp_path, keep="worst:2", name_prefix="w") as env:
+        run(env, 8)
+        assert not list(tmp_path.glob("w-*"))
+    names = sorted(path.name for path in tmp_path.glob("w-*.mp4"))
+    assert names == ["w-episode-1.mp4", "w-episode-3.mp4"]
+
+
 # --- ends ----------------------------------------------------------------------------
 
 
@@ -412,6 +451,32 @@ def test_interrupted_choice_is_taken_up_again(tmp_path: Path) -> None:
     assert calls == [3, 3]
     assert videos_in(tmp_path) == [0]
     assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("on_error", ["warn", "raise"])
+def test_full_disk_at_the_end_loses_no_chosen_video(
+    tmp_path: Path, on_error: str
+) -> None:
+    """What cannot be said of it in its log is not said; it is pending all the same."""
+    env = mjrec.Monitor(
+        pendulum(), tmp_path, keep="worst:2", workers=0, on_error=on_error
+    )
+    run(env, 8)
+    size = max(path.stat().st_size for path in tmp_path.glob("*.log"))
+    # Enough for all but what is added to the longer log.
+    with file_size_limit(size + 20):
+        if on_error == "raise":
+            with pytest.raises(mjrec.FileNotWritten):
+                env._recorder.finish()
+        else:
+            env._recorder.finish()
+    env.close()
+    details = manifest_of(tmp_path)["mjrec"]
+    assert [entry["episode_id"] for entry in details["pending"]] == [1, 3]
+    assert details["schedule"]["recorded"] == [1, 3]
+    assert not list(tmp_path.glob("*episode00000[024567]*"))
+    render(tmp_path)
+    assert videos_in(tmp_path) == [1, 3]
 
 
 PROGRAM = """

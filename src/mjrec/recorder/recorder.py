@@ -816,7 +816,8 @@ class Recorder:
             return
         assert self._finished is not None
         video = self.video_recorder
-        has_video = video is not None and video.enabled
+        is_out = self._standing(is_complete=True) is Standing.DROPPED
+        has_video = video is not None and video.enabled and not is_out
         self._trackers.episode(self._finished, has_video=has_video)
         self._tell_of_videos()
 
