@@ -281,14 +281,6 @@ def test_not_an_environment_is_an_error(tmp_path: Path) -> None:
         mjrec.Monitor({}, tmp_path)
 
 
-def test_vector_environment_is_an_error(make_corridor: Any, tmp_path: Path) -> None:
-    """The error says where the monitor goes instead."""
-    vector = gymnasium.vector.SyncVectorEnv([make_corridor])
-    with pytest.raises(InvalidArgument, match="SyncVectorEnv"):
-        mjrec.Monitor(vector, tmp_path)
-    vector.close()
-
-
 def test_modes_give_the_types(corridor: Any, tmp_path: Path, play: Any) -> None:
     """set_monitor_mode takes effect at the next reset, and types stay aligned."""
     with mjrec.Monitor(corridor, tmp_path, mode="evaluation") as env:
