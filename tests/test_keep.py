@@ -22,6 +22,7 @@ from recordings import frames_in, journal_of, manifest_of, metadata_of, videos_i
 import mjrec
 from conftest import Corridor
 from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.recorder import kept_videos
 from mjrec.recorder.tracking import FinishedVideo, Tracker
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.pending import recorded_episodes
@@ -432,6 +433,37 @@ def test_live_videos_stay_where_a_function_cannot_choose(tmp_path: Path) -> None
     assert walk.closed
     assert videos_in(tmp_path) == [0, 1, 2]
     assert len(manifest_of(tmp_path)["videos"]) == 3
+
+
+def test_who_does_not_wait_for_a_function_that_cannot_choose(tmp_path: Path) -> None:
+    """Is told the same, and nothing is lost either."""
+    env = mjrec.Monitor(pendulum(), tmp_path, keep=confused, workers=1)
+    run(env, 3)
+    with pytest.raises(mjrec.InvalidArgument, match="confused"):
+        env.close(wait=False)
+    pending = manifest_of(tmp_path)["mjrec"]["pending"]
+    assert [entry["episode_id"] for entry in pending] == [0, 1, 2]
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_interrupted_deletion_is_taken_up_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C before what has fallen out is gone: it goes when the monitor closes."""
+    env = mjrec.Monitor(pendulum(), tmp_path, keep="worst:1", workers=0)
+    run(env, 1)
+
+    def interrupted(paths: Any) -> None:
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(kept_videos, "_remove", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(env, 1)
+    assert logs_of(tmp_path) == [0, 1]
+    env.close()
+    assert h5_of(tmp_path) == [1]
+    assert logs_of(tmp_path) == []
 
 
 def test_interrupted_choice_is_taken_up_again(tmp_path: Path) -> None:

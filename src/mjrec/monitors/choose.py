@@ -136,9 +136,15 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             `video_callable`: "best:3" or "worst:3" (by return), "failures" or
             "failures:20" (the first 20), "median", or a function from the finished
             episodes (`mjrec.trackers.FinishedEpisode`) to the numbers of those to
-            keep. Every episode is recorded, and what is not chosen is deleted, at once
-            where the rule allows; with "median" and a function all states stay on
-            disk until `close`. The manifest and the metadata name the rule.
+            keep. A failure is what `info["is_success"]` or `info["success"]` of the
+            last step denies; where there is neither, what was terminated. Every
+            episode is recorded, and what is not chosen is deleted, at once where the
+            rule allows; with "median" and a function all states stay on disk until
+            `close`. Episodes that are not completed are never chosen. Trajectories
+            that are kept in any case (type evaluation, `trajectory_callable`) stay
+            without their video. Manifest and metadata name the rule, and whether it
+            was applied: of a killed run the candidates are pending. Where the function
+            raises, or names no finished episodes, `close` says so and keeps all.
         step_trigger: which steps begin a video, instead of `video_callable`: a
             function from the number of steps taken so far to a bool, asked before
             each step. The first picture is that before the step.
