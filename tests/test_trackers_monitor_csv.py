@@ -44,7 +44,7 @@ def test_header_and_rows(run: Run) -> None:
     tracker.episode(run, episode(reward=math.nan))
     tracker.episode(run, episode(reward=-math.inf, end_time=before + 100))
     tracker.end(run)
-    path = run.directory / "openaigym.episodes.0.4711.monitor.csv"
+    path = run.directory / "openaigym.results.0.4711.monitor.csv"
     header, columns, *rows = path.read_text().splitlines()
     start = json.loads(header.removeprefix("#"))
     assert start["env_id"] == "Hopper-v5"

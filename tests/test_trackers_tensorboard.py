@@ -18,6 +18,7 @@ from full_disk import file_size_limit
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import mjrec
 from mjrec.errors import (
     DirectoryNotWritable,
     EncoderError,
@@ -101,6 +102,25 @@ def test_video_is_played_as_a_gif_of_the_file(finished: Finished) -> None:
     [text] = events.Tensors("training/video_file")
     assert finished.video.path.name.encode() in text.tensor_proto.string_val[0]
     assert text.step == 10
+
+
+def test_monitor_tells_it_everything(
+    tmp_path: Path, make_corridor: Any, play: Callable[..., None]
+) -> None:
+    """Episodes as they end, and each video."""
+    with mjrec.Monitor(
+        make_corridor(3),
+        tmp_path,
+        lambda number: number != 1,
+        trackers=TensorBoardTracker(),
+    ) as env:
+        play(env, 3)
+    [directory] = (tmp_path / "tensorboard").iterdir()
+    events = read(directory)
+    assert [e.step for e in events.Scalars("training/return")] == [3, 6, 9]
+    assert [e.step for e in events.Images("training/video")] == [3, 9]
+    [manifest] = tmp_path.glob("*.manifest.json")
+    assert directory.name in manifest.name
 
 
 def test_video_of_no_episode_stands_at_the_last_step(finished: Finished) -> None:

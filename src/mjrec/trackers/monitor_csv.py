@@ -44,7 +44,7 @@ class MonitorCsvTracker(Tracker):
             added unless it ends in `monitor.csv`, and a number where it is taken:
             `logs/a.monitor.csv`, `logs/a.1.monitor.csv` ... None is the monitor
             directory. In a directory the name is
-            `openaigym.episodes.<infix>.monitor.csv`.
+            `openaigym.results.<infix>.monitor.csv`.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
@@ -77,7 +77,7 @@ class MonitorCsvTracker(Tracker):
         """Yield the names that the run's file may have, best first."""
         path = run.directory if self._path is None else self._path
         if path == run.directory or path.is_dir():
-            path /= f"{FILE_PREFIX}.episodes.{run.infix}.{_ENDING}"
+            path /= f"{FILE_PREFIX}.results.{run.infix}.{_ENDING}"
         base = path.name.removesuffix(_ENDING).removesuffix(".")
         yield path.with_name(f"{base}.{_ENDING}" if base else _ENDING)
         for number in itertools.count(1):

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""With the real Stable-Baselines3: training, its vector environments, its readers."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from finished_files import episode
+from recordings import journal_of, manifest_of, metadata_of, videos_in
+
+import mjrec
+from mjrec.trackers import MonitorCsvTracker, Run
+
+# Where it is installed to be tested, being unable to import it is no reason to skip.
+if "MJREC_TEST_STABLE_BASELINES3" not in os.environ:
+    pytest.importorskip(
+        "stable_baselines3", reason="Stable-Baselines3 is not installed here"
+    )
+
+# Before pyplot, which would look for a display.
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor, get_monitor_files, load_results
+from stable_baselines3.common.results_plotter import plot_results, ts2xy
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+
+# Beyond it, something waits for something that never comes.
+pytestmark = pytest.mark.timeout(120)
+
+STEPS = 256
+
+# Many times as fast for so small a network, where the cores are busy.
+torch.set_num_threads(1)
+
+
+def make_env(directory: Path, *, steps: int = 20, **options: Any) -> Any:
+    """Return a monitored pendulum; its pictures are drawn later."""
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=steps)
+    return mjrec.Monitor(
+        env, directory, width=48, height=32, render="deferred", **options
+    )
+
+
+def make_ppo(env: Any) -> PPO:
+    return PPO(
+        "MlpPolicy",
+        env,
+        n_steps=64,
+        batch_size=64,
+        n_epochs=1,
+        seed=0,
+        device="cpu",
+        policy_kwargs={"net_arch": [8]},
+    )
+
+
+def rewards_in(directory: Path) -> list[float]:
+    return [entry["reward"] for entry in journal_of(directory)]
+
+
+def test_training_is_recorded(tmp_path: Path) -> None:
+    """Every episode, with its videos; the algorithm sees the same returns."""
+    env = make_env(
+        tmp_path,
+        video_callable=lambda n: n in (0, 3),
+        trackers=MonitorCsvTracker(),
+    )
+    with env:
+        model = make_ppo(env).learn(STEPS)
+    seen = [one["r"] for one in model.ep_info_buffer]
+    assert len(seen) > 5
+    assert rewards_in(tmp_path) == pytest.approx(seen)
+    assert videos_in(tmp_path) == [0, 3]
+    assert metadata_of(tmp_path, 3)["recording"] == "deferred"
+    assert manifest_of(tmp_path)["mjrec"]["pending"] == []
+    read = load_results(str(tmp_path))
+    assert list(read["r"]) == rewards_in(tmp_path)
+    # Without the steps of the last episode, which did not end.
+    steps, returns = ts2xy(read, "timesteps")
+    assert steps[-1] == sum(entry["length"] for entry in journal_of(tmp_path)) <= STEPS
+    assert list(returns) == rewards_in(tmp_path)
+
+
+def test_episode_info_is_what_stable_baselines3_logs(tmp_path: Path) -> None:
+    """Without a monitor of its own around, as in a vector environment."""
+    venv = DummyVecEnv(
+        [lambda: make_env(tmp_path, episode_info=True, video_callable=False)]
+    )
+    model = make_ppo(venv).learn(STEPS)
+    venv.close()
+    seen = [one["r"] for one in model.ep_info_buffer]
+    assert len(seen) > 5
+    assert rewards_in(tmp_path) == pytest.approx(seen)
+
+
+def test_learning_again_begins_a_new_episode(tmp_path: Path) -> None:
+    """`learn` resets in mid-episode, and what was cut off is an episode too."""
+    with make_env(tmp_path, video_callable=False, allow_early_reset=True) as env:
+        model = make_ppo(env)
+        model.learn(64)
+        model.learn(64)
+    assert sum(entry["length"] for entry in journal_of(tmp_path)) <= 128
+    assert len(journal_of(tmp_path)) > 2
+
+
+# From Python 3.12 on, `fork` beside any thread is warned of: torch's, for instance.
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+@pytest.mark.parametrize("kind", ["dummy", "spawn", "forkserver", "fork"])
+def test_each_environment_of_a_vector_has_its_monitor(
+    kind: str, tmp_path: Path
+) -> None:
+    """All in one directory; what was chosen is there as a video after `close`."""
+
+    def make(index: int) -> Callable[[], Any]:
+        # Sent to another process as code: nothing of this module may be named in it.
+        def make_monitored() -> Any:
+            import gymnasium
+
+            import mjrec
+
+            env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=20)
+            return mjrec.Monitor(
+                env,
+                directory,
+                lambda number: number in (0, 2),
+                resume=True,
+                uid=f"env{index}",
+                width=48,
+                height=32,
+                render="deferred",
+                workers=1,
+                allow_early_reset=True,
+            )
+
+        return make_monitored
+
+    directory = str(tmp_path / "recordings")
+    functions = [make(index) for index in range(2)]
+    venv = VecMonitor(
+        DummyVecEnv(functions)
+        if kind == "dummy"
+        else SubprocVecEnv(functions, start_method=kind)
+    )
+    model = make_ppo(venv).learn(STEPS)
+    venv.close()
+    manifests = [
+        json.loads(path.read_text())
+        for path in (tmp_path / "recordings").glob("*.manifest.json")
+    ]
+    assert len(manifests) == 2
+    for manifest in manifests:
+        assert len(manifest["videos"]) == 2
+        assert manifest["mjrec"]["pending"] == []
+    results = mjrec.load_results(directory)
+    assert sorted(results["episode_rewards"]) == pytest.approx(
+        sorted(one["r"] for one in model.ep_info_buffer)
+    )
+
+
+def test_own_monitor_outside_agrees(tmp_path: Path) -> None:
+    """Its file and ours say the same, but for its six digits."""
+    env = make_env(
+        tmp_path / "ours", video_callable=False, trackers=MonitorCsvTracker()
+    )
+    with Monitor(env, str(tmp_path / "theirs" / "0")) as outer:
+        make_ppo(outer).learn(STEPS)
+    (ours, theirs) = (load_results(str(tmp_path / name)) for name in ("ours", "theirs"))
+    assert list(ours["r"]) == pytest.approx(list(theirs["r"]), abs=1e-6)
+    assert list(ours["l"]) == list(theirs["l"])
+    # Its own reader finds both.
+    assert len(get_monitor_files(str(tmp_path / "ours"))) == 1
+    assert np.allclose(ours["t"], theirs["t"], atol=0.5)
+
+
+def test_evaluation_is_recorded(tmp_path: Path) -> None:
+    """The returns that `evaluate_policy` gives are those in the directory."""
+    model = make_ppo(gymnasium.make("InvertedPendulum-v5"))
+    options = {"mode": "evaluation", "video_callable": lambda number: number == 1}
+    with make_env(tmp_path, **options) as env:
+        returns, lengths = evaluate_policy(
+            model, env, 3, return_episode_rewards=True, warn=False
+        )
+    assert rewards_in(tmp_path) == pytest.approx(returns)
+    assert [entry["length"] for entry in journal_of(tmp_path)] == lengths
+    assert {entry["type"] for entry in journal_of(tmp_path)} == {"e"}
+    assert videos_in(tmp_path) == [1]
+
+
+def test_files_of_several_runs_are_read_together(tmp_path: Path) -> None:
+    """In the order of the ends; NaN and infinity too, and a run without episodes."""
+    tracker = MonitorCsvTracker()
+    runs = [
+        Run(directory=tmp_path, infix=f"{i}.1", env_id="x", env_index=i)
+        for i in range(3)
+    ]
+    for run in runs:
+        tracker.begin(run)
+    start = episode().end_time
+    for second, (which, reward) in enumerate(
+        [(1, 1.0), (0, math.nan), (1, math.inf), (0, -2.5)]
+    ):
+        tracker.episode(runs[which], episode(reward=reward, end_time=start + second))
+    for run in runs:
+        tracker.end(run)
+    read = load_results(str(tmp_path))
+    assert np.array_equal(read["r"], [1.0, math.nan, math.inf, -2.5], equal_nan=True)
+    assert list(np.diff(read["t"])) == pytest.approx([1, 1, 1], abs=1e-3)
+    assert list(read["l"]) == [10] * 4
+    steps, _ = ts2xy(read, "timesteps")
+    assert list(steps) == [10, 20, 30, 40]
+
+
+def test_results_are_plotted(tmp_path: Path) -> None:
+    """By its own function, from our file."""
+    from matplotlib import pyplot
+
+    tracker, run = MonitorCsvTracker(), Run(directory=tmp_path, infix="0.1", env_id="x")
+    tracker.begin(run)
+    for number in range(120):
+        tracker.episode(run, episode(number))
+    tracker.end(run)
+    plot_results([str(tmp_path)], None, "timesteps", "ours")
+    [points] = pyplot.gca().collections
+    assert len(points.get_offsets()) == 120
+    pyplot.close("all")
