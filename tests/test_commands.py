@@ -313,6 +313,43 @@ def test_wrong_usage_is_status_2(mjrec: Any) -> None:
     assert left.value.code == 2
 
 
+@pytest.mark.parametrize("env", ["HalfCheetah-v5", "model.xml"])
+def test_cameras_given_more_than_once_are_a_video_each(
+    mjrec: Any, tmp_path: Path, env: str
+) -> None:
+    """All are listed, whether the environment or the monitor shows the first."""
+    (tmp_path / "model.xml").write_text(PENDULUM)
+    name = str(tmp_path / env) if env.endswith(".xml") else env
+    first = "front" if env.endswith(".xml") else "track"
+    status, out, _ = mjrec(
+        *("record", name, "--out", tmp_path / "out", "--max-steps", 2),
+        *("--size", "64x48", "--camera", first, "--camera", -1),
+    )
+    assert status == 0
+    videos = sorted(path.name for path in (tmp_path / "out").glob("*.mp4"))
+    assert len(videos) == 2
+    assert "2 videos:" in out
+    assert all(video in out for video in videos)
+    assert metadata_of(tmp_path / "out", 0)["camera"] == first
+
+
+def test_cameras_side_by_side_with_captions_and_a_second_name(
+    mjrec: Any, tmp_path: Path
+) -> None:
+    """One video, twice as wide, that says what it is."""
+    status, _, _ = mjrec(
+        *(*CHEETAH, "--out", tmp_path, "--camera", "track", "--camera", -1),
+        *("--tiled", "--annotate", "--name-prefix", "rl-video"),
+    )
+    assert status == 0
+    [frame, *_] = frames_in(tmp_path, 0)
+    assert frame.shape == (48, 128, 3)
+    about = metadata_of(tmp_path, 0)
+    assert about["tiled"]
+    assert about["annotated"]
+    assert (tmp_path / "rl-video-episode-0.mp4").exists()
+
+
 def test_list_shows_every_episode(mjrec: Any, tmp_path: Path) -> None:
     """A row each, with the video's name whole."""
     mjrec(

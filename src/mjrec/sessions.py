@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from .environments.episode_seeds import EpisodeSeeds, episode_seeds
 from .environments.from_name import NamedEnvironment, environment_from_name
@@ -60,6 +60,10 @@ class Session:
         resume: add to the recordings that are in the directory.
         camera: a name or number; None is the model's tracking camera where there is
             one.
+        further_cameras: of more videos of the same episodes.
+        tiled: one video of all cameras side by side, instead of one for each.
+        annotate: whether episode, step, time and return are written on the frames.
+        name_prefix: of the second names of videos, see `mjrec.Monitor`.
         height: of the videos, in pixels; None is the environment's own.
         width: likewise.
         fps: the rate written into the videos; None is real time.
@@ -83,6 +87,10 @@ class Session:
     force: bool = False
     resume: bool = False
     camera: str | int | None = None
+    further_cameras: tuple[str | int, ...] = ()
+    tiled: bool = False
+    annotate: bool = False
+    name_prefix: str | None = None
     height: int | None = None
     width: int | None = None
     fps: float | None = None
@@ -139,7 +147,7 @@ def record_session(
         closing = stack.enter_context(contextlib.ExitStack())
         closing.callback(named.environment.close)
         policy = load_policy(session.policy, named.environment)
-        monitor = Monitor(
+        recorded = Monitor(
             named.environment,
             session.directory,
             schedule,
@@ -154,8 +162,13 @@ def record_session(
             # Without videos it is still the schedule that chooses what is kept.
             trajectory_callable=schedule if session.render == OFF else None,
             env_id=named.env_id,
-            **named.view,
+            tiled=session.tiled,
+            annotate=session.annotate,
+            name_prefix=session.name_prefix,
+            **_view(named, session),
         )
+        # A name is that of one environment, never of a vector environment.
+        monitor = cast("GymnasiumMonitor | DmEnvMonitor", recorded)
         # From here on the monitor closes the environment.
         closing.pop_all()
         stack.enter_context(monitor)
@@ -186,6 +199,15 @@ def with_chosen_videos(episodes: Sequence[SessionEpisode]) -> list[SessionEpisod
     ]
 
 
+def _view(named: NamedEnvironment, session: Session) -> dict[str, Any]:
+    """Return the monitor's cameras and size."""
+    view = dict(named.view)
+    if session.further_cameras:
+        # An environment that was made with its camera shows it by itself.
+        view["camera"] = [view.get("camera"), *session.further_cameras]
+    return view
+
+
 def _check(session: Session) -> None:
     """Check what can be checked before anything is imported or made."""
     if session.episodes < 1:
@@ -199,6 +221,9 @@ def _check(session: Session) -> None:
         workers=session.workers,
         quality=session.quality,
         keep=session.keep,
+        tiled=session.tiled,
+        annotate=session.annotate,
+        name_prefix=session.name_prefix,
     )
     if session.keep is not None and session.schedule is not None:
         raise InvalidArgument(

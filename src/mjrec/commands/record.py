@@ -15,6 +15,7 @@ import tyro
 
 from .. import json_text
 from ..errors import InvalidArgument
+from ..formats.video_metadata import finished_videos
 from ..sessions import (
     Session,
     SessionEpisode,
@@ -23,7 +24,7 @@ from ..sessions import (
 )
 from .help_text import flowing_help
 from .progress import EpisodeProgress
-from .view_options import camera_of, size_of
+from .view_options import camera_of, number_or_name, size_of
 
 __all__ = ["record"]
 
@@ -44,7 +45,10 @@ def record(
     keep: str | None = None,
     force: bool = False,
     resume: bool = False,
-    camera: str | None = None,
+    camera: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    tiled: bool = False,
+    annotate: bool = False,
+    name_prefix: str | None = None,
     size: str | None = None,
     fps: float | None = None,
     max_fps: float = 60,
@@ -76,7 +80,11 @@ def record(
         force: delete the recordings that are in the directory.
         resume: add to the recordings that are in the directory.
         camera: name or number; the model's tracking camera, where there is one, if it
-            is not given.
+            is not given. Given more than once: a video from each.
+        tiled: one video of all cameras side by side.
+        annotate: write episode, step, time and return on the frames.
+        name_prefix: videos get the names that Gymnasium's RecordVideo would give them,
+            PREFIX-episode-27.mp4, besides their own.
         size: of the videos, WIDTHxHEIGHT in pixels.
         fps: frames per second written into the videos; real time, if not given.
         max_fps: the most frames for a second of simulated time; of a faster simulation
@@ -106,7 +114,11 @@ def record(
         keep=keep,
         force=force,
         resume=resume,
-        camera=camera_of(camera),
+        camera=camera_of(camera[0] if camera else None),
+        further_cameras=tuple(number_or_name(each) for each in camera[1:]),
+        tiled=tiled,
+        annotate=annotate,
+        name_prefix=name_prefix,
         height=height,
         width=width,
         fps=fps,
@@ -158,13 +170,14 @@ def _print_summary(
     if interrupted:
         console.print("Interrupted. What was recorded so far is complete:")
     videos = [episode.video for episode in recorded if episode.video]
+    files = [name for video in videos for name in _files(video)]
     shown = session.directory.absolute()
     lines = [
         f"{_count(len(recorded), 'episode')} of {session.environment}, "
         f"seed {session.seed}, in",
         f"  {shown}",
-        _count(len(videos), "video") + (":" if videos else ""),
-        *(f"  {video.name}{_pending(video)}" for video in videos),
+        _count(len(files), "video") + (":" if files else ""),
+        *(f"  {name}" for name in files),
     ]
     # Names must survive copying, so no line is folded.
     console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
@@ -192,9 +205,12 @@ def _print_json(
     sys.stdout.write(json_text.dumps(summary) + "\n")
 
 
-def _pending(video: Path) -> str:
+def _files(video: Path) -> list[str]:
+    """Return the names of an episode's videos, those of further cameras too."""
     # Nothing incomplete has a video's final name.
-    return "" if video.exists() else f"  (pending: mjrec render {video.parent})"
+    if video.exists():
+        return [name for name, _ in finished_videos(video)]
+    return [f"{video.name}  (pending: mjrec render {video.parent})"]
 
 
 def _kwargs(text: str) -> dict[str, Any]:

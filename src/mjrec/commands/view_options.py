@@ -8,7 +8,7 @@ import re
 from ..errors import InvalidArgument
 from ..frames import check_size
 
-__all__ = ["camera_of", "size_of"]
+__all__ = ["camera_of", "number_or_name", "size_of"]
 
 
 def size_of(text: str | None) -> tuple[int | None, int | None]:
@@ -29,6 +29,9 @@ def size_of(text: str | None) -> tuple[int | None, int | None]:
 
 def camera_of(text: str | None) -> str | int | None:
     """Return a camera's number, if `text` is a whole number, else its name."""
-    if text is not None and re.fullmatch(r"-?\d+", text, re.ASCII):
-        return int(text)
-    return text
+    return None if text is None else number_or_name(text)
+
+
+def number_or_name(text: str) -> str | int:
+    """Return the number, if `text` is a whole number, else `text`."""
+    return int(text) if re.fullmatch(r"-?\d+", text, re.ASCII) else text
