@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -578,3 +580,29 @@ def test_so_it_is_of_dm_control(tmp_path: Path) -> None:
     [alone] = run(tmp_path / "alone", "back")
     assert hashes_of(both[1]) == hashes_of(alone)
     assert hashes_of(both[0]) != hashes_of(alone)
+
+
+KILLED = """
+import os, sys, gymnasium, mjrec
+env = gymnasium.make("HalfCheetah-v5")
+env = mjrec.Monitor(
+    env, sys.argv[1], camera=["track", -1], render="live", height=48, width=64,
+    name_prefix="rl-video",
+)
+env.reset(seed=0)
+for _ in range(8):
+    env.step(env.action_space.sample())
+os.kill(os.getpid(), 9)
+"""
+
+
+def test_a_killed_recording_has_all_its_videos(tmp_path: Path) -> None:
+    """In the manifest, and under their second names."""
+    subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
+    recover(tmp_path, timeout=30)
+    [manifest] = tmp_path.glob("*.manifest.json")
+    videos = [video for video, _ in json.loads(manifest.read_text())["videos"]]
+    assert len(videos) == 2
+    assert sorted(videos) == sorted(p.name for p in tmp_path.glob("openaigym*.mp4"))
+    seconds = {p.name for p in tmp_path.glob("rl-video*.mp4")}
+    assert seconds == {"rl-video-episode-0.mp4", "rl-video-episode-0.-1.mp4"}

@@ -21,6 +21,7 @@ __all__ = [
     "StepRuns",
     "file_facts",
     "finished_videos",
+    "further_live_videos",
     "is_broken",
     "is_done",
     "metadata_path",
@@ -149,6 +150,22 @@ def finished_videos(video: Path) -> list[tuple[str, str]]:
     return list(dict.fromkeys(names))
 
 
+def further_live_videos(video: Path) -> list[str]:
+    """Return the names of what further cameras saw of an episode, drawn as it ran.
+
+    For whoever finds these files and not what belongs to them: what is rendered from a
+    trajectory, now or once more, says so in its metadata.
+
+    Args:
+        video: the first video of the episode, be it there or not.
+    """
+    return [
+        path.name
+        for path in sorted(video.parent.iterdir())
+        if _is_further(path.name, video) and _is_live(metadata_path(path))
+    ]
+
+
 def is_done(video: Path) -> bool:
     """Tell whether nothing is left to do about a video: it is there, or given up."""
     metadata = metadata_path(video)
@@ -159,6 +176,13 @@ def is_broken(metadata: Path) -> bool:
     """Tell whether a video's metadata says that it broke."""
     try:
         return bool(read_object(metadata).get("broken"))
+    except (OSError, ValueError):
+        return False
+
+
+def _is_live(metadata: Path) -> bool:
+    try:
+        return read_object(metadata).get("recording") == "live"
     except (OSError, ValueError):
         return False
 

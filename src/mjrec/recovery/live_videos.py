@@ -20,7 +20,13 @@ from ..formats.ffmpeg import ffmpeg_executable, ffmpeg_sha256, ffmpeg_version
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import episode_of
 from ..formats.unfinished_video import UnfinishedVideo, VideoFile, VideoNote, read_note
-from ..formats.video_metadata import StepRuns, file_facts, metadata_path, timing_facts
+from ..formats.video_metadata import (
+    StepRuns,
+    file_facts,
+    further_live_videos,
+    metadata_path,
+    timing_facts,
+)
 from .cut_off import how_it_ended, sums_of, write_metadata
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
@@ -39,7 +45,8 @@ def finish_video(
     video broke, and why.
 
     Args:
-        note_file: the note beside it.
+        note_file: the note beside it. That of an episode's first video comes after
+            those of its further cameras, which its metadata names.
         known: what is known of the monitor's episodes.
         is_over: tells whether not to wait any longer for its encoder.
 
@@ -190,8 +197,15 @@ def _metadata(
         **sums,
         **timing,
         **file_facts(file),
+        **_further_videos(note.video.path),
         "recovered": True,
     }
+
+
+def _further_videos(video: Path) -> dict[str, Any]:
+    """Return what the first video of an episode says of those of further cameras."""
+    names = further_live_videos(video)
+    return {"further_videos": names} if names else {}
 
 
 def _is_whole(note: VideoNote, file: VideoFile, length: Any) -> bool:

@@ -87,7 +87,7 @@ class Mending:
                     self._note(finish_log_of_dead(log, known))
         # Of logs a manifest says nothing that is not so of trajectories.
         before = len(self.files)
-        for note in remains.notes:
+        for note in sorted(remains.notes, key=remains.is_first_video):
             with self._noting_failure(_video_of(note)):
                 self._note(finish_video(note, known, is_over=self._is_over))
         kept = [text for text in remains.texts if not self._finish_text(text, known)]

@@ -41,6 +41,7 @@ _VIDEO_PART = re.compile(
     r"\.(?P<video>openaigym\.video\..+\.video\d{6,}(?:\.[^/]+)?)"
     r"\.(?P<kind>mp4|framehash|json|meta\.json)\.[0-9a-f]{8}\.part"
 )
+_FIRST_NOTE = re.compile(r"\.video\d{6,}\.[a-z0-9]+\.note\.part$")
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,10 @@ class Remains:
         """Tell whether an unfinished file is of a video as it was to be at first."""
         match = _VIDEO_PART.fullmatch(part.name)
         return match is not None and match["video"].rpartition(".video")[2].isdigit()
+
+    def is_first_video(self, note: Path) -> bool:
+        """Tell whether a note is of the first video of its episode."""
+        return _FIRST_NOTE.search(note.name) is not None
 
     def _is_held(self, part: Path) -> bool:
         """Tell whether an unfinished file may be somebody's who is alive."""
