@@ -48,7 +48,9 @@ def gymnasium_pictures(
     """
     if camera is None and height is None and width is None:
         return EnvironmentPictures(env)
-    simulated = simulation_in(env)
+    # An environment of ours keeps its simulation in an object of its own.
+    own = getattr(env.unwrapped, "simulation", None)
+    simulated = simulation_in(env) or simulation_in(own)
     if simulated is None:
         raise InvalidArgument(
             "camera, height and width choose among the pictures of a MuJoCo "
@@ -63,8 +65,8 @@ def gymnasium_pictures(
         lambda: (simulated.model, simulated.data),
         look=lambda: Look(**_look(simulated, env, camera=camera is None)),
         camera=camera,
-        height=_own_size(simulated, "height") if height is None else height,
-        width=_own_size(simulated, "width") if width is None else width,
+        height=_own_size(simulated, env, "height") if height is None else height,
+        width=_own_size(simulated, env, "width") if width is None else width,
     )
 
 
@@ -180,9 +182,9 @@ def _keeps_frames(env: gymnasium.Env[Any, Any]) -> bool:
     return env.has_wrapper_attr("pop_frames") and not env.get_wrapper_attr("pop_frames")
 
 
-def _own_size(simulated: Any, name: str) -> int:
+def _own_size(simulated: Any, env: gymnasium.Env[Any, Any], name: str) -> int:
     # Gymnasium's default, for environments that do not say.
-    return int(getattr(simulated, name, 480))
+    return int(getattr(simulated, name, None) or getattr(env.unwrapped, name, 480))
 
 
 def _look(
