@@ -74,8 +74,9 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     Other environments are drawn while they step, through their own `render()`.
 
     Args:
-        env: a Gymnasium environment or a dm_env environment such as
-            `dm_control.suite.load(...)`. Where pictures are drawn live it must be
+        env: a Gymnasium environment, one of its vector environments, of which each
+            sub-environment is recorded (`VectorMonitor` says how), or a dm_env
+            environment such as `dm_control.suite.load(...)`. Where pictures are drawn live it must be
             made with `render_mode="rgb_array"` (or `"rgb_array_list"`, `"ansi"`);
             deferred rendering needs no `render_mode`, and no OpenGL in this process.
         directory: where the recordings go. It is made where it is missing.
@@ -121,7 +122,8 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
         observations: whether trajectories hold observations too.
         allow_early_reset: whether a reset in mid-episode is allowed; the episode is
             then no part of the statistics, and its video is marked incomplete. None
-            is what the framework has: no for Gymnasium, yes for dm_env.
+            is what the framework has: no for Gymnasium, yes for its vector environments
+            and for dm_env.
         on_error: "raise", or "warn": where something cannot be recorded (a full disk,
             a dead encoder, a video that cannot be rendered) the simulation goes on,
             the log says so once, and the manifest lists under `mjrec.faults` which
@@ -170,7 +172,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
         A `GymnasiumMonitor`, a `VectorMonitor` or a `DmEnvMonitor`.
 
     Raises:
-        InvalidArgument: `env` is neither, or an argument cannot be.
+        InvalidArgument: `env` is none of these, or an argument cannot be.
         NoPictures: videos were asked for of an environment that gives no pictures.
         PicturesDiffer: `render="deferred"`, and what the environment shows cannot be
             made from its state; the message names what stands in the way.

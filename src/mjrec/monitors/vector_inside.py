@@ -74,21 +74,22 @@ class InsideRecording(VectorRecording):
         # A tiled video of several cameras is each sub-environment's own.
         tiled = options.tiled and isinstance(view["camera"], list | tuple)
         options = dataclasses.replace(options, tiled=tiled)
+        monitored: list[_Env] = []
         with opened_together(directory) as monitors:
             self._closing.how = _leave_open
             for index, each in enumerate(envs):
-                monitors.append(
-                    GymnasiumMonitor(
-                        each,
-                        directory,
-                        options_of(index, options),
-                        **view,
-                        env_id=env_id,
-                        env_index=index,
-                        rendering=None if shared is None else shared.share,
-                        close_environment=self._closing,
-                    )
+                monitor = GymnasiumMonitor(
+                    each,
+                    directory,
+                    options_of(index, options),
+                    **view,
+                    env_id=env_id,
+                    env_index=index,
+                    rendering=None if shared is None else shared.share,
+                    close_environment=self._closing,
                 )
+                monitors.append(monitor)
+                monitored.append(monitor)
         self._closing.how = close_environment
         super().__init__(
             monitors,
@@ -96,7 +97,7 @@ class InsideRecording(VectorRecording):
             clock=functools.partial(simulation_time, envs[0]),
             declared=functools.partial(declared_rate, envs[0]),
         )
-        envs[:] = monitors
+        envs[:] = monitored
 
     def reset(
         self, which: list[int], *, seed: Any, options: dict[str, Any] | None
