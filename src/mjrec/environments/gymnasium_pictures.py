@@ -184,7 +184,7 @@ def _keeps_frames(env: gymnasium.Env[Any, Any]) -> bool:
 
 def _own_size(simulated: Any, env: gymnasium.Env[Any, Any], name: str) -> int:
     # Gymnasium's default, for environments that do not say.
-    return int(getattr(simulated, name, None) or getattr(env.unwrapped, name, 480))
+    return int(getattr(simulated, name, getattr(env.unwrapped, name, 480)))
 
 
 def _look(
