@@ -292,7 +292,9 @@ def test_what_other_processes_know(tmp_path: Path) -> None:
             lambda: gymnasium.make(
                 "Hopper-v5", render_mode="rgb_array", width=64, height=64
             )
-        ]
+        ],
+        # What was forked from a process with an OpenGL context hangs in its own.
+        context="spawn",
     )
     with mjrec.Monitor(vector, tmp_path) as env:
         play(env, 2, seed=1)

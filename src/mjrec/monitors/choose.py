@@ -76,9 +76,10 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     Args:
         env: a Gymnasium environment, one of its vector environments, of which each
             sub-environment is recorded (`VectorMonitor` says how), or a dm_env
-            environment such as `dm_control.suite.load(...)`. Where pictures are drawn live it must be
-            made with `render_mode="rgb_array"` (or `"rgb_array_list"`, `"ansi"`);
-            deferred rendering needs no `render_mode`, and no OpenGL in this process.
+            environment such as `dm_control.suite.load(...)`. Where pictures are drawn
+            live it must be made with `render_mode="rgb_array"` (or `"rgb_array_list"`,
+            `"ansi"`); deferred rendering needs no `render_mode`, and no OpenGL in this
+            process.
         directory: where the recordings go. It is made where it is missing.
         video_callable: which episodes get a video: a function from the episode's
             number, from 0, to a bool; None for `capped_cubic_video_schedule`; False
