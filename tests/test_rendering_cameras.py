@@ -590,7 +590,7 @@ env = mjrec.Monitor(
     name_prefix="rl-video",
 )
 env.reset(seed=0)
-for _ in range(8):
+for _ in range(30):
     env.step(env.action_space.sample())
 os.kill(os.getpid(), 9)
 """
