@@ -166,19 +166,23 @@ def test_clips_are_in_the_manifest(tmp_path: Path) -> None:
     assert results["episode_lengths"] == [3, 3]
 
 
-def test_mujoco_clips_are_drawn_live(tmp_path: Path) -> None:
-    """They have pictures, and the metadata says how and why."""
+@pytest.mark.parametrize("render", [None, "live"])
+def test_mujoco_clips_are_rendered_later(render: str | None, tmp_path: Path) -> None:
+    """They have the same pictures either way, and the metadata says which it was."""
     made = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array", width=64)
     with mjrec.Monitor(
-        made, tmp_path, step_trigger=lambda step: step == 1, video_length=3
+        made,
+        tmp_path,
+        step_trigger=lambda step: step == 1,
+        video_length=3,
+        render=render,
     ) as env:
         env.reset(seed=0)
         for _ in range(5):
             env.step(np.zeros(1, np.float32))
     [about] = tmp_path.glob("*.meta.json")
     metadata = json.loads(about.read_text())
-    assert metadata["recording"] == "live"
-    assert "counted in steps" in metadata["recording_reason"]
+    assert metadata["recording"] == (render or "deferred")
     assert metadata["frame_count"] == 4
 
 
@@ -189,8 +193,7 @@ def test_mujoco_clips_are_drawn_live(tmp_path: Path) -> None:
         ({"step_trigger": bool, "video_callable": bool}, "one of them"),
         ({"video_length": 0}, "positive whole number"),
         ({"video_length": True}, "positive whole number"),
-        ({"step_trigger": bool, "render": "deferred"}, 'render="live"'),
-        ({"video_length": 3, "render": "off"}, 'render="live"'),
+        ({"video_length": 3, "render": "off"}, 'render="off"'),
     ],
 )
 def test_what_cannot_be_is_told_before_anything_is_made(
@@ -199,4 +202,13 @@ def test_what_cannot_be_is_told_before_anything_is_made(
     """One error with the way out, and no directory."""
     with pytest.raises(mjrec.InvalidArgument, match=words):
         mjrec.Monitor(Counting(3), tmp_path / "run", **options)
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_cannot_be_rendered_later_is_no_clip_to_be(tmp_path: Path) -> None:
+    """Asked for by name it is an error, before anything is made."""
+    with pytest.raises(mjrec.PicturesDiffer, match='render="live"'):
+        mjrec.Monitor(
+            Counting(3), tmp_path / "run", step_trigger=bool, render="deferred"
+        )
     assert not (tmp_path / "run").exists()

@@ -24,7 +24,7 @@ from ..rendering.again import Variant, render_again
 from ..rendering.cpu_slots import check_workers
 from ..rendering.finishing import finish_pending
 from ..rendering.outcomes import Outcome
-from ..rendering.pending import EpisodeKey, recorded_episodes
+from ..rendering.pending import EpisodeKey, RecordingKey, key_of, recordings
 from ..rendering.views import View
 from ..simulation.model_trust import trusting_all_models
 from .help_text import flowing_help
@@ -187,8 +187,8 @@ def render(
     return report.exit_status
 
 
-def _episodes(target: Path, episode: int | None) -> tuple[Path, list[EpisodeKey]]:
-    """Return a directory and those of its episodes that were asked for.
+def _episodes(target: Path, episode: int | None) -> tuple[Path, list[RecordingKey]]:
+    """Return a directory and those of its episodes and clips that were asked for.
 
     Raises:
         InvalidArgument: there are none.
@@ -196,19 +196,22 @@ def _episodes(target: Path, episode: int | None) -> tuple[Path, list[EpisodeKey]
     if not target.exists():
         raise InvalidArgument(f"There is no directory or file {target}.")
     if not target.is_dir():
-        key = EpisodeKey.of(target.name)
+        key = key_of(target.name)
         return target.parent, [] if key is None else [key]
     if not any(iter_monitor_files(target)):
         raise InvalidArgument(
             f"{target} holds no recordings. `mjrec record ENV --out {target}` makes "
             "some."
         )
-    keys = recorded_episodes(target)
+    keys = recordings(target)
     if episode is None:
         return target, keys
-    chosen = [key for key in keys if key.episode_id == episode]
+    of_episodes = [key for key in keys if isinstance(key, EpisodeKey)]
+    chosen: list[RecordingKey] = [
+        key for key in of_episodes if key.episode_id == episode
+    ]
     if not chosen:
-        numbers = sorted({key.episode_id for key in keys})
+        numbers = sorted({key.episode_id for key in of_episodes})
         listed = ", ".join(map(str, numbers[:_SHOWN])) or "none"
         raise InvalidArgument(
             f"{target} has no recorded states of {_what(target, episode)}. It has "
@@ -217,7 +220,7 @@ def _episodes(target: Path, episode: int | None) -> tuple[Path, list[EpisodeKey]
     return target, chosen
 
 
-def _trajectories(target: Path, keys: Iterable[EpisodeKey]) -> list[Path]:
+def _trajectories(target: Path, keys: Iterable[RecordingKey]) -> list[Path]:
     """Return the trajectories that were asked for.
 
     Raises:
@@ -227,7 +230,11 @@ def _trajectories(target: Path, keys: Iterable[EpisodeKey]) -> list[Path]:
         # Whatever its name is otherwise.
         return [target]
     directory = target if target.is_dir() else target.parent
-    found = (find_trajectory(directory, key.infix, key.episode_id) for key in keys)
+    found = (
+        find_trajectory(directory, key.infix, key.episode_id)
+        for key in keys
+        if isinstance(key, EpisodeKey)
+    )
     trajectories = [path for path in found if path is not None]
     if not trajectories:
         raise InvalidArgument(

@@ -15,12 +15,19 @@
     ├── openaigym.trajectory.<infix>.episode000027.log  a recorded episode in flight
     ├── openaigym.trajectory.<infix>.episode000027.h5   ... and finished
     ├── openaigym.trajectory.<infix>.episode000027.log.damaged  that nobody can read
+    ├── openaigym.clip.<infix>.step000000137.part000000.log  of a video in steps
     ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
     ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
     ├── .openaigym.<infix>.lock                         while its monitor is open
     ├── .openaigym.video.<infix>.video000027.lock       while somebody renders it
+    ├── .openaigym.clip.<infix>.step000000137.lock      likewise
     ├── .openaigym.manifest.<infix>.lock                while somebody rewrites it
     └── .openaigym.render.<number>.lock                 while somebody uses that CPU
+
+A video that is counted in steps may go on across resets. Until it is rendered there is
+a log for each part of it that is of one episode, called by the number of steps that the
+monitor had recorded when it began. Its own name is that of the episode in which it
+began, as of any video, or `video000027.step000137.mp4` where a step began it.
 
 `<infix>` is `<monitor id>.<uid or process id>`. It stands for one monitor: no two
 monitors ever share one in a directory. Names that start with a dot and end in
@@ -39,7 +46,12 @@ from ..errors import InvalidArgument
 __all__ = [
     "FILE_PREFIX",
     "MANIFEST_PREFIX",
+    "ClipPart",
     "Infix",
+    "clip_lock_name",
+    "clip_part_name",
+    "clip_prefix",
+    "clip_video_prefix",
     "episode_of",
     "infix_of",
     "is_manifest",
@@ -72,6 +84,9 @@ _VIDEO = rf"openaigym\.video\.{_INFIX_PART}\.video(?P<episode>[0-9]{{6,18}})"
 _TRAJECTORY = (
     rf"openaigym\.trajectory\.{_INFIX_PART}\.episode(?P<episode>[0-9]{{6,18}})"
 )
+# Not the number of an episode: no part of a clip is taken for an episode's file.
+_CLIP = rf"openaigym\.clip\.{_INFIX_PART}\.step(?P<step>[0-9]{{9,18}})"
+_CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})\.log")
 
 _MANIFEST = re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json")
 _PATTERNS = (
@@ -80,10 +95,12 @@ _PATTERNS = (
     re.compile(rf"openaigym\.episodes\.{_INFIX_PART}\.jsonl"),
     re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
     re.compile(rf"{_TRAJECTORY}\.(log|h5|log\.damaged)"),
+    _CLIP_PART,
     re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
 )
 _HIDDEN = (
     re.compile(rf"\.{_VIDEO}\.lock"),
+    re.compile(rf"\.{_CLIP}\.lock"),
     re.compile(r"\.openaigym\.render\.[0-9]+\.lock"),
     re.compile(rf"\.openaigym\.manifest\.{_INFIX_PART}\.lock"),
     re.compile(rf"\.openaigym\.{_INFIX_PART}\.lock"),
@@ -112,6 +129,30 @@ class Infix:
         """Return the infix written as `text`; None for one of another making."""
         match = _INFIX.fullmatch(text)
         return None if match is None else cls(int(match["number"]), match["uid"])
+
+
+@dataclass(frozen=True)
+class ClipPart:
+    """What the name of a part of a video that is counted in steps says.
+
+    Attributes:
+        infix: of its monitor.
+        first_step: how many steps the monitor had recorded when the video began.
+        number: which part it is, from 0.
+    """
+
+    infix: Infix
+    first_step: int
+    number: int
+
+    @classmethod
+    def parse(cls, name: str) -> ClipPart | None:
+        """Return what a file's name says; None for other files."""
+        match = _CLIP_PART.fullmatch(name)
+        infix = None if match is None else Infix.parse(match["infix"])
+        if match is None or infix is None:
+            return None
+        return cls(infix, int(match["step"]), int(match["part"]))
 
 
 def check_uid(uid: object) -> str:
@@ -157,6 +198,39 @@ def trajectory_prefix(infix: Infix, episode_id: int) -> str:
 def video_lock_name(infix: Infix, episode_id: int) -> str:
     """Return the name of the file that whoever renders an episode holds locked."""
     return f".{video_prefix(infix, episode_id)}.lock"
+
+
+def clip_prefix(infix: Infix, first_step: int) -> str:
+    """Return how the names of the parts of a video begin that is counted in steps.
+
+    Args:
+        infix: the monitor's.
+        first_step: how many steps the monitor had recorded when it began.
+    """
+    return f"{FILE_PREFIX}.clip.{infix}.step{first_step:09d}"
+
+
+def clip_part_name(infix: Infix, first_step: int, number: int) -> str:
+    """Return the name of one part, which is of one episode; they count from 0."""
+    return f"{clip_prefix(infix, first_step)}.part{number:06d}.log"
+
+
+def clip_lock_name(infix: Infix, first_step: int) -> str:
+    """Return the name of the file that whoever renders such a video holds locked."""
+    return f".{clip_prefix(infix, first_step)}.lock"
+
+
+def clip_video_prefix(infix: Infix, episode_id: int, step: int | None) -> str:
+    """Return the name of a video that is counted in steps, without its extensions.
+
+    Args:
+        infix: the monitor's.
+        episode_id: the episode in which it began.
+        step: how many steps were recorded when a step began it; None where it began
+            with the episode.
+    """
+    prefix = video_prefix(infix, episode_id)
+    return prefix if step is None else f"{prefix}.step{step:06d}"
 
 
 def render_lock_name(number: int) -> str:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["pending_video", "with_reason"]
+__all__ = ["pending_clip", "pending_video", "with_reason"]
 
 # What ffmpeg or a driver says can be long; what matters is where it begins and ends.
 _LONGEST_REASON = 1000
@@ -24,16 +24,27 @@ def pending_video(episode_id: int, *, trajectory: str, video: str) -> dict[str, 
     return {"episode_id": episode_id, "trajectory": trajectory, "video": video}
 
 
+def pending_clip(episode_id: int, *, first_part: str, video: str) -> dict[str, Any]:
+    """Return the entry of a video that is counted in steps.
+
+    Args:
+        episode_id: the number of the episode in which it began.
+        first_part: the base name of the first of its logs.
+        video: the base name that the video will have.
+    """
+    return {"episode_id": episode_id, "clip": first_part, "video": video}
+
+
 def with_reason(
     entry: Mapping[str, Any], reasons: Mapping[str, str]
 ) -> Mapping[str, Any]:
     """Return an entry that says why rendering it has failed, if that is known.
 
     Args:
-        entry: as `pending_video` returns it.
-        reasons: by the base names of videos, or of logs of trajectories.
+        entry: as `pending_video` or `pending_clip` returns it.
+        reasons: by the base names of videos, or of logs.
     """
-    by_log = f"{entry.get('trajectory')}.log"
+    by_log = str(entry.get("clip") or f"{entry.get('trajectory')}.log")
     reason = reasons.get(str(entry.get("video")), reasons.get(by_log))
     return entry if reason is None else {**entry, "reason": _shortened(reason)}
 

@@ -165,16 +165,17 @@ class MonitorControls(MonitorLifetime):
         scenes: Scenes,
         options: RecorderOptions,
         close_environment: Callable[[Any], None],
+        clip_scenes: Scenes | None,
         env_index: int | None = None,
         rendering: Callable[[Path], Rendering] | None = None,
     ) -> None:
         """Open the directory; from here on the environment is this monitor's.
 
         What renders is made by `rendering`, or is a service of this monitor's own.
+        `clip_scenes` are `scenes` once more, for videos that are counted in steps;
+        None without any.
         """
-        choice = rendering_choice(
-            options.render, scenes, env_id, has_clips=options.has_clips
-        )
+        choice = rendering_choice(options.render, scenes, env_id)
         self._open(
             directory,
             Subject(
@@ -187,6 +188,7 @@ class MonitorControls(MonitorLifetime):
                 declared=functools.partial(declared_rate, env),
                 rendering=choice,
                 states=scenes.states,
+                clip_states=None if clip_scenes is None else clip_scenes.states,
                 environment=scenes.environment,
                 random_state=scenes.random_state,
             ),
@@ -217,7 +219,10 @@ class MonitorControls(MonitorLifetime):
             functools.partial(
                 _close,
                 self._recorder,
-                (subject.pictures, *subject.further_pictures.values(), subject.states),
+                (
+                    *(subject.pictures, *subject.further_pictures.values()),
+                    *(subject.states, subject.clip_states),
+                ),
                 close_environment,
             ),
             at_exit=functools.partial(_note_last_error, self._recorder),

@@ -70,12 +70,17 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
             lambda each: _pictures(env, camera=each, **size),
             tiled=options.tiled,
         )
+
+        def scenes() -> Scenes:
+            return _scenes(env, env_id=env_id, camera=view.camera, **size)
+
         self._start(
             env,
             directory,
             env_id=env_id or _env_id(env),
             view=view,
-            scenes=_scenes(env, env_id=env_id, camera=view.camera, **size),
+            scenes=scenes(),
+            clip_scenes=scenes() if options.has_clips else None,
             options=options,
             close_environment=operator.methodcaller("close"),
         )

@@ -15,6 +15,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
 from ..environments.gymnasium_scenes import gymnasium_scenes
+from ..environments.scenes import Scenes
 from ..recorder.ended_trajectories import Rendering
 from ..recorder.options import RecorderOptions
 from .cameras import camera_pictures
@@ -67,13 +68,18 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
             lambda each: gymnasium_pictures(env, camera=each, **size),
             tiled=options.tiled,
         )
+
+        def scenes() -> Scenes:
+            return gymnasium_scenes(env, camera=view.camera, **size)
+
         self._start(
             env,
             directory,
             env_id=env_id or env_id_of(env),
             env_index=env_index,
             view=view,
-            scenes=gymnasium_scenes(env, camera=view.camera, **size),
+            scenes=scenes(),
+            clip_scenes=scenes() if options.has_clips else None,
             options=options,
             rendering=rendering,
             close_environment=close_environment,

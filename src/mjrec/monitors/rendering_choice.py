@@ -14,12 +14,9 @@ __all__ = ["rendering_choice"]
 logger = logging.getLogger(__name__)
 
 _NO_SIMULATION = "it has no MuJoCo model and data that can be seen"
-_CLIPS = "a video that is counted in steps need not be of one episode"
 
 
-def rendering_choice(
-    asked: str | None, scenes: Scenes, env_id: str, *, has_clips: bool = False
-) -> RenderingChoice:
+def rendering_choice(asked: str | None, scenes: Scenes, env_id: str) -> RenderingChoice:
     """Return when the pictures of an environment are drawn.
 
     Args:
@@ -27,16 +24,12 @@ def rendering_choice(
             that the pictures follow from the states, else live.
         scenes: what is known of the environment.
         env_id: its name, for messages.
-        has_clips: videos are counted in steps, and not each of one episode; they are
-            drawn live.
 
     Raises:
         PicturesDiffer: deferred was asked for, and the pictures do not follow.
     """
     if asked in (LIVE, OFF):
         return RenderingChoice(mode=str(asked), is_forced=True)
-    if has_clips:
-        return RenderingChoice(mode=LIVE, reason=_CLIPS)
     obstacle = _NO_SIMULATION if scenes.states is None else scenes.obstacle
     if obstacle is None:
         logger.info("The videos of %s are rendered from recorded states.", env_id)

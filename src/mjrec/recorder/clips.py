@@ -4,12 +4,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Protocol
 
-from ..errors import Error
-from .video_recorder import VideoRecorder
+__all__ = ["Clip", "Clips"]
 
-__all__ = ["Clips"]
+
+class Clip(Protocol):
+    """What records one video that is counted in steps, and lists it at its end."""
+
+    def begin(self) -> None:
+        """Take the picture of this moment."""
+
+    def reset(self, episode_id: int) -> None:
+        """Take the picture of an episode that has just begun.
+
+        Args:
+            episode_id: its number.
+        """
+
+    def step(
+        self, reward: float, *, terminated: bool, truncated: bool, is_there: bool
+    ) -> None:
+        """Take the picture of a step.
+
+        Args:
+            reward: of the step.
+            terminated: the task ended the episode.
+            truncated: a limit from outside the task ended it.
+            is_there: False where the environment has reset itself already.
+        """
+
+    def end(self, facts: Mapping[str, Any]) -> None:
+        """End the video. Where it was interrupted, the next call goes on.
+
+        Args:
+            facts: what is known of its end.
+        """
 
 
 class Clips:
@@ -19,16 +49,12 @@ class Clips:
     with and those of exactly `length` steps, on across resets, which add a picture
     each. Without a length it ends with the episode.
 
-    They are drawn live: a trajectory is of one episode, and such a video need not be.
-
     Args:
         length: in steps; None is until the end of the episode.
         trigger: tells by the number of steps taken so far whether one begins before
             the next; None where only episodes begin them.
-        begin: makes what records one; it is given the number of steps taken so far,
+        make: returns what records one; it is given the number of steps taken so far,
             or None where it begins with an episode.
-        on_end: called with each, closed.
-        tolerates: tells whether to go on after an error.
     """
 
     def __init__(
@@ -36,17 +62,16 @@ class Clips:
         *,
         length: int | None,
         trigger: Callable[[int], Any] | None,
-        begin: Callable[[int | None], VideoRecorder],
-        on_end: Callable[[VideoRecorder], object],
-        tolerates: Callable[[Exception], bool],
+        make: Callable[[int | None], Clip],
     ) -> None:
         self._length = length
         self._trigger = trigger
-        self._begin = begin
-        self._on_end = on_end
-        self._tolerates = tolerates
-        self._video: VideoRecorder | None = None
+        self._make = make
+        self._clip: Clip | None = None
         self._steps = 0
+        self._reward = 0.0
+        # How the running one has ended, until that is all written down.
+        self._ending: Mapping[str, Any] | None = None
 
     def reset(self, episode_id: int, *, is_chosen: bool) -> None:
         """Take the picture of an episode that has just begun.
@@ -55,9 +80,9 @@ class Clips:
             episode_id: its number.
             is_chosen: a video begins with it, unless one is running.
         """
-        if self._video is not None:
-            self._video.metadata["last_episode_id"] = episode_id
-            self._take(self._video)
+        self._settle()
+        if self._clip is not None:
+            self._clip.reset(episode_id)
         elif is_chosen:
             self._start(None)
 
@@ -67,26 +92,41 @@ class Clips:
         Args:
             steps: how many were taken so far.
         """
-        if self._video is None and self._trigger is not None and self._trigger(steps):
+        if self._ending is not None:
+            self._settle()
+        if self._clip is None and self._trigger is not None and self._trigger(steps):
             self._start(steps)
 
-    def step(self, *, is_there: bool, done: bool) -> None:
+    def step(
+        self,
+        reward: float,
+        *,
+        terminated: bool,
+        truncated: bool,
+        is_there: bool,
+    ) -> None:
         """Take the picture of a step.
 
         Args:
+            reward: of the step.
+            terminated: the task ended the episode.
+            truncated: a limit from outside the task ended it.
             is_there: False where the environment has reset itself already.
-            done: the episode is over.
         """
-        video = self._video
-        if video is None:
+        clip = self._clip
+        if clip is None:
             return
         self._steps += 1
-        if is_there:
-            self._take(video)
-        else:
-            video.metadata["final_frame"] = "missing"
+        self._reward += reward
+        done = terminated or truncated
         if self._steps == self._length or (self._length is None and done):
-            self._end(video, {"complete": True})
+            self._ending = {"complete": True}
+        try:
+            clip.step(
+                reward, terminated=terminated, truncated=truncated, is_there=is_there
+            )
+        finally:
+            self._settle()
 
     def close(self, facts: Mapping[str, Any]) -> None:
         """End the running video, if there is one. Idempotent.
@@ -94,30 +134,26 @@ class Clips:
         Args:
             facts: why it ends early.
         """
-        if self._video is not None:
-            self._end(self._video, {"complete": False, **facts})
+        if self._clip is not None and self._ending is None:
+            self._ending = {"complete": False, **facts}
+        self._settle()
 
     def _start(self, steps: int | None) -> None:
-        self._video = video = self._begin(steps)
-        self._steps = 0
-        self._take(video)
+        clip = self._make(steps)
+        self._clip = clip
+        self._steps, self._reward = 0, 0.0
+        clip.begin()
 
-    def _take(self, video: VideoRecorder) -> None:
+    def _settle(self) -> None:
+        """End the running video, if it is over."""
+        if self._clip is None or self._ending is None:
+            return
         try:
-            video.capture_frame()
-        except Exception as error:
-            if not self._tolerates(error):
-                raise
-            video.give_up(str(error))
-
-    def _end(self, video: VideoRecorder, facts: Mapping[str, Any]) -> None:
-        self._video = None
-        video.metadata.update(facts, length=self._steps)
-        try:
-            video.capture_last()
-            video.close()
-        except Error as error:
-            if not self._tolerates(error):
-                raise
-        finally:
-            self._on_end(video)
+            self._clip.end(
+                {**self._ending, "length": self._steps, "reward": self._reward}
+            )
+        except Exception:
+            # There is nothing more to be had of it. After Ctrl-C there is.
+            self._clip = self._ending = None
+            raise
+        self._clip = self._ending = None

@@ -19,7 +19,7 @@ class Rendering(Protocol):
     """Whoever turns ended trajectories into videos, beside the simulation."""
 
     def submit(self, trajectory: Path) -> None:
-        """Take over an ended trajectory. Never waits."""
+        """Take over an ended trajectory, or a clip by its first log. Never waits."""
 
     def wait(self, on_progress: Callable[[Any], None]) -> None:
         """Return when all that was taken over is done."""
@@ -59,6 +59,17 @@ class EndedTrajectories:
             self._rendering.submit(log)
         else:
             self._unfinished.append(log)
+
+    def add_clip(self, first_part: Path) -> None:
+        """Take over the logs of a video that is counted in steps. Never waits.
+
+        They stay as they are until it is rendered, by whomever.
+
+        Args:
+            first_part: the first of them.
+        """
+        if self._rendering is not None:
+            self._rendering.submit(first_part)
 
     def wait(self, on_progress: Callable[[Any], None]) -> None:
         """Return when whoever renders is done; at once where nobody does."""

@@ -9,13 +9,14 @@ from types import MappingProxyType
 from typing import Any
 
 from ..formats.monitor_directory import episode_of
-from ..formats.pending_videos import pending_video, with_reason
+from ..formats.pending_videos import pending_clip, pending_video, with_reason
 from ..formats.video_metadata import (
     finished_videos,
     is_broken,
     is_done,
     metadata_path,
 )
+from .deferred_clip import DeferredClip
 from .deferred_video import DeferredVideo
 from .video_recorder import VideoRecorder
 
@@ -35,8 +36,8 @@ class EpisodeVideos:
         # What is finished and was not told of: episode, video and metadata.
         self._news: list[tuple[int, Path, Path]] = []
         self._broken: list[str] = []
-        # Number, base name of the trajectory without extension, and the video.
-        self._deferred: list[tuple[int, str, Path]] = []
+        # How a manifest names them while they are pending, and where they will be.
+        self._deferred: list[tuple[dict[str, Any], Path]] = []
 
     def add_live(self, recorder: VideoRecorder) -> None:
         """Note a video that was drawn while its episode ran."""
@@ -52,7 +53,16 @@ class EpisodeVideos:
         self, episode_id: int, trajectory: Path, video: DeferredVideo
     ) -> None:
         """Note a video that is to be rendered from a trajectory."""
-        self._deferred.append((episode_id, trajectory.stem, Path(video.path)))
+        path = Path(video.path)
+        entry = pending_video(episode_id, trajectory=trajectory.stem, video=path.name)
+        self._deferred.append((entry, path))
+
+    def add_deferred_clip(self, clip: DeferredClip) -> None:
+        """Note a video that is counted in steps and is to be rendered."""
+        entry = pending_clip(
+            clip.episode_id, first_part=clip.first_part.name, video=clip.video.name
+        )
+        self._deferred.append((entry, clip.video))
 
     def finished(self) -> list[tuple[str, str]]:
         """Return the names of the videos that are there now, and their metadata's.
@@ -87,18 +97,12 @@ class EpisodeVideos:
             reasons: why rendering has failed, by the names of videos or of logs.
         """
         self._look_for_rendered()
-        return [
-            with_reason(
-                pending_video(episode_id, trajectory=trajectory, video=video.name),
-                reasons,
-            )
-            for episode_id, trajectory, video in self._deferred
-        ]
+        return [with_reason(entry, reasons) for entry, _ in self._deferred]
 
     def _look_for_rendered(self) -> None:
         waiting = []
         for entry in self._deferred:
-            video = entry[2]
+            video = entry[1]
             if not is_done(video):
                 waiting.append(entry)
             elif is_broken(metadata_path(video)):

@@ -123,10 +123,10 @@ class RecorderOptions:
                 "video_length must be a positive whole number of steps, or None for "
                 f"videos until the end of the episode, got {length!r}."
             )
-        if self.has_clips and self.render in (DEFERRED, OFF):
+        if self.has_clips and self.render == OFF:
             raise InvalidArgument(
-                "Videos that are counted in steps (step_trigger, video_length) are "
-                f'drawn live: use render="live" or None, got {self.render!r}.'
+                "step_trigger and video_length are about videos, and with "
+                'render="off" there are none: leave one of them out.'
             )
         prefix = self.name_prefix
         if prefix is not None and not (

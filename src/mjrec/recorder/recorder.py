@@ -24,6 +24,7 @@ from ..errors import (
 from ..formats.journal import JournalEntry, JournalWriter
 from ..formats.manifest import Manifest, write_manifest
 from ..formats.monitor_directory import (
+    clip_video_prefix,
     journal_name,
     manifest_name,
     stats_prefix,
@@ -35,13 +36,15 @@ from ..formats.trajectory_log import RowBlocks
 from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
-from .clips import Clips
+from .clips import Clip, Clips
+from .deferred_clip import ClipLogs, DeferredClip
 from .deferred_video import DeferredVideo
 from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
 from .episode_videos import EpisodeVideos
 from .faults import Faults, What
 from .kept_videos import KeptVideos
+from .live_clip import LiveClip, name_further_videos
 from .opening import OpenDirectory, open_directory
 from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
 from .selection import Standing, selection_from
@@ -101,6 +104,7 @@ class Recorder:
             check_pictures(subject)
         self._subject = subject
         self._states = subject.states
+        self._clip_states = subject.clip_states
         self._options = options
         self._env_info = {"gym_version": GYM_VERSION, "env_id": subject.env_id}
         self._pid = os.getpid()
@@ -123,8 +127,8 @@ class Recorder:
             uid=options.uid,
             env_info=self._env_info,
         )
-        if self._states is not None:
-            self._states.open(self.directory)
+        for states in self._all_states():
+            states.open(self.directory)
         self._ended = EndedTrajectories(
             rendering(self.directory) if rendering else None, finish_log
         )
@@ -166,7 +170,14 @@ class Recorder:
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
         # The same, where it is drawn live, and those of further cameras.
         self._live_videos: tuple[VideoRecorder, ...] = ()
-        self._clips = self._new_clips() if options.has_clips else None
+        self._clip_logs = self._new_clip_logs()
+        self._clips: Clips | None = None
+        if options.has_clips:
+            self._clips = Clips(
+                length=options.video_length,
+                trigger=options.step_trigger,
+                make=self._new_clip,
+            )
         self.closed = False
 
     @property
@@ -207,8 +218,8 @@ class Recorder:
 
     def model_changed(self) -> None:
         """Note that textures, height fields or meshes were changed in mid-episode."""
-        if self._states is not None:
-            self._states.model_changed()
+        for states in self._all_states():
+            states.model_changed()
 
     def resetting(self) -> AbstractContextManager[None]:
         """Return what to put around the reset of the environment."""
@@ -355,7 +366,12 @@ class Recorder:
                 for video in self._live_videos:
                     self._take_picture(video, is_there=picture, last=done)
                 if self._clips is not None:
-                    self._clips.step(is_there=picture, done=done)
+                    self._clips.step(
+                        reward,
+                        terminated=bool(terminated),
+                        truncated=bool(truncated),
+                        is_there=picture,
+                    )
             finally:
                 if done:
                     self._end_episode()
@@ -408,10 +424,10 @@ class Recorder:
 
     def _end_by_close(self) -> None:
         with contextlib.ExitStack() as ends:
-            if self._states is not None:
+            for states in self._all_states():
                 # A trajectory without its model is worth nothing, and what stores it
                 # may end with the process.
-                ends.callback(self._finish_models, self._states)
+                ends.callback(self._finish_models, states)
             if self._kept is not None:
                 ends.callback(self._settle, self._kept.decide)
             ends.callback(self._end_episode)
@@ -419,36 +435,85 @@ class Recorder:
             if self._clips is not None:
                 self._clips.close(self._ending or {"reason": CLOSE})
 
-    def _new_clips(self) -> Clips:
-        def begin(steps: int | None) -> VideoRecorder:
-            episode_id = self._next_episode_id - 1
-            path = self._video_path(episode_id)
-            if steps is not None:
-                path = path.with_name(f"{path.name}.step{steps:06d}")
-            self._subject.pictures.begin_episode()
-            named = ("episode", episode_id) if steps is None else ("step", steps)
-            video = self._live_video(path, self._subject.pictures)
+    def _all_states(self) -> list[StateSource]:
+        return [each for each in (self._states, self._clip_states) if each is not None]
+
+    def _new_clip_logs(self) -> ClipLogs | None:
+        """Return what clips that are rendered later have in common, if they can be."""
+        if self._clip_states is None or self._choice.mode != DEFERRED:
+            return None
+        return ClipLogs(
+            directory=self.directory,
+            infix=self._place.infix,
+            states=self._clip_states,
+            pace=self._pace,
+            facts=self._episode_facts,
+            before=self._before_clip,
+            tolerates=self._tolerates_in_video,
+            on_end=self._add_deferred_clip,
+        )
+
+    def _new_clip(self, steps: int | None) -> Clip:
+        """Return what records a video that is counted in steps, beginning now.
+
+        Args:
+            steps: how many were taken when a step began it; None where it begins with
+                an episode.
+        """
+        logs, episode_id = self._clip_logs, self._next_episode_id - 1
+        name = clip_video_prefix(self._place.infix, episode_id, steps)
+        named = ("episode", episode_id) if steps is None else ("step", steps)
+        path, second_name = self.directory / name, self._second_name(*named)
+        if logs is not None:
+            start = logs.states.begin_episode()
+            if self._can_be_deferred(start):
+                promise = self._promise(path, DEFERRED)
+                return DeferredClip(
+                    logs,
+                    start,
+                    first_step=self.stats_recorder.total_steps,
+                    episode_id=episode_id,
+                    video=path.with_name(f"{name}.mp4"),
+                    facts={"kept": False, "video": {**promise, **second_name}},
+                )
+        return self._live_clip(path, second_name)
+
+    def _live_clip(self, path: Path, second_name: Mapping[str, str]) -> LiveClip:
+        videos = self._live_videos_at(path)
+        for video in videos:
             video.metadata.update(
                 first_step=self.stats_recorder.total_steps,
-                last_episode_id=episode_id,
-                **self._second_name(*named),
+                last_episode_id=self._next_episode_id - 1,
             )
-            return video
-
-        def end(video: VideoRecorder) -> None:
-            self.add_video(video)
-            _name_again(video)
-
-        def tolerates(error: Exception) -> bool:
-            return self._tolerates("video", error)
-
-        return Clips(
-            length=self._options.video_length,
-            trigger=self._options.step_trigger,
-            begin=begin,
-            on_end=end,
-            tolerates=tolerates,
+        videos[0].metadata.update(second_name)
+        subject = self._subject
+        return LiveClip(
+            videos,
+            (subject.pictures, *subject.further_pictures.values()),
+            on_end=self._add_live_clip,
+            tolerates=self._tolerates_in_video,
         )
+
+    def _before_clip(self) -> dict[str, Any]:
+        """Return what of the running episode is not in a part that begins now."""
+        stats = self.stats_recorder
+        return {
+            "steps_before": stats.steps or 0,
+            "reward_before": stats.rewards or 0.0,
+            "reset_time": self._reset_clock,
+        }
+
+    def _add_live_clip(self, videos: Sequence[VideoRecorder]) -> None:
+        for video in videos:
+            self.add_video(video)
+        _name_again(videos[0])
+
+    def _add_deferred_clip(self, clip: DeferredClip) -> None:
+        self._videos.add_deferred_clip(clip)
+        self._ended.add_clip(clip.first_part)
+
+    def _tolerates_in_video(self, error: Exception) -> bool:
+        return self._tolerates("video", error)
 
     def _finish_models(self, states: StateSource) -> None:
         try:
@@ -535,23 +600,33 @@ class Recorder:
 
     def _begin_live_videos(self, episode_id: int, *, enabled: bool) -> None:
         path = self._video_path(episode_id)
-        main = self._live_video(path, self._subject.pictures, enabled=enabled)
+        main, *further = self._live_videos_at(path, enabled=enabled)
         main.metadata.update(self._second_name("episode", episode_id))
         self.video_recorder = main
         if not main.enabled:
             return
-        further = self._subject.further_pictures
-        self._live_videos = (
-            main,
-            *(
-                self._live_video(path.with_name(f"{path.name}.{name}"), pictures)
-                for name, pictures in further.items()
-            ),
-        )
-        for pictures in (self._subject.pictures, *further.values()):
+        self._live_videos = (main, *further)
+        subject = self._subject
+        for pictures in (subject.pictures, *subject.further_pictures.values()):
             pictures.begin_episode()
         for video in self._live_videos:
             video.capture_frame()
+
+    def _live_videos_at(
+        self, path: Path, *, enabled: bool = True
+    ) -> tuple[VideoRecorder, ...]:
+        """Return what draws the first camera's video, and then the others' if it is."""
+        main = self._live_video(path, self._subject.pictures, enabled=enabled)
+        if not main.enabled:
+            return (main,)
+        further = self._subject.further_pictures.items()
+        return (
+            main,
+            *(
+                self._live_video(path.with_name(f"{path.name}.{name}"), pictures)
+                for name, pictures in further
+            ),
+        )
 
     def _live_video(
         self, base_path: Path, pictures: EpisodePictures, *, enabled: bool = True
@@ -612,28 +687,44 @@ class Recorder:
         video: str | None,
         is_kept: bool,
     ) -> dict[str, Any]:
+        promise = None
+        if video is not None:
+            promise = self._episode_promise(episode_id, video)
         return {
-            "episode_id": episode_id,
+            **self._episode_facts(start),
+            "random_state": self._random_state,
+            "kept": is_kept,
+            "video": promise,
+            **({} if self._kept is None else {"candidate": video is not None}),
+        }
+
+    def _episode_facts(self, start: EpisodeStart | None) -> dict[str, Any]:
+        """Return what a log says of the running episode."""
+        return {
+            "episode_id": self._next_episode_id - 1,
             "infix": str(self._place.infix),
             "env_id": self._subject.env_id,
             "type": self.stats_recorder.episode_type,
             **self._episode_start,
-            "random_state": self._random_state,
             "environment": self._subject.environment,
             "versions": dict(versions()),
             "model": None if start is None else start.model,
             "scene": None if start is None else start.scene,
             "refusal": None if start is None else start.refusal,
-            "kept": is_kept,
-            "video": None if video is None else self._promise(episode_id, video),
-            **({} if self._kept is None else {"candidate": video is not None}),
         }
 
-    def _promise(self, episode_id: int, recording: str) -> dict[str, Any]:
-        """Return what a trajectory says of its video."""
+    def _episode_promise(self, episode_id: int, recording: str) -> dict[str, Any]:
+        """Return what a trajectory says of its episode's video."""
+        return {
+            **self._promise(self._video_path(episode_id), recording),
+            **self._second_name("episode", episode_id),
+        }
+
+    def _promise(self, path: Path, recording: str) -> dict[str, Any]:
+        """Return what is said of a video that belongs at `path`, but its ending."""
         options = self._options
         promise: dict[str, Any] = {
-            "name": self._video_path(episode_id).name + ".mp4",
+            "name": f"{path.name}.mp4",
             "quality": options.quality,
             "fps": None if options.fps is None else str(options.fps),
             "max_fps": None if options.max_fps is None else str(options.max_fps),
@@ -647,7 +738,7 @@ class Recorder:
             promise["annotate"] = True
         if self._kept is not None:
             promise["selection"] = self._kept.facts()
-        return {**promise, **self._second_name("episode", episode_id)}
+        return promise
 
     def _second_name(self, what: str, number: int) -> dict[str, str]:
         """Return what a video is called besides, for its metadata."""
@@ -686,7 +777,7 @@ class Recorder:
         """Ask the schedule; only once for a number, which resets may share."""
         if self._decision[0] != episode_id:
             self._decision = (episode_id, bool(self._schedule(episode_id)))
-            if self._decision[1] and self._kept is None:
+            if self._decision[1]:
                 self._videos.scheduled.append(episode_id)
         return self._decision[1]
 
@@ -897,7 +988,7 @@ class Recorder:
                     if standing is Standing.CHOSEN:
                         ends.callback(_name_again, video)
                     ends.callback(self._end_live_video, video, facts, standing)
-                    ends.callback(_name_further, video, self._live_videos[1:])
+                    ends.callback(name_further_videos, video, self._live_videos[1:])
                 for video in self._live_videos[1:]:
                     ends.callback(self._end_live_video, video, facts, standing)
         if self._kept is not None:
@@ -913,7 +1004,7 @@ class Recorder:
         episode_id = self._next_episode_id - 1
         video = self.video_recorder
         deferred = video if isinstance(video, DeferredVideo) else None
-        promise = self._promise(episode_id, DEFERRED if deferred else LIVE)
+        promise = self._episode_promise(episode_id, DEFERRED if deferred else LIVE)
         verdict: Mapping[str, Any] = {}
         if self._kept is not None and self._decision[1]:
             verdict = self._kept.verdict(standing, promise)
@@ -1028,13 +1119,6 @@ def _name_again(video: VideoRecorder) -> None:
     """Give the finished videos of an episode their second names, if they have any."""
     if video.finished and video.path is not None and "also_named" in video.metadata:
         give_second_names(Path(video.path))
-
-
-def _name_further(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:
-    """Let the metadata of an episode's first video name the others."""
-    names = [Path(v.path).name for v in others if v.finished and v.path is not None]
-    if names:
-        first.metadata["further_videos"] = names
 
 
 # Asking the system for the process's number at every step takes as long as counting it.

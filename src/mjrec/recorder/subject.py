@@ -45,6 +45,9 @@ class Subject:
         rendering: when pictures are drawn.
         cameras: all of them, for JSON, where there are several.
         states: of its simulation; None where there is none that can be seen.
+        clip_states: the same once more, for videos that are counted in steps: they
+            run beside episodes, and a source has one reader only. None where there
+            are no such videos.
         environment: what it can be made from again, for the trajectories.
         random_state: returns the state of its random generator, for JSON, or None.
     """
@@ -58,6 +61,7 @@ class Subject:
     further_pictures: Mapping[str, EpisodePictures] = field(default_factory=dict)
     cameras: tuple[Any, ...] = ()
     states: StateSource | None = None
+    clip_states: StateSource | None = None
     environment: Mapping[str, Any] | None = None
     random_state: Callable[[], Any] = lambda: None
 

@@ -23,7 +23,8 @@ class Captions:
 
     The return is the sum of the rewards up to the frame's step. The time is that of
     the simulation since the reset; where no states were recorded, so many steps; where
-    it is not known how long these are, there is none.
+    it is not known how long these are, there is none. A part of a clip may begin in the
+    midst of an episode, and says what was before it.
 
     Args:
         reader: of the trajectory; not used any more afterwards.
@@ -36,12 +37,14 @@ class Captions:
     def __init__(self, reader: TrajectoryReader, indices: Sequence[int]) -> None:
         facts = reader.header.facts
         self._episode_id = int(facts.get("episode_id") or 0)
+        before = facts.get("clip") or {}
         steps = reader.frame_steps[list(indices)]
-        self._steps: list[int] = steps.tolist()
+        self._steps: list[int] = (steps + before.get("steps_before", 0)).tolist()
         # One after the other, as the monitor adds them up.
-        sums = np.cumsum(np.concatenate([[0.0], reader.rewards]))
+        first = float(before.get("reward_before", 0.0))
+        sums = np.cumsum(np.concatenate([[first], reader.rewards]))
         self._rewards: list[float] = sums[np.minimum(steps, len(sums) - 1)].tolist()
-        self._times = _times(reader, self._steps)
+        self._times = _times(reader, steps.tolist(), before.get("reset_time"))
 
     def __iter__(self) -> Iterator[Caption]:
         times: Iterable[float | None]
@@ -52,10 +55,13 @@ class Captions:
             )
 
 
-def _times(reader: TrajectoryReader, steps: Sequence[int]) -> list[float] | None:
+def _times(
+    reader: TrajectoryReader, steps: Sequence[int], reset_time: float | None
+) -> list[float] | None:
     clock = _clock(reader)
     if clock is not None and len(clock) > max(steps, default=0):
-        elapsed = clock[list(steps)] - clock[0]
+        began = clock[0] if reset_time is None else reset_time
+        elapsed = clock[list(steps)] - began
         return [float(seconds) for seconds in elapsed]
     timestep = reader.header.facts.get("timestep")
     if timestep is None:

@@ -1,54 +1,77 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finishing episodes: the trajectory's final form, the video, the manifest.
+"""Finishing recordings: the trajectory's final form, the video, the manifest.
 
-One episode after the other, each by all workers. What cannot be done is told, stays
-as it was, and stops nothing else.
+One episode or clip after the other, each by all workers. What cannot be done is told,
+stays as it was, and stops nothing else.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 from ..errors import BlankVideo, Error, GLError
 from ..formats.second_names import give_all_second_names
 from ..formats.trajectory_file import finish_trajectory
 from ..formats.video_writer import VideoFile
+from .clip_videos import render_clip
 from .crew import Crew
 from .outcomes import Outcome
-from .pending import EpisodeKey, PendingEpisode, claim, look_at, remove_unfinished
+from .pending import (
+    PendingEpisode,
+    PendingRecording,
+    RecordingKey,
+    claim,
+    look_at,
+    remove_unfinished,
+)
 from .progress import Progress
+from .recorded_clips import PendingClip
 from .rendered_manifests import reconcile, update_manifest
 from .videos import render_video
+from .workers import DrawingWorkers
 
 __all__ = ["EpisodeFinisher", "finish_pending"]
 
 logger = logging.getLogger(__name__)
 
 
+class _Render(Protocol):
+    """Renders the videos of one recording."""
+
+    def __call__(
+        self,
+        *,
+        workers: DrawingWorkers,
+        strict: bool,
+        on_frame: Callable[[], object],
+    ) -> VideoFile | None: ...
+
+
 def finish_pending(
     directory: Path,
-    keys: Iterable[EpisodeKey],
+    keys: Iterable[RecordingKey],
     *,
     workers: int | None,
     strict: bool = False,
     on_progress: Callable[[Progress], object] = lambda _: None,
 ) -> Iterator[Outcome]:
-    """Finish what is pending of some episodes, and yield what became of each.
+    """Finish what is pending of some recordings, and yield what became of each.
 
-    Nothing is yielded of an episode that nothing was to be done about. What another
+    Nothing is yielded of one that nothing was to be done about. What another
     process is at is left to it. Manifests of monitors that are closed are kept true,
     and second names of videos are given, also where an earlier run could not.
 
     Args:
         directory: the monitor directory.
-        keys: which episodes.
+        keys: which episodes and clips.
         workers: how many processes draw; None is one for each free CPU.
         strict: whether a video that shows nothing is a failure.
         on_progress: called after every frame, and when an episode is over.
@@ -69,7 +92,7 @@ def finish_pending(
 
 
 class EpisodeFinisher:
-    """Finishes the episodes that are added to it.
+    """Finishes the episodes and clips that are added to it.
 
     Args:
         directory: the monitor directory.
@@ -80,8 +103,8 @@ class EpisodeFinisher:
 
     Attributes:
         progress: how far it is.
-        on_progress: called after every frame, and when an episode is over. It may add
-            episodes.
+        on_progress: called after every frame, and when a recording is done. It may add
+            recordings.
     """
 
     def __init__(
@@ -99,7 +122,7 @@ class EpisodeFinisher:
         self._strict = strict
         self._crew = Crew(directory, workers=workers, wait=wait)
         # None stands for one that could not be read when it was added.
-        self._waiting: dict[EpisodeKey, PendingEpisode | None] = {}
+        self._waiting: dict[RecordingKey, PendingRecording | None] = {}
         self._gl_failure: GLError | None = None
 
     def __len__(self) -> int:
@@ -116,36 +139,36 @@ class EpisodeFinisher:
     ) -> None:
         self._crew.close()
 
-    def add(self, key: EpisodeKey) -> bool:
-        """Add an episode, and return whether there is anything to do about it."""
+    def add(self, key: RecordingKey) -> bool:
+        """Add a recording, and return whether there is anything to do about it."""
         try:
-            episode = look_at(self._directory, key)
+            pending = look_at(self._directory, key)
         except (Error, OSError):
             # The same again when its turn comes, which is when it is told.
-            episode = None
+            pending = None
         else:
-            if episode is None:
+            if pending is None:
                 return False
-        self._waiting[key] = episode
-        videos, frames = _work(episode)
+        self._waiting[key] = pending
+        videos, frames = _work(pending)
         if videos:
             self._count(videos=videos, frames=frames)
         return True
 
     def is_ready(self) -> bool:
-        """Tell whether an episode waits whose model is there already."""
+        """Tell whether a recording waits whose model is there already."""
         return any(map(_has_model, self._waiting.values()))
 
-    def finish_next(self) -> tuple[EpisodeKey, Outcome]:
-        """Finish the first episode whose model is there, else the first."""
+    def finish_next(self) -> tuple[RecordingKey, Outcome]:
+        """Finish the first recording whose model is there, else the first."""
         key = next(
-            (key for key, episode in self._waiting.items() if _has_model(episode)),
+            (key for key, pending in self._waiting.items() if _has_model(pending)),
             next(iter(self._waiting)),
         )
-        episode = self._waiting.pop(key)
+        pending = self._waiting.pop(key)
         before = self.progress
         outcome = self._finish(key)
-        videos, frames = _work(episode)
+        videos, frames = _work(pending)
         if videos:
             # Also the frames that were not drawn: nobody waits for them any more.
             self.progress = replace(
@@ -167,56 +190,84 @@ class EpisodeFinisher:
         self.progress = replace(self.progress, **now)
         self.on_progress(self.progress)
 
-    def _finish(self, key: EpisodeKey) -> Outcome:
-        nothing = Outcome(name=key.video_name, directory=self._directory)
+    def _finish(self, key: RecordingKey) -> Outcome:
+        nothing = Outcome(name=key.told_name, directory=self._directory)
         try:
             lock = claim(self._directory, key)
             if lock is None:
                 return replace(nothing, is_elsewhere=True)
             try:
                 # Somebody else may have done it since it was added.
-                episode = look_at(self._directory, key)
-                return nothing if episode is None else self._finish_claimed(episode)
+                pending = look_at(self._directory, key)
+                if pending is None:
+                    return nothing
+                if pending.video is not None:
+                    nothing = replace(nothing, name=pending.video.name)
+                if isinstance(pending, PendingClip):
+                    return self._finish_clip(pending)
+                return self._finish_episode(pending)
             finally:
                 lock.release()
         except (Error, OSError) as error:
             reason = str(error)
         except Exception as error:
-            logger.exception("%s cannot be finished.", key.trajectory_name)
+            logger.exception("%s cannot be finished.", key.recording_name)
             reason = f"{type(error).__name__}: {error}"
-        self._note_failure(key, reason)
+        self._note_failure(key, {nothing.name: reason})
         return replace(nothing, failure=reason)
 
-    def _note_failure(self, key: EpisodeKey, reason: str) -> None:
+    def _note_failure(self, key: RecordingKey, reasons: Mapping[str, str]) -> None:
         # Whatever stands in the way of that is told by `reconcile`.
         with contextlib.suppress(Error, OSError):
-            update_manifest(
-                self._directory, key.infix, reasons={key.video_name: reason}
-            )
+            update_manifest(self._directory, key.infix, reasons=reasons)
 
-    def _finish_claimed(self, episode: PendingEpisode) -> Outcome:
+    def _finish_clip(self, clip: PendingClip) -> Outcome:
+        outcome = Outcome(name=clip.parts[0].name, directory=self._directory)
+        if clip.video is not None:
+            outcome = self._finish_videos(
+                clip,
+                replace(outcome, name=clip.video.name),
+                functools.partial(render_clip, clip.parts),
+            )
+        # The first one last: it says which video they are of.
+        for part in reversed(clip.parts):
+            part.unlink(missing_ok=True)
+        update_manifest(self._directory, clip.key.infix)
+        return outcome
+
+    def _finish_episode(self, episode: PendingEpisode) -> Outcome:
         path = episode.trajectory
         if episode.is_log and episode.is_kept:
             path = finish_trajectory(path)
         outcome = Outcome(name=path.name, directory=self._directory)
         if episode.video is not None:
-            outcome = replace(outcome, name=episode.video.name)
-            for video in (episode.video, *episode.further_videos):
-                remove_unfinished(video)
-            outcome = self._rendered(path, outcome)
-            if outcome.is_video:
-                names = tuple(video.name for video in episode.further_videos)
-                outcome = replace(outcome, further_videos=names)
+            outcome = self._finish_videos(
+                episode,
+                replace(outcome, name=episode.video.name),
+                functools.partial(render_video, path),
+            )
         if not episode.is_kept:
             for suffix in (".log", ".h5"):
                 path.with_suffix(suffix).unlink(missing_ok=True)
         update_manifest(self._directory, episode.key.infix)
         return outcome
 
-    def _rendered(self, trajectory: Path, outcome: Outcome) -> Outcome:
-        """Render the video of a trajectory, and return what became of it."""
+    def _finish_videos(
+        self, pending: PendingRecording, outcome: Outcome, render: _Render
+    ) -> Outcome:
+        """Render the videos of a recording, and return what became of them."""
+        assert pending.video is not None
+        for video in (pending.video, *pending.further_videos):
+            remove_unfinished(video)
+        outcome = self._rendered(outcome, render)
+        if not outcome.is_video:
+            return outcome
+        names = tuple(video.name for video in pending.further_videos)
+        return replace(outcome, further_videos=names)
+
+    def _rendered(self, outcome: Outcome, render: _Render) -> Outcome:
         try:
-            file = self._render(trajectory)
+            file = self._render(render)
         except BlankVideo as error:
             # It is as much of a video as there will ever be.
             return replace(
@@ -229,13 +280,12 @@ class EpisodeFinisher:
         frame_count = 0 if file is None else file.frame_count
         return replace(outcome, is_video=frame_count > 0, frame_count=frame_count)
 
-    def _render(self, trajectory: Path) -> VideoFile | None:
+    def _render(self, render: _Render) -> VideoFile | None:
         if self._gl_failure is not None:
             # The same for all of them, after a second of trying each.
             raise self._gl_failure
         try:
-            return render_video(
-                trajectory,
+            return render(
                 workers=self._crew.at_work(),
                 strict=self._strict,
                 on_frame=lambda: self._count(frames_done=1),
@@ -245,11 +295,11 @@ class EpisodeFinisher:
             raise
 
 
-def _work(episode: PendingEpisode | None) -> tuple[int, int]:
-    """Return how many videos and frames an episode is; one that is not known is one."""
-    return (1, 0) if episode is None else (episode.video_count, episode.frame_count)
+def _work(pending: PendingRecording | None) -> tuple[int, int]:
+    """Return how many videos and frames it is; one that is not known is one."""
+    return (1, 0) if pending is None else (pending.video_count, pending.frame_count)
 
 
-def _has_model(episode: PendingEpisode | None) -> bool:
-    file = None if episode is None else episode.model_file
+def _has_model(pending: PendingRecording | None) -> bool:
+    file = None if pending is None else pending.model_file
     return file is None or file.exists()

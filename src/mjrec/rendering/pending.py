@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is left to do about the recorded episodes of a directory.
+"""What is left to do about the recordings of a directory.
 
 An episode is left to do when its trajectory is still a log, though it has ended, or
-when its video was deferred and is not there. Whoever does it holds the episode's lock,
-so that any number of processes can share the work of a directory, and what a dead one
-left is taken over.
+when its video was deferred and is not there. A clip, a video that is counted in steps,
+is left to do as long as it has logs. Whoever does it holds the lock of the episode or
+the clip, so that any number of processes can share the work of a directory, and what a
+dead one left is taken over.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from ..errors import DirectoryNotWritable
 from ..formats.frame_hashes import frame_hash_path
@@ -31,15 +32,20 @@ from ..formats.monitor_directory import (
 )
 from ..formats.trajectory_file import find_trajectory
 from ..formats.video_metadata import is_done, metadata_path
-from .recorded_facts import open_for_rendering
+from .recorded_clips import ClipKey, PendingClip, look_at_clip, recorded_clips
+from .recorded_facts import model_file, open_for_rendering
 from .videos import further_video_paths, video_path
 
 __all__ = [
     "EpisodeKey",
     "PendingEpisode",
+    "PendingRecording",
+    "RecordingKey",
     "claim",
+    "key_of",
     "look_at",
     "recorded_episodes",
+    "recordings",
     "remove_unfinished",
 ]
 
@@ -66,9 +72,24 @@ class EpisodeKey:
         return None if infix is None or number is None else cls(infix, number)
 
     @property
+    def lock_name(self) -> str:
+        """The name of what whoever is at it holds locked."""
+        return video_lock_name(self.infix, self.episode_id)
+
+    @property
     def trajectory_name(self) -> str:
         """The base name of the trajectory without extension."""
         return trajectory_prefix(self.infix, self.episode_id)
+
+    @property
+    def recording_name(self) -> str:
+        """The base name of the trajectory, as logs call it."""
+        return self.trajectory_name
+
+    @property
+    def told_name(self) -> str:
+        """What it is called where nothing is known of it."""
+        return self.video_name
 
     @property
     def video_name(self) -> str:
@@ -109,6 +130,20 @@ class PendingEpisode:
         return self.trajectory.suffix == ".log"
 
 
+RecordingKey: TypeAlias = EpisodeKey | ClipKey
+PendingRecording: TypeAlias = PendingEpisode | PendingClip
+
+
+def key_of(name: str) -> RecordingKey | None:
+    """Return that of the episode or clip that a file is of; None for other files."""
+    return ClipKey.of(name) or EpisodeKey.of(name)
+
+
+def recordings(directory: Path) -> list[RecordingKey]:
+    """Return the episodes that have a trajectory, and the clips that have logs."""
+    return [*recorded_episodes(directory), *recorded_clips(directory)]
+
+
 def recorded_episodes(directory: Path) -> list[EpisodeKey]:
     """Return the episodes that have a trajectory, monitor by monitor, in order."""
     keys = {
@@ -122,8 +157,8 @@ def recorded_episodes(directory: Path) -> list[EpisodeKey]:
     )
 
 
-def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
-    """Return what is left to do about an episode; None where it is nothing.
+def look_at(directory: Path, key: RecordingKey) -> PendingRecording | None:
+    """Return what is left to do about a recording; None where it is nothing.
 
     An episode that is still running, or of which its monitor has not decided yet
     whether it gets a video, is nobody's business but its monitor's: its log does not
@@ -134,6 +169,12 @@ def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
             cannot be.
         OSError: its monitor's lock cannot be looked at.
     """
+    if isinstance(key, ClipKey):
+        return look_at_clip(directory, key)
+    return _look_at_episode(directory, key)
+
+
+def _look_at_episode(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
     trajectory = find_trajectory(directory, key.infix, key.episode_id)
     if trajectory is None:
         return None
@@ -158,19 +199,18 @@ def look_at(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
             further_videos=tuple(further),
             frame_count=0 if video is None else reader.frame_count * (1 + len(further)),
             is_kept=facts.get("kept", True),
-            model_file=_model_file(directory, facts),
+            model_file=model_file(directory, facts),
         )
 
 
-def claim(directory: Path, key: EpisodeKey) -> Lock | None:
-    """Return the lock of an episode, or None where another process has it.
+def claim(directory: Path, key: RecordingKey) -> Lock | None:
+    """Return the lock of a recording, or None where another process has it.
 
     Raises:
         DirectoryNotWritable: there can be no lock in the directory.
     """
-    path = directory / video_lock_name(key.infix, key.episode_id)
     try:
-        return try_lock(path, f"{os.getpid()}\n")
+        return try_lock(directory / key.lock_name, f"{os.getpid()}\n")
     except OSError as error:
         raise DirectoryNotWritable(directory, error.strerror) from error
 
@@ -178,7 +218,7 @@ def claim(directory: Path, key: EpisodeKey) -> Lock | None:
 def remove_unfinished(video: Path) -> None:
     """Remove what a renderer that was killed has left of a deferred video.
 
-    To be called by who holds the episode's lock, so that nobody else is at it.
+    To be called by who holds the recording's lock, so that nobody else is at it.
     """
     ends = (video, frame_hash_path(video), metadata_path(video))
     for path in video.parent.iterdir():
@@ -202,10 +242,3 @@ def _deferred_video(trajectory: Path, facts: Mapping[str, Any]) -> Path | None:
         return None
     path = video_path(trajectory, facts)
     return None if is_done(path) else path
-
-
-def _model_file(directory: Path, facts: Mapping[str, Any]) -> Path | None:
-    """Return what comes first of a model; what it was made from may never come."""
-    model = facts.get("model") or {}
-    name = model.get("mjb") or model.get("xml")
-    return None if name is None else directory / name

@@ -20,6 +20,7 @@ from ..formats.json_fields import (
     integer,
     list_of,
     mapping,
+    number,
     optional,
     text,
     unreadable,
@@ -30,7 +31,7 @@ from ..frames import QUALITIES
 from ..rates import to_rate
 from .views import PlainCamera, plain_camera
 
-__all__ = ["open_for_rendering"]
+__all__ = ["model_file", "open_for_rendering"]
 
 # Not all that `Fraction` takes: 1e20000000 keeps it busy for a minute.
 _RATE = re.compile(r"\d{1,12}(/\d{1,12})?", re.ASCII)
@@ -39,7 +40,7 @@ _RATE = re.compile(r"\d{1,12}(/\d{1,12})?", re.ASCII)
 _ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/\d{1,40})?", re.ASCII)
 _BASE_NAME = re.compile(r"[\w.-]{1,200}", re.ASCII)
 _RECORDINGS = ("deferred", "live")
-_MOST_STEPS_A_FRAME = 10**12
+_MOST_STEPS = 10**12
 # Each may have a file of its own.
 _MOST_CAMERAS = 100
 
@@ -47,9 +48,9 @@ _MOST_CAMERAS = 100
 def open_for_rendering(path: Path) -> TrajectoryReader:
     """Open a trajectory, as `open_trajectory` does, and check its facts.
 
-    Afterwards `rate`, `timestep`, `scene`, `model` and `video` are there as they
-    should be, or None, or missing; `stride`, `kept` and `candidate` as they should be,
-    or missing.
+    Afterwards `rate`, `timestep`, `scene`, `model`, `video` and `clip` are there as
+    they should be, or None, or missing; `stride`, `kept` and `candidate` as they should
+    be, or missing.
 
     Raises:
         UnreadableFile: of `open_trajectory`; or a fact is of a kind that it cannot be.
@@ -64,6 +65,18 @@ def open_for_rendering(path: Path) -> TrajectoryReader:
     return reader
 
 
+def model_file(directory: Path, facts: Mapping[str, Any]) -> Path | None:
+    """Return what comes first of a model; what it was made from may never come.
+
+    Args:
+        directory: of the recording.
+        facts: the recording's, checked.
+    """
+    model = facts.get("model") or {}
+    name = model.get("mjb") or model.get("xml")
+    return None if name is None else directory / name
+
+
 def _check(facts: Mapping[str, Any]) -> None:
     for key in ("rate", "timestep"):
         field(facts, key, optional(_rate), default=None)
@@ -76,6 +89,7 @@ def _check(facts: Mapping[str, Any]) -> None:
         field(facts, key, optional(mapping), default=None)
     field(facts, "model", optional(_model), default=None)
     field(facts, "video", optional(_video), default=None)
+    field(facts, "clip", optional(_clip), default=None)
 
 
 def _model(value: Any) -> Mapping[str, Any]:
@@ -101,6 +115,15 @@ def _video(value: Any) -> Mapping[str, Any]:
         field(video, key, boolean, default=False)
     field(video, "also_named", optional(_second_name), default=None)
     return video
+
+
+def _clip(value: Any) -> Mapping[str, Any]:
+    clip = mapping(value)
+    for key in ("first_step", "part", "steps_before"):
+        field(clip, key, _count, default=0)
+    field(clip, "reward_before", number, default=0.0)
+    field(clip, "reset_time", optional(number), default=None)
+    return clip
 
 
 def _cameras(value: Any) -> tuple[PlainCamera | None, ...]:
@@ -149,10 +172,18 @@ def _base_name(value: Any) -> str:
 
 
 def _stride(value: Any) -> int:
-    number = integer(value)
-    if isinstance(value, float) or not 1 <= number <= _MOST_STEPS_A_FRAME:
-        raise ValueError(f"{number!r:.80} is no number of steps")
-    return number
+    return _steps(value, least=1)
+
+
+def _count(value: Any) -> int:
+    return _steps(value, least=0)
+
+
+def _steps(value: Any, *, least: int) -> int:
+    steps = integer(value)
+    if isinstance(value, float) or not least <= steps <= _MOST_STEPS:
+        raise ValueError(f"{steps!r:.80} is no number of steps")
+    return steps
 
 
 def _one_of(*choices: str) -> Any:

@@ -2,8 +2,9 @@
 """A process that finishes episodes beside a simulation.
 
 `python -m mjrec.rendering.render_server DIRECTORY --workers N|auto [--strict]`. On its
-standard input it is told the base name of one ended trajectory a line, and at last
-`that was all`. On its standard output it says one JSON object a line::
+standard input it is told the base name of one ended trajectory a line, or of the first
+log of a clip, and at last `that was all`. On its standard output it says one JSON
+object a line::
 
     {"progress": {"videos_done": 0, "videos": 2, "frames_done": 40, "frames": 2002}}
     {"done": "<trajectory>", "name": "<video or trajectory>", "failure": null}
@@ -35,7 +36,7 @@ from typing import Any
 from ..patience import patience_s
 from .child_python import say_stacks_when_asked, take_standard_output
 from .finishing import EpisodeFinisher
-from .pending import EpisodeKey
+from .pending import RecordingKey, key_of
 from .progress import Progress
 from .render_service import ALL_SAID
 
@@ -96,7 +97,7 @@ class _Service:
         self._answers = answers
         self._last_report = 0.0
         # By which names they were given.
-        self._names: dict[EpisodeKey, str] = {}
+        self._names: dict[RecordingKey, str] = {}
         self._finisher = finisher
         finisher.on_progress = self._look_up
 
@@ -130,7 +131,7 @@ class _Service:
     def _take_in(self) -> bool:
         """Take what was said, and return whether there is something to do."""
         for name in self._inbox.names():
-            key = EpisodeKey.of(name)
+            key = key_of(name)
             if key is not None and self._finisher.add(key):
                 self._names[key] = name
             else:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -21,7 +21,14 @@ from ..annotation import Caption, annotated, check_annotation, pillow_version
 from ..atomic_files import write_text
 from ..blank_frames import BlankFrames
 from ..errors import EncoderError, NoPictures, UnreadableFile
-from ..formats.monitor_directory import Infix, episode_of, infix_of, video_prefix
+from ..formats.monitor_directory import (
+    ClipPart,
+    Infix,
+    clip_video_prefix,
+    episode_of,
+    infix_of,
+    video_prefix,
+)
 from ..formats.second_names import give_second_names, take_second_names
 from ..formats.trajectory_reader import TrajectoryReader
 from ..formats.video_metadata import (
@@ -48,7 +55,19 @@ from .recorded_pictures import (
 from .views import PlainCamera, View, plain_camera
 from .workers import DrawingWorkers
 
-__all__ = ["further_video_paths", "render_video", "video_path"]
+__all__ = [
+    "Footage",
+    "ending_facts",
+    "further_video_paths",
+    "is_annotated",
+    "known_facts",
+    "render_footage",
+    "render_video",
+    "usual_fps",
+    "video_path",
+    "what_broke",
+    "write_that_it_broke",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -71,6 +90,31 @@ class _Shot:
     view: View
     cameras: tuple[PlainCamera | None, ...] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footage:
+    """What there is to be drawn.
+
+    Attributes:
+        runs: recordings, and the numbers of their pictures that are wanted.
+        facts: of the first recording, among them what is said of the video.
+        metadata: what the metadata says of whatever was recorded.
+        steps: of the pictures.
+        stride: the usual number of steps from one picture to the next.
+        timestep: simulated seconds of a step, as text, where they are known.
+        fps: of the file.
+        captions: what is written on the pictures; None where nothing is.
+    """
+
+    runs: Sequence[tuple[Path, Sequence[int]]]
+    facts: Mapping[str, Any]
+    metadata: Mapping[str, Any]
+    steps: Sequence[int]
+    stride: int
+    timestep: str | None
+    fps: Fraction
+    captions: Iterable[Caption] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,52 +172,83 @@ def render_video(
         FileNotWritten: the disk is full.
         Error: its frames cannot be drawn or encoded.
     """
-    view = view or View()
     with open_for_rendering(trajectory) as reader:
         facts = reader.header.facts
-        shots = _shots(trajectory, facts, view, out)
-        broken = _what_broke(facts)
         if reader.frame_count == 0:
-            if broken and facts.get("video"):
-                nothing = {**_episode_facts(reader), "empty": True, **broken}
-                _write_metadata(shots[-1].path, nothing)
+            if "broken_reason" in facts and facts.get("video"):
+                write_that_it_broke(out or video_path(trajectory, facts), _told(reader))
                 return None
             raise NoPictures(_why_no_pictures(trajectory, facts))
         warn_of_other_pictures(reader)
         chosen = chosen_frames(reader.frame_count, facts, max_fps)
-        stride = facts.get("stride", 1) * chosen.every
-        steps = reader.frame_steps[chosen.indices].tolist()
-        captions = _captions(reader, chosen, annotate)
-        episode = _episode_facts(reader)
-    rate = _usual_fps(facts, chosen) if fps is None else to_rate(fps)
+        footage = Footage(
+            runs=[(trajectory, chosen.indices)],
+            facts=facts,
+            metadata=_told(reader),
+            steps=reader.frame_steps[chosen.indices].tolist(),
+            stride=facts.get("stride", 1) * chosen.every,
+            timestep=facts.get("timestep"),
+            fps=usual_fps(facts, chosen) if fps is None else to_rate(fps),
+            captions=_captions(reader, chosen, annotate),
+        )
+    return render_footage(
+        footage,
+        workers=workers,
+        view=view or View(),
+        out=out,
+        strict=strict,
+        on_frame=on_frame,
+    )
+
+
+def render_footage(
+    footage: Footage,
+    *,
+    workers: DrawingWorkers,
+    view: View,
+    out: Path | None = None,
+    strict: bool = False,
+    on_frame: Callable[[], object] = lambda: None,
+) -> VideoFile:
+    """Render the video of what was recorded, or the video of each camera.
+
+    See `render_video`, also for what it raises.
+
+    Returns:
+        What was written, of the first camera.
+    """
+    shots = _shots(footage.runs[0][0], footage.facts, view, out)
     if out is None:
         # They would go on leading to what is replaced now.
         take_second_names(shots[-1].path)
+    said = {
+        **timing_facts(
+            StepRuns(footage.steps, stride=footage.stride),
+            fps=footage.fps,
+            timestep=_fraction(footage.timestep),
+            stride=footage.stride,
+        ),
+        "pictures": "scene",
+        "quality": view.quality or _recorded(footage.facts).get("quality", "full"),
+    }
+    if footage.captions is not None:
+        said["annotated"] = {"pillow": pillow_version()}
 
     def render(shot: _Shot) -> _Written:
         file, blank = _write_video(
             shot.path,
-            lambda: _drawn(workers, trajectory, chosen, shot),
-            captions=captions,
-            fps=rate,
+            lambda: _drawn(workers, footage.runs, shot),
+            captions=footage.captions,
+            fps=footage.fps,
             on_frame=on_frame,
         )
         metadata = {
-            **episode,
-            **timing_facts(
-                StepRuns(steps, stride=stride),
-                fps=file.fps,
-                timestep=_fraction(facts.get("timestep")),
-                stride=stride,
-            ),
+            **footage.metadata,
+            **said,
             **file_facts(file),
             **blank.facts(),
-            "pictures": "scene",
-            "quality": view.quality or _recorded(facts).get("quality", "full"),
             **shot.facts,
-            **({} if captions is None else {"annotated": {"pillow": pillow_version()}}),
             **workers.gl_strings,
-            **broken,
         }
         _complete(file, metadata)
         return _Written(file=file, blank=blank)
@@ -202,21 +277,36 @@ def further_video_paths(trajectory: Path, facts: Mapping[str, Any]) -> list[Path
 
 
 def video_path(trajectory: Path, facts: Mapping[str, Any]) -> Path:
-    """Return where the video of a trajectory belongs.
+    """Return where the video of a trajectory, or of a part of a clip, belongs.
 
     Raises:
         UnreadableFile: the trajectory names none, or one that is not its own.
     """
     name = _recorded(facts).get("name")
-    infix = Infix.parse(infix_of(trajectory.name) or "")
-    number = episode_of(trajectory.name)
-    own = infix and number is not None and f"{video_prefix(infix, number)}.mp4"
-    if own and name == own:
-        return trajectory.with_name(own)
+    for own in _own_names(trajectory.name, str(name)):
+        if name == own:
+            return trajectory.with_name(own)
     raise UnreadableFile(
         trajectory,
         f"the video that it names, {name!r:.200}, is not that of its own episode",
     )
+
+
+def _own_names(recording: str, video: str) -> Iterator[str]:
+    """Yield what the video of a recording may be called.
+
+    Args:
+        recording: the base name of the file.
+        video: the name that it gives. Of a clip it tells in which episode it began.
+    """
+    clip = ClipPart.parse(recording)
+    number = episode_of(video if clip else recording)
+    infix = clip.infix if clip else Infix.parse(infix_of(recording) or "")
+    if infix is None or number is None:
+        return
+    yield f"{video_prefix(infix, number)}.mp4"
+    if clip is not None:
+        yield f"{clip_video_prefix(infix, number, clip.first_step)}.mp4"
 
 
 def _shots(
@@ -273,19 +363,34 @@ def _captions(
 ) -> Captions | None:
     """Return what is to be written on the frames; None where nothing is."""
     if annotate is None:
-        annotate = _recorded(reader.header.facts).get("annotate", False)
+        annotate = is_annotated(reader.header.facts)
     if not annotate:
         return None
     check_annotation()
     return Captions(reader, chosen.indices)
 
 
+def is_annotated(facts: Mapping[str, Any]) -> bool:
+    """Tell whether something was to be written on the pictures."""
+    return bool(_recorded(facts).get("annotate", False))
+
+
 def _drawn(
-    workers: DrawingWorkers, trajectory: Path, chosen: ChosenFrames, shot: _Shot
+    workers: DrawingWorkers,
+    runs: Sequence[tuple[Path, Sequence[int]]],
+    shot: _Shot,
+) -> Iterable[Frame]:
+    """Return the pictures of all runs; the first is drawn before this returns."""
+    drawn = (_run(workers, *run, shot) for run in runs)
+    return itertools.chain(next(drawn), itertools.chain.from_iterable(drawn))
+
+
+def _run(
+    workers: DrawingWorkers, trajectory: Path, indices: Sequence[int], shot: _Shot
 ) -> Iterable[Frame]:
     if shot.cameras is None:
-        return workers.frames(trajectory, chosen.indices, shot.view)
-    return workers.frames(trajectory, chosen.indices, shot.view, cameras=shot.cameras)
+        return workers.frames(trajectory, indices, shot.view)
+    return workers.frames(trajectory, indices, shot.view, cameras=shot.cameras)
 
 
 def _all_or_none(videos: Iterable[_Written]) -> list[_Written]:
@@ -310,7 +415,7 @@ def _judge(videos: Iterable[_Written], *, strict: bool) -> None:
         video.blank.judge(video.file.path, strict=True)
 
 
-def _usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:
+def usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:
     """Return the rate at which a second of the file is as long as when recorded."""
     asked = _recorded(facts).get("fps")
     rate = recorded_rate(facts) if asked is None else Fraction(asked)
@@ -394,30 +499,46 @@ def _remove(file: VideoFile) -> None:
             path.unlink(missing_ok=True)
 
 
-def _episode_facts(reader: TrajectoryReader) -> dict[str, Any]:
+def _told(reader: TrajectoryReader) -> dict[str, Any]:
     """Return what the metadata says of the episode."""
     facts = reader.header.facts
-    complete = bool(facts.get("complete"))
-    if complete:
-        ending = {key: facts.get(key) for key in ("terminated", "truncated")}
-    else:
-        # Whoever was killed could not say why it ended.
-        ending = {"reason": facts.get("reason", KILLED)}
-        if "exception" in facts:
-            ending["exception"] = facts["exception"]
     so_far = {"length": reader.step_count, "reward": float(reader.rewards.sum())}
+    over = {key: facts.get(key) for key in ("terminated", "truncated")}
     return {
-        "episode_id": facts.get("episode_id"),
-        "content_type": "video/mp4",
-        "complete": complete,
-        **ending,
-        **{key: facts.get(key, so_far[key]) for key in so_far},
-        **{key: facts.get(key) for key in ("type", "env_id", "seed", "options")},
+        **known_facts(facts),
+        **(over if facts.get("complete") else {}),
+        **ending_facts(facts, so_far),
         **_selection(facts),
+        **what_broke(facts),
+    }
+
+
+def known_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the metadata says that was known when the recording began."""
+    keys = ("episode_id", "type", "env_id", "seed", "options", "versions")
+    return {
+        "content_type": "video/mp4",
+        **{key: facts.get(key) for key in keys},
         "recording": "deferred",
-        "versions": facts.get("versions"),
         "rendered_with": dict(versions()),
     }
+
+
+def ending_facts(facts: Mapping[str, Any], so_far: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the metadata says of the end.
+
+    Args:
+        facts: of the recording, or of its last part.
+        so_far: `length` and `reward`, where nobody could say them.
+    """
+    complete = bool(facts.get("complete"))
+    ending = {key: facts.get(key, so_far[key]) for key in so_far}
+    if not complete:
+        # Whoever was killed could not say why it ended.
+        ending["reason"] = facts.get("reason", KILLED)
+        if "exception" in facts:
+            ending["exception"] = facts["exception"]
+    return {"complete": complete, **ending}
 
 
 def _selection(facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -426,7 +547,8 @@ def _selection(facts: Mapping[str, Any]) -> dict[str, Any]:
     return {} if selection is None else {"selection": selection}
 
 
-def _what_broke(facts: Mapping[str, Any]) -> dict[str, Any]:
+def what_broke(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the metadata says where a recording ended early by an error."""
     reason = facts.get("broken_reason")
     return {} if reason is None else {"broken_reason": reason, "broken": True}
 
@@ -435,6 +557,11 @@ def _recorded(facts: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return what a trajectory says of its video; nothing where it has none."""
     video: Mapping[str, Any] = facts.get("video") or {}
     return video
+
+
+def write_that_it_broke(video: Path, metadata: Mapping[str, Any]) -> None:
+    """Write the metadata of a video that there will never be."""
+    _write_metadata(video, {**metadata, "empty": True, "broken": True})
 
 
 def _why_no_pictures(trajectory: Path, facts: Mapping[str, Any]) -> str:
