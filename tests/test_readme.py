@@ -39,9 +39,11 @@ def run(*command: str, cwd: Path) -> str:
     return done.stdout
 
 
-def needs_dm_control(text: str) -> None:
+def needs_extras(text: str) -> None:
     if "dm_control" in text:
         pytest.importorskip("dm_control", reason="dm_control is not installed here")
+    if "stable_baselines3" in text:
+        pytest.importorskip("stable_baselines3", reason="it is not installed here")
 
 
 @pytest.fixture
@@ -58,7 +60,7 @@ PYTHON = dict(zip(("gymnasium", "dm_control", "again"), blocks("python"), strict
 def test_python_block_runs(name: str, checkout: Path) -> None:
     """As it stands, after what it goes on from, and it leaves a video."""
     code = PYTHON[name]
-    needs_dm_control(code)
+    needs_extras(code)
     if name == "again":
         code = PYTHON["gymnasium"] + code
     run(sys.executable, "-c", code, cwd=checkout)
@@ -69,7 +71,7 @@ def test_python_block_runs(name: str, checkout: Path) -> None:
 @pytest.mark.parametrize("line", [x for x in shell_lines() if x.startswith("mjrec")])
 def test_command_runs(line: str, checkout: Path) -> None:
     """As it stands, with the recordings that the ones before it made."""
-    needs_dm_control(line)
+    needs_extras(line)
     if line.startswith(("mjrec list", "mjrec render", "mjrec recover")):
         out = f"--out {line.split()[2]} "
         [recording] = [x for x in shell_lines() if out in x]
@@ -146,7 +148,7 @@ def test_scripts_test_runs(tmp_path: Path) -> None:
 @pytest.mark.parametrize("example", EXAMPLES, ids=[path.stem for path in EXAMPLES])
 def test_example_runs(example: Path, tmp_path: Path) -> None:
     """By itself, in an empty directory, and is listed on the examples' page."""
-    needs_dm_control(example.read_text())
+    needs_extras(example.read_text())
     copied = shutil.copy(example, tmp_path)
     run(sys.executable, copied, cwd=tmp_path)
     assert list((tmp_path / "recordings").iterdir())

@@ -50,10 +50,15 @@ class Failing(Tracker):
 
     def __init__(self) -> None:
         self.calls = 0
+        self.ends = 0
 
     def episode(self, run: Run, episode: FinishedEpisode) -> None:
         self.calls += 1
         raise ConnectionError("no server")
+
+    def end(self, run: Run) -> None:
+        self.ends += 1
+        raise ConnectionError("no server here either")
 
 
 def record(directory: Path, env_id: str, *, episodes: int = 2, **options: Any) -> Any:
@@ -113,7 +118,7 @@ def test_tracker_that_raises_is_dismissed_and_the_rest_goes_on(
     failing, listening = Failing(), Listening()
     with caplog.at_level(logging.ERROR, "mjrec"):
         record(tmp_path, "InvertedPendulum-v5", trackers=[failing, listening])
-    assert failing.calls == 1
+    assert (failing.calls, failing.ends) == (1, 1)
     assert len(listening.of("episode")) == 2
     assert "Failing has failed" in caplog.text
     [fault] = manifest_of(tmp_path)["mjrec"]["faults"]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -91,3 +92,6 @@ class ToldTrackers:
         logger.exception("%s has failed and is told nothing more.", name)
         self._trackers = tuple(each for each in self._trackers if each is not tracker)
         self._on_fault(name, error)
+        # So that it lets go of what it holds open, as far as it still can.
+        with contextlib.suppress(Exception):
+            tracker.end(self._run)

@@ -88,8 +88,8 @@ class Tracker:
 
     To be subclassed; each method does nothing. One tracker may serve several runs at
     the same time, those of a vector environment for instance: each call says which.
-    What a method raises is logged and noted in the manifest, the tracker is not called
-    again for that run, and the recording goes on.
+    What a method raises is logged and noted in the manifest, the run is ended for that
+    tracker, which is told nothing more of it, and the recording goes on.
     """
 
     def begin(self, run: Run) -> None:
