@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 from gymnasium.vector import AsyncVectorEnv
+from vector_environments import DISABLED, NEXT_STEP, SAME_STEP, hashes_at, play
 
 import mjrec
 from mjrec.formats.locks import is_locked
-from vector_environments import DISABLED, NEXT_STEP, SAME_STEP, hashes_at, play
 
 _STEPS = 3
 _PATIENCE = 90

@@ -18,9 +18,6 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
 from processes import children
-
-import mjrec
-from mjrec import Error, InvalidArgument, NoPictures, ResetNeeded, ResetNotAllowed
 from vector_environments import (
     DISABLED,
     MODES,
@@ -33,6 +30,9 @@ from vector_environments import (
     play,
     shown,
 )
+
+import mjrec
+from mjrec import Error, InvalidArgument, NoPictures, ResetNeeded, ResetNotAllowed
 
 LENGTHS = (2, 3)
 

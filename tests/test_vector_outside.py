@@ -11,10 +11,6 @@ import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-
-import mjrec
-from mjrec import InvalidArgument, NoPictures, PicturesDiffer, ResetNeeded
-from mjrec.recorder.tracking import Tracker
 from vector_environments import (
     DISABLED,
     MODES,
@@ -26,6 +22,10 @@ from vector_environments import (
     play,
     shown,
 )
+
+import mjrec
+from mjrec import InvalidArgument, NoPictures, PicturesDiffer, ResetNeeded
+from mjrec.recorder.tracking import Tracker
 
 LENGTHS = (2, 3)
 

@@ -11,10 +11,6 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 from recordings import frames_of
-
-import mjrec
-from mjrec import InvalidArgument, NoPictures
-from mjrec.frame_grid import grid_frame
 from vector_environments import (
     DISABLED,
     NEXT_STEP,
@@ -25,6 +21,10 @@ from vector_environments import (
     path_of,
     play,
 )
+
+import mjrec
+from mjrec import InvalidArgument, NoPictures
+from mjrec.frame_grid import grid_frame
 
 LENGTHS = (2, 3, 2)
 
