@@ -4,6 +4,7 @@
 ::
 
     openaigym.video.<infix>.video000027.mp4             the first camera's
+    openaigym.video.<infix>.video000027.step000137.mp4  of one that a step began
     openaigym.video.<infix>.video000027.side.mp4        a further camera's
     openaigym.video.<infix>.video000027.camera2.mp4     of one that has no name
     openaigym.video.<infix>.video000027.tiled.mp4       all sub-environments' in one
@@ -40,7 +41,8 @@ _TILED = "tiled"
 
 # Names of cameras that would be taken for another part of a file's name, or for none.
 _AMBIGUOUS = re.compile(
-    r"|full|draft|annotated|plain|tiled|meta|\d*x\d*|.*fps|video\d+|camera(-.*|\d+)"
+    r"|full|draft|annotated|plain|tiled|meta|\d*x\d*|.*fps|(video|step)\d+"
+    r"|camera(-.*|\d+)"
 )
 # Directories have names of 255 bytes, and there are other parts.
 _LONGEST_PART = 80

@@ -14,6 +14,7 @@ from ..formats.trajectory_file import find_trajectory
 from ..rendering.recorded_facts import open_for_rendering
 from ..results.recorded_environment import recorded_env_info
 from ..results.sources import MonitorResults
+from .clips import last_clip_episode
 from .remains import Remains
 
 __all__ = ["KnownEpisodes"]
@@ -46,7 +47,8 @@ class KnownEpisodes:
         self._facts: dict[int, Mapping[str, Any]] = {}
         self._entries: dict[int, JournalEntry] = {}
         self.first_episode_id = min(self._recorded, default=None)
-        self.last_episode_id = files.last_episode_id
+        # Those of clips are in no name.
+        self.last_episode_id = max(files.last_episode_id, last_clip_episode(remains))
         self._read_journal()
         # Asked now: of a log that is finished it could not be asked so cheaply.
         self.env_info = self._env_info()

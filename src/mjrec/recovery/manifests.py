@@ -27,10 +27,17 @@ from ..formats.monitor_directory import (
     trajectory_prefix,
     video_prefix,
 )
+from ..formats.pending_videos import pending_video
 from ..formats.stats_file import StatsFile, read_stats_file, write_stats_file
-from ..formats.video_metadata import finished_videos, is_broken, is_done
+from ..formats.video_metadata import (
+    finished_videos,
+    is_broken,
+    is_done,
+    metadata_path,
+)
 from ..results.recorded_environment import GYM_VERSION
 from ..results.sources import MonitorResults
+from .clips import pending_clips, videos_begun_by_steps
 from .known_episodes import KnownEpisodes
 from .remains import Remains, look_through
 from .report import RecoveredFile
@@ -81,6 +88,7 @@ def _has_anything(remains: Remains) -> bool:
         (
             *(files.journal, files.manifest, files.stats),
             *(files.trajectories, files.videos, files.metadata),
+            remains.clip_logs,
         )
     )
 
@@ -187,11 +195,22 @@ def _manifest(
             broken += [about for _, about in _all_videos(remains, names)]
         elif names is not None and (remains.directory / names[0]).exists():
             finished += _all_videos(remains, names)
+    for video in videos_begun_by_steps(remains):
+        if is_broken(metadata_path(video)):
+            broken += [about for _, about in finished_videos(video)]
+        elif video.exists():
+            finished += finished_videos(video)
     first = known.first_episode_id or 0
     pending = [
-        _pending(remains, episode_id, old_details)
-        for episode_id in sorted(files.trajectories)
-        if _is_pending(remains, known, episode_id)
+        _as_listed(entry, old_details)
+        for entry in (
+            *(
+                _pending(remains, episode_id)
+                for episode_id in sorted(files.trajectories)
+                if _is_pending(remains, known, episode_id)
+            ),
+            *pending_clips(remains),
+        )
     ]
     choice = choice_of(remains, known, old_details)
     return Manifest(
@@ -230,15 +249,19 @@ def _all_videos(remains: Remains, first: tuple[str, str]) -> list[tuple[str, str
     return finished_videos(remains.directory / first[0])
 
 
-def _pending(
-    remains: Remains, episode_id: int, old_details: Mapping[str, Any]
+def _pending(remains: Remains, episode_id: int) -> dict[str, Any]:
+    """Return how a manifest names a pending video."""
+    return pending_video(
+        episode_id,
+        trajectory=trajectory_prefix(remains.infix, episode_id),
+        video=f"{video_prefix(remains.infix, episode_id)}.mp4",
+    )
+
+
+def _as_listed(
+    entry: dict[str, Any], old_details: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    """Return how a manifest names a pending video; as it did, if it did."""
-    entry = {
-        "episode_id": episode_id,
-        "trajectory": trajectory_prefix(remains.infix, episode_id),
-        "video": f"{video_prefix(remains.infix, episode_id)}.mp4",
-    }
+    """Return an entry of what is pending; as it was, if it was listed before."""
     listed = old_details.get("pending")
     for old in listed if isinstance(listed, list) else ():
         # It may say more, of a try that has failed.

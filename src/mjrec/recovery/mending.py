@@ -20,6 +20,7 @@ from ..formats.locks import try_lock
 from ..formats.monitor_directory import Infix
 from ..rendering.pending import EpisodeKey, claim
 from ..rendering.rendered_manifests import update_manifest
+from .clips import remove_empty_parts
 from .known_episodes import KnownEpisodes
 from .live_videos import finish_video
 from .manifests import write_results
@@ -85,6 +86,8 @@ class Mending:
             with self._noting_failure(log.name), self._claimed(log) as is_ours:
                 if is_ours:
                     self._note(finish_log_of_dead(log, known))
+        for file in remove_empty_parts(remains):
+            self._note(file)
         # Of logs a manifest says nothing that is not so of trajectories.
         before = len(self.files)
         for note in sorted(remains.notes, key=remains.is_first_video):

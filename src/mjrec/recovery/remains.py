@@ -14,7 +14,9 @@ from pathlib import Path
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
+    ClipPart,
     Infix,
+    clip_lock_name,
     infix_of,
     iter_monitor_files,
     lock_name,
@@ -71,7 +73,16 @@ class Remains:
     @property
     def logs(self) -> list[Path]:
         """The logs of its episodes."""
-        return [path for path in self.paths if path.suffix == ".log"]
+        return [
+            path
+            for path in self.paths
+            if path.suffix == ".log" and ClipPart.parse(path.name) is None
+        ]
+
+    @property
+    def clip_logs(self) -> list[Path]:
+        """The logs of videos that are counted in steps."""
+        return [path for path in self.paths if ClipPart.parse(path.name) is not None]
 
     @property
     def notes(self) -> list[Path]:
@@ -124,7 +135,7 @@ class Remains:
         number = int(re.findall(r"\.video(\d{6,})", part.name)[-1])
         if self.is_own_video(part):
             renderer = f".{video_prefix(self.infix, number)}.lock"
-            return is_locked(self.directory / renderer)
+            return is_locked(self.directory / renderer) or self._renders_clip()
         # Of an episode that is rendered once more. Its metadata, which nobody holds,
         # is there for a moment only.
         siblings = [
@@ -133,6 +144,12 @@ class Remains:
             if path.name.startswith(f".{match['video']}.mp4.")
         ]
         return match["kind"] == "meta.json" or any(map(is_locked, siblings))
+
+    def _renders_clip(self) -> bool:
+        """Tell whether somebody is at a clip, whose video may be called as others."""
+        parts = (ClipPart.parse(path.name) for path in self.clip_logs)
+        locks = {clip_lock_name(self.infix, part.first_step) for part in parts if part}
+        return any(is_locked(self.directory / name) for name in locks)
 
 
 def remains_of(directory: Path) -> list[Remains]:
