@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import signal
 import subprocess
@@ -14,9 +15,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from full_disk import file_size_limit
 from recordings import manifest_of
 
 import mjrec
+from mjrec.commands import main
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.pending import look_at, recordings
@@ -104,7 +107,7 @@ def hashes(directory: Path) -> dict[str, list[str]]:
 
 def told(directory: Path) -> Iterator[dict[str, Any]]:
     """Yield the metadata of each video."""
-    for path in sorted(directory.glob("*.meta.json")):
+    for path in sorted(directory.glob("openaigym.*.meta.json")):
         yield json.loads(path.read_text())
 
 
@@ -127,14 +130,7 @@ def check_same(live: Path, deferred: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"camera": "track"},
-        {"camera": "track", "annotate": True},
-        {"max_fps": 50},
-        {"annotate": True, "max_fps": 60, "camera": None},
-    ],
+    "options", [{}, {"camera": "track", "annotate": True}, {"max_fps": 50}]
 )
 def test_pictures_are_those_that_were_drawn_live(
     options: dict[str, Any], tmp_path: Path
@@ -165,3 +161,211 @@ def test_resets_that_change_the_model_are_seen(annotate: bool, tmp_path: Path) -
     for render in ("live", "deferred"):
         record(tmp_path / render, reacher(), 14, render=render, **options)
     check_same(tmp_path / "live", tmp_path / "deferred")
+
+
+def test_trajectories_and_clips_run_beside_each_other(tmp_path: Path) -> None:
+    """Each sees all that changes in the model, whoever looks first."""
+    clips: dict[str, Any] = {
+        "step_trigger": lambda step: step in (2, 9),
+        "video_length": 6,
+    }
+    live = hopper(render_mode="rgb_array")
+    evaluation: dict[str, Any] = {"mode": "evaluation"}
+    record(tmp_path / "live", live, 14, render="live", **clips, **evaluation)
+    record(tmp_path / "both", hopper(), 14, **clips, **evaluation)
+    record(tmp_path / "plain", hopper(), 14, video_callable=False, **evaluation)
+    check_same(tmp_path / "live", tmp_path / "both")
+    recorded = sorted((tmp_path / "both").glob("*.h5"))
+    plain = sorted((tmp_path / "plain").glob("*.h5"))
+    assert len(recorded) == len(plain) == 3
+    for one, other in zip(recorded, plain, strict=True):
+        with open_trajectory(one) as first, open_trajectory(other) as second:
+            assert first.states(0, 4).tobytes() == second.states(0, 4).tobytes()
+            assert len(first.model_changes) == len(second.model_changes) > 0
+
+
+def test_clips_wait_for_who_renders_them(tmp_path: Path) -> None:
+    """Pending, with a log for each episode; afterwards there is the video alone."""
+    record(
+        tmp_path,
+        hopper(3),
+        8,
+        step_trigger=lambda step: step == 1,
+        video_length=6,
+        workers=0,
+        name_prefix="rl-video",
+        camera=["track", -1],
+    )
+    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
+    assert parts(tmp_path) == [f"000000001.part{n:06d}.log" for n in range(3)]
+    assert main(["render", str(tmp_path)]) == 0
+    assert not parts(tmp_path)
+    manifest = manifest_of(tmp_path)
+    assert not manifest["mjrec"]["pending"]
+    further = entry["video"].replace(".mp4", ".-1.mp4")
+    assert {name for name, _ in manifest["videos"]} == {entry["video"], further}
+    assert (tmp_path / "rl-video-step-1.mp4").samefile(tmp_path / entry["video"])
+    [about] = [each for each in told(tmp_path) if "further_videos" in each]
+    # Two steps, a reset and three steps, a reset and a step, and what was there first.
+    assert about["frame_count"] == 9
+    assert not finish(tmp_path)
+
+
+def test_clip_that_begins_with_an_episode_has_its_name(tmp_path: Path) -> None:
+    """`video_length` with a schedule; so do Gymnasium's names."""
+    record(
+        tmp_path,
+        hopper(3),
+        7,
+        video_callable=lambda episode: episode == 1,
+        video_length=4,
+        workers=0,
+        name_prefix="rl-video",
+    )
+    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
+    assert entry["episode_id"] == 1
+    assert entry["video"].endswith(".video000001.mp4")
+    [outcome] = finish(tmp_path)
+    assert (outcome.name, outcome.frame_count) == (entry["video"], 6)
+    assert (tmp_path / "rl-video-episode-1.mp4").exists()
+
+
+def test_clip_that_runs_at_close_is_as_long_as_it_is(tmp_path: Path) -> None:
+    """It says that it is shorter than asked for, and why."""
+    record(tmp_path, hopper(), 7, step_trigger=lambda step: step == 4, video_length=99)
+    [about] = told(tmp_path)
+    assert (about["complete"], about["reason"]) == (False, "close")
+    assert (about["length"], about["frame_count"]) == (3, 5)
+    assert len(mjrec.load_results(tmp_path)["videos"]) == 1
+
+
+def test_running_clip_is_its_monitors_business(tmp_path: Path) -> None:
+    """Nobody renders one that may go on, be it between two episodes."""
+    monitor = mjrec.Monitor(
+        hopper(), tmp_path, step_trigger=lambda step: step == 2, workers=0
+    )
+    with monitor:
+        hop(monitor, 4)
+        monitor._recorder._clips._clip._part._log.flush()
+        [key] = recordings(tmp_path)
+        assert look_at(tmp_path, key) is None
+    assert look_at(tmp_path, key) is not None
+
+
+def test_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> None:
+    """With all that was there a second before; and it is in the manifest then."""
+    script = (
+        "import os, signal, sys, time, glob\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "import mjrec\n"
+        "from test_deferred_clips import hop, hopper\n"
+        f"env = mjrec.Monitor(hopper(), {str(tmp_path)!r}, video_length=99,\n"
+        "    step_trigger=lambda step: step == 2, workers=0)\n"
+        "hop(env, 13)\n"
+        f"while not glob.glob({str(tmp_path / '*.part000002.log')!r}):\n"
+        "    time.sleep(0.01)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], check=False, capture_output=True, text=True
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert mjrec.recover(tmp_path)
+    manifest = manifest_of(tmp_path)["mjrec"]
+    [entry] = manifest["pending"]
+    assert (entry["episode_id"], manifest["next_episode_id"]) == (0, 3)
+    assert main(["render", str(tmp_path)]) == 0
+    [about] = told(tmp_path)
+    assert (about["complete"], about["reason"]) == (False, "killed")
+    # Three steps of the first episode, five of the second and three of the third, each
+    # with the picture that it began with here.
+    assert (about["frame_count"], about["length"]) == (14, 11)
+    assert about["last_episode_id"] == 2
+    assert [name for name, _ in manifest_of(tmp_path)["videos"]] == [entry["video"]]
+    assert not mjrec.recover(tmp_path)
+
+
+def test_clip_ends_where_its_pictures_would_lie(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What was taken before stays, and the next clip is another one."""
+    env = hopper()
+    with mjrec.Monitor(
+        env,
+        tmp_path,
+        step_trigger=lambda step: step == 1,
+        video_length=4,
+        mode="evaluation",
+    ) as monitor:
+        hop(monitor, 3)
+        simulated: Any = env.unwrapped
+        simulated.model = copy.copy(simulated.model)
+        monitor.step(np.zeros(3))
+        monitor.step(np.zeros(3))
+    assert "ends early" in caplog.text
+    [about] = [each for each in told(tmp_path) if "first_step" in each]
+    assert about["broken"]
+    assert "another model" in about["broken_reason"]
+    assert (about["frame_count"], about["length"]) == (3, 4)
+    manifest = manifest_of(tmp_path)
+    assert len(manifest["mjrec"]["broken"]) == 1
+    assert not manifest["mjrec"]["pending"]
+
+
+def test_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
+    """With `on_error="warn"`: what had room is rendered, and the manifest tells."""
+    monitor = mjrec.Monitor(
+        hopper(),
+        tmp_path,
+        step_trigger=lambda step: step == 2,
+        video_length=9,
+        on_error="warn",
+        workers=0,
+    )
+    hop(monitor, 5)
+    with file_size_limit(1000):
+        hop(monitor, 5)
+    hop(monitor, 3)
+    monitor.close()
+    assert monitor.get_total_steps() == 13
+    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
+    faults = manifest_of(tmp_path)["mjrec"]["faults"]
+    assert "video" in {fault["what"] for fault in faults}
+    [outcome] = finish(tmp_path)
+    assert (outcome.name, outcome.failure) == (entry["video"], None)
+    assert outcome.frame_count == 4
+    [about] = told(tmp_path)
+    assert "part000000" in about["broken_reason"]
+
+
+def test_a_part_that_is_missing_is_told(tmp_path: Path) -> None:
+    """What is there stays, and so does the entry in the manifest, with the reason."""
+    record(
+        tmp_path,
+        hopper(3),
+        8,
+        step_trigger=lambda step: step == 1,
+        video_length=6,
+        workers=0,
+    )
+    [second] = tmp_path.glob("*.part000001.log")
+    second.unlink()
+    [outcome] = finish(tmp_path)
+    assert "part 1" in str(outcome.failure)
+    assert len(parts(tmp_path)) == 2
+    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
+    assert "part 1" in entry["reason"]
+
+
+def test_clips_belong_to_their_monitor(tmp_path: Path) -> None:
+    """`force` removes their logs, and a resumed run has other ones."""
+    options: dict[str, Any] = {
+        "step_trigger": lambda step: step == 1,
+        "video_length": 3,
+        "workers": 0,
+    }
+    for number in range(2):
+        record(tmp_path, hopper(), 5, resume=number > 0, **options)
+    assert len({key.infix for key in recordings(tmp_path)}) == 2
+    record(tmp_path, hopper(), 5, force=True, **options)
+    assert len(recordings(tmp_path)) == 1
