@@ -18,6 +18,7 @@
     ├── openaigym.clip.<infix>.step000000137.part000000.log  of a video in steps
     ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
     ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
+    ├── openaigym.results.<infix>.monitor.csv           Stable-Baselines3's, if wanted
     ├── .openaigym.<infix>.lock                         while its monitor is open
     ├── .openaigym.video.<infix>.video000027.lock       while somebody renders it
     ├── .openaigym.clip.<infix>.step000000137.lock      likewise
@@ -97,6 +98,7 @@ _PATTERNS = (
     re.compile(rf"{_TRAJECTORY}\.(log|h5|log\.damaged)"),
     _CLIP_PART,
     re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
+    re.compile(rf"openaigym\.results\.{_INFIX_PART}\.monitor\.csv"),
 )
 _HIDDEN = (
     re.compile(rf"\.{_VIDEO}\.lock"),
