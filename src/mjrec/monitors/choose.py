@@ -152,7 +152,8 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             function from the number of steps taken so far to a bool, asked before
             each step. The first picture is that before the step.
         video_length: steps of a video after its first picture; it goes on across
-            resets. None is until the end of the episode.
+            resets. None is until the end of the episode. Where pictures are deferred,
+            so are these; the states that they are drawn from are then removed.
         name_prefix: finished videos have Gymnasium's names besides,
             `<name_prefix>-episode-27.mp4` or `<name_prefix>-step-1000.mp4`: links to
             the same files.

@@ -297,6 +297,9 @@ def _schedule(
         *files.metadata,
         *(listed if isinstance(listed, list) else ()),
     }
+    recorded |= {
+        clip["episode_id"] for clip in pending_clips(remains) if _is_scheduled(clip)
+    }
     for episode_id in files.trajectories:
         if episode_id not in recorded:
             try:
@@ -306,6 +309,11 @@ def _schedule(
                 continue
     rule = None if choice is None else f"keep:{choice['rule']}"
     return {"name": old.get("name") or rule, "recorded": sorted(recorded)}
+
+
+def _is_scheduled(clip: Mapping[str, Any]) -> bool:
+    """Tell whether a clip began with its episode, and is called as that."""
+    return bool(clip["video"].endswith(f".video{clip['episode_id']:06d}.mp4"))
 
 
 def _env_info(remains: Remains, known: KnownEpisodes) -> Mapping[str, Any]:

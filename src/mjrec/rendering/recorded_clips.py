@@ -7,6 +7,7 @@ behind the other. They stay logs, and are removed when the video is there.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -20,6 +21,7 @@ from ..formats.monitor_directory import (
     Infix,
     clip_lock_name,
     clip_part_name,
+    infix_of,
     iter_monitor_files,
     lock_name,
 )
@@ -38,6 +40,8 @@ __all__ = [
     "recorded_clips",
 ]
 
+_VIDEO = re.compile(r".*\.video[0-9]{6,18}\.step(?P<step>[0-9]{6,18})\.mp4")
+
 
 @dataclass(frozen=True)
 class ClipKey:
@@ -53,9 +57,19 @@ class ClipKey:
 
     @classmethod
     def of(cls, name: str) -> ClipKey | None:
-        """Return that of the clip that a file is a part of; None for other files."""
+        """Return that of the clip that a file is a part of; None for other files.
+
+        Also that of a video that a step began; what began with an episode is called
+        as that episode's.
+        """
         part = ClipPart.parse(name)
-        return None if part is None else cls(part.infix, part.first_step)
+        if part is not None:
+            return cls(part.infix, part.first_step)
+        video = _VIDEO.fullmatch(name)
+        infix = Infix.parse(infix_of(name) or "")
+        if video is None or infix is None:
+            return None
+        return cls(infix, int(video["step"]))
 
     @property
     def lock_name(self) -> str:
@@ -142,9 +156,10 @@ class PendingClip:
 
 def recorded_clips(directory: Path) -> list[ClipKey]:
     """Return the clips that have logs, monitor by monitor, in order."""
-    keys = {ClipKey.of(path.name) for path in iter_monitor_files(directory)}
+    parts = (ClipPart.parse(path.name) for path in iter_monitor_files(directory))
+    keys = {ClipKey(part.infix, part.first_step) for part in parts if part is not None}
     return sorted(
-        (key for key in keys if key is not None),
+        keys,
         key=lambda key: (key.infix.monitor_id, key.infix.uid, key.first_step),
     )
 
