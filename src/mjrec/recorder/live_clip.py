@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from ..errors import Error
+from .live_videos import name_further_videos
 from .subject import EpisodePictures
 from .video_recorder import VideoRecorder
 
-__all__ = ["LiveClip", "name_further_videos"]
+__all__ = ["LiveClip"]
 
 
 class LiveClip:
@@ -92,10 +92,3 @@ class LiveClip:
         except Error as error:
             if not self._tolerates(error):
                 raise
-
-
-def name_further_videos(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:
-    """Let the metadata of a first camera's video name the others."""
-    names = [Path(v.path).name for v in others if v.finished and v.path is not None]
-    if names:
-        first.metadata["further_videos"] = names

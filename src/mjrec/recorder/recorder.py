@@ -8,7 +8,7 @@ import logging
 import os
 import time
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -24,36 +24,34 @@ from ..errors import (
 from ..formats.journal import JournalEntry, JournalWriter
 from ..formats.manifest import Manifest, write_manifest
 from ..formats.monitor_directory import (
-    clip_video_prefix,
     journal_name,
     manifest_name,
     stats_prefix,
     trajectory_prefix,
-    video_prefix,
 )
-from ..formats.second_names import give_second_names
 from ..formats.trajectory_log import RowBlocks
 from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
-from .clips import Clip, Clips
-from .deferred_clip import ClipLogs, DeferredClip
+from .clip_maker import ClipMaker
+from .clips import Clips
 from .deferred_video import DeferredVideo
 from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
 from .episode_videos import EpisodeVideos
 from .faults import Faults, What
 from .kept_videos import KeptVideos
-from .live_clip import LiveClip, name_further_videos
+from .live_videos import LiveVideoMaker, LiveVideos
 from .opening import OpenDirectory, open_directory
 from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
 from .selection import Standing, selection_from
 from .stats_recorder import StatsRecorder, reward_to_float
-from .subject import EpisodePictures, Subject, check_pictures, what_is_missing
+from .subject import Subject, check_pictures, what_is_missing
 from .told_trackers import ToldTrackers
 from .tracking import FinishedEpisode, Run
 from .trajectory_recorder import Pace, TrajectoryRecorder
 from .versions import versions
+from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder, can_give_pictures
 
 __all__ = ["Recorder"]
@@ -169,15 +167,21 @@ class Recorder:
         self._said: set[str] = set()
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
         # The same, where it is drawn live, and those of further cameras.
-        self._live_videos: tuple[VideoRecorder, ...] = ()
-        self._clip_logs = self._new_clip_logs()
-        self._clips: Clips | None = None
-        if options.has_clips:
-            self._clips = Clips(
-                length=options.video_length,
-                trigger=options.step_trigger,
-                make=self._new_clip,
-            )
+        self._live_videos: LiveVideos | None = None
+        self._live_maker = LiveVideoMaker(
+            subject=subject,
+            options=options,
+            facts=self.live_video_facts,
+            caption=self._caption,
+        )
+        self._promises = VideoPromises(
+            directory=self.directory,
+            infix=self._place.infix,
+            subject=subject,
+            options=options,
+            selection=None if self._kept is None else self._kept.facts(),
+        )
+        self._clips = self._new_clips() if options.has_clips else None
         self.closed = False
 
     @property
@@ -279,9 +283,8 @@ class Recorder:
             if not self._tolerates("video", error):
                 raise
             # Where it is only the first picture, states are recorded all the same.
-            if self._live_videos:
-                for video in self._live_videos:
-                    video.give_up(str(error))
+            if self._live_videos is not None:
+                self._live_videos.give_up(str(error))
             else:
                 self._begin_live_videos(episode_id, enabled=False)
         if self._options.write_upon_reset:
@@ -363,8 +366,8 @@ class Recorder:
                         )
                     except (PicturesDiffer, FileNotWritten) as error:
                         self._stop_recording(self._trajectory, error)
-                for video in self._live_videos:
-                    self._take_picture(video, is_there=picture, last=done)
+                if self._live_videos is not None:
+                    self._live_videos.take(is_there=picture, last=done)
                 if self._clips is not None:
                     self._clips.step(
                         reward,
@@ -438,60 +441,27 @@ class Recorder:
     def _all_states(self) -> list[StateSource]:
         return [each for each in (self._states, self._clip_states) if each is not None]
 
-    def _new_clip_logs(self) -> ClipLogs | None:
-        """Return what clips that are rendered later have in common, if they can be."""
-        if self._clip_states is None or self._choice.mode != DEFERRED:
-            return None
-        return ClipLogs(
-            directory=self.directory,
-            infix=self._place.infix,
-            states=self._clip_states,
+    def _new_clips(self) -> Clips:
+        maker = ClipMaker(
+            subject=self._subject,
+            promises=self._promises,
+            live=self._live_maker,
             pace=self._pace,
-            facts=self._episode_facts,
+            episode_facts=self._episode_facts,
             before=self._before_clip,
+            can_be_deferred=self._can_be_deferred,
             tolerates=self._tolerates_in_video,
-            on_end=self._add_deferred_clip,
+            videos=self._videos,
+            ended=self._ended,
         )
-
-    def _new_clip(self, steps: int | None) -> Clip:
-        """Return what records a video that is counted in steps, beginning now.
-
-        Args:
-            steps: how many were taken when a step began it; None where it begins with
-                an episode.
-        """
-        logs, episode_id = self._clip_logs, self._next_episode_id - 1
-        name = clip_video_prefix(self._place.infix, episode_id, steps)
-        named = ("episode", episode_id) if steps is None else ("step", steps)
-        path, second_name = self.directory / name, self._second_name(*named)
-        if logs is not None:
-            start = logs.states.begin_episode()
-            if self._can_be_deferred(start):
-                promise = self._promise(path, DEFERRED)
-                return DeferredClip(
-                    logs,
-                    start,
-                    first_step=self.stats_recorder.total_steps,
-                    episode_id=episode_id,
-                    video=path.with_name(f"{name}.mp4"),
-                    facts={"kept": False, "video": {**promise, **second_name}},
-                )
-        return self._live_clip(path, second_name)
-
-    def _live_clip(self, path: Path, second_name: Mapping[str, str]) -> LiveClip:
-        videos = self._live_videos_at(path)
-        for video in videos:
-            video.metadata.update(
-                first_step=self.stats_recorder.total_steps,
-                last_episode_id=self._next_episode_id - 1,
-            )
-        videos[0].metadata.update(second_name)
-        subject = self._subject
-        return LiveClip(
-            videos,
-            (subject.pictures, *subject.further_pictures.values()),
-            on_end=self._add_live_clip,
-            tolerates=self._tolerates_in_video,
+        return Clips(
+            length=self._options.video_length,
+            trigger=self._options.step_trigger,
+            make=lambda steps: maker.make(
+                steps,
+                episode_id=self._next_episode_id - 1,
+                total_steps=self.stats_recorder.total_steps,
+            ),
         )
 
     def _before_clip(self) -> dict[str, Any]:
@@ -502,15 +472,6 @@ class Recorder:
             "reward_before": stats.rewards or 0.0,
             "reset_time": self._reset_clock,
         }
-
-    def _add_live_clip(self, videos: Sequence[VideoRecorder]) -> None:
-        for video in videos:
-            self.add_video(video)
-        _name_again(videos[0])
-
-    def _add_deferred_clip(self, clip: DeferredClip) -> None:
-        self._videos.add_deferred_clip(clip)
-        self._ended.add_clip(clip.first_part)
 
     def _tolerates_in_video(self, error: Exception) -> bool:
         return self._tolerates("video", error)
@@ -580,8 +541,7 @@ class Recorder:
         if self._states is not None and (keeps or deferred):
             start = self._states.begin_episode()
             deferred = deferred and self._can_be_deferred(start)
-        self._trajectory = self.video_recorder = None
-        self._live_videos = ()
+        self._trajectory = self._live_videos = self.video_recorder = None
         if keeps or deferred:
             self._trajectory = self._new_trajectory(
                 episode_id,
@@ -593,58 +553,26 @@ class Recorder:
         if deferred:
             assert self._trajectory is not None
             self.video_recorder = DeferredVideo(
-                self._video_path(episode_id), self._trajectory
+                self._promises.path(episode_id), self._trajectory
             )
         else:
             self._begin_live_videos(episode_id, enabled=wanted)
 
     def _begin_live_videos(self, episode_id: int, *, enabled: bool) -> None:
-        path = self._video_path(episode_id)
-        main, *further = self._live_videos_at(path, enabled=enabled)
-        main.metadata.update(self._second_name("episode", episode_id))
-        self.video_recorder = main
+        recorders = self._live_maker.at(
+            self._promises.path(episode_id), enabled=enabled
+        )
+        main = self.video_recorder = recorders[0]
+        main.metadata.update(self._promises.second_name("episode", episode_id))
         if not main.enabled:
             return
-        self._live_videos = (main, *further)
-        subject = self._subject
-        for pictures in (subject.pictures, *subject.further_pictures.values()):
-            pictures.begin_episode()
-        for video in self._live_videos:
-            video.capture_frame()
-
-    def _live_videos_at(
-        self, path: Path, *, enabled: bool = True
-    ) -> tuple[VideoRecorder, ...]:
-        """Return what draws the first camera's video, and then the others' if it is."""
-        main = self._live_video(path, self._subject.pictures, enabled=enabled)
-        if not main.enabled:
-            return (main,)
-        further = self._subject.further_pictures.items()
-        return (
-            main,
-            *(
-                self._live_video(path.with_name(f"{path.name}.{name}"), pictures)
-                for name, pictures in further
-            ),
+        self._live_videos = LiveVideos(
+            recorders,
+            self._live_maker.pictures,
+            tolerates=self._tolerates_in_video,
+            on_picture_error=self.note_error,
         )
-
-    def _live_video(
-        self, base_path: Path, pictures: EpisodePictures, *, enabled: bool = True
-    ) -> VideoRecorder:
-        return VideoRecorder(
-            pictures,
-            base_path=base_path,
-            metadata=self.live_video_facts(),
-            enabled=enabled,
-            fps=self._options.fps,
-            max_fps=self._options.max_fps,
-            frame_hashes=True,
-            clock=self._subject.clock,
-            declared=self._subject.declared,
-            facts=pictures.facts,
-            strict=self._options.strict,
-            caption=self._caption if self._options.annotate else None,
-        )
+        self._live_videos.begin()
 
     def _caption(self) -> Caption:
         """Return what is written on the picture of this moment."""
@@ -689,7 +617,7 @@ class Recorder:
     ) -> dict[str, Any]:
         promise = None
         if video is not None:
-            promise = self._episode_promise(episode_id, video)
+            promise = self._promises.of_episode(episode_id, video)
         return {
             **self._episode_facts(start),
             "random_state": self._random_state,
@@ -712,43 +640,6 @@ class Recorder:
             "scene": None if start is None else start.scene,
             "refusal": None if start is None else start.refusal,
         }
-
-    def _episode_promise(self, episode_id: int, recording: str) -> dict[str, Any]:
-        """Return what a trajectory says of its episode's video."""
-        return {
-            **self._promise(self._video_path(episode_id), recording),
-            **self._second_name("episode", episode_id),
-        }
-
-    def _promise(self, path: Path, recording: str) -> dict[str, Any]:
-        """Return what is said of a video that belongs at `path`, but its ending."""
-        options = self._options
-        promise: dict[str, Any] = {
-            "name": f"{path.name}.mp4",
-            "quality": options.quality,
-            "fps": None if options.fps is None else str(options.fps),
-            "max_fps": None if options.max_fps is None else str(options.max_fps),
-            "recording": recording,
-            "reason": self._choice.reason if recording == LIVE else None,
-        }
-        if self._subject.cameras:
-            promise["cameras"] = list(self._subject.cameras)
-            promise["tiled"] = options.tiled
-        if options.annotate:
-            promise["annotate"] = True
-        if self._kept is not None:
-            promise["selection"] = self._kept.facts()
-        return promise
-
-    def _second_name(self, what: str, number: int) -> dict[str, str]:
-        """Return what a video is called besides, for its metadata."""
-        prefix = self._options.name_prefix
-        if prefix is None:
-            return {}
-        return {"also_named": f"{prefix}-{what}-{number}.mp4"}
-
-    def _video_path(self, episode_id: int) -> Path:
-        return self.directory / video_prefix(self._place.infix, episode_id)
 
     def _can_be_deferred(self, start: EpisodeStart) -> bool:
         if start.refusal is None:
@@ -829,25 +720,6 @@ class Recorder:
             self.video_recorder.broken = True
             self.video_recorder.metadata["broken_reason"] = reason
 
-    def _take_picture(
-        self, recorder: VideoRecorder, *, is_there: bool, last: bool
-    ) -> None:
-        if not recorder.functional:
-            return
-        if not is_there:
-            recorder.metadata["final_frame"] = "missing"
-            return
-        try:
-            recorder.capture_frame()
-            if last:
-                recorder.capture_last()
-        except Exception as error:
-            # Also where it is the environment's own `render` that has raised.
-            if not self._tolerates("video", error):
-                self.note_error(error)
-                raise
-            recorder.give_up(str(error))
-
     def _take_last_picture(self) -> None:
         """Take the picture of the running episode's last step, if it was left out."""
         if self.stats_recorder.done is not False or self._ending is not None:
@@ -857,13 +729,8 @@ class Recorder:
                 self._trajectory.take_frame()
             except PicturesDiffer as error:
                 self._stop_frames(self._trajectory, error)
-        for video in self._live_videos:
-            try:
-                video.capture_last()
-            except Exception as error:
-                if not self._tolerates("video", error):
-                    raise
-                video.give_up(str(error))
+        if self._live_videos is not None:
+            self._live_videos.take_last()
 
     def _journal_episode(self) -> None:
         self._finished = episode = self._finished_episode()
@@ -926,9 +793,9 @@ class Recorder:
         return self._faults.tolerates(what, error, episode_id=self._next_episode_id - 1)
 
     def _discard_episode(self) -> None:
-        for video in (self.video_recorder, *self._live_videos):
-            if video is not None:
-                video.discard()
+        for videos in (self.video_recorder, self._live_videos):
+            if videos is not None:
+                videos.discard()
         self._discard_trajectory()
 
     def _discard_trajectory(self) -> None:
@@ -981,16 +848,8 @@ class Recorder:
         try:
             self._end_trajectory(facts, standing)
         finally:
-            with contextlib.ExitStack() as ends:
-                # Run from the last to the first: the metadata of the first video is
-                # the sign that all are there.
-                for video in self._live_videos[:1]:
-                    if standing is Standing.CHOSEN:
-                        ends.callback(_name_again, video)
-                    ends.callback(self._end_live_video, video, facts, standing)
-                    ends.callback(name_further_videos, video, self._live_videos[1:])
-                for video in self._live_videos[1:]:
-                    ends.callback(self._end_live_video, video, facts, standing)
+            if self._live_videos is not None:
+                self._end_live_videos(self._live_videos, facts, standing)
         if self._kept is not None:
             self._settle(self._kept.settle)
 
@@ -1004,7 +863,7 @@ class Recorder:
         episode_id = self._next_episode_id - 1
         video = self.video_recorder
         deferred = video if isinstance(video, DeferredVideo) else None
-        promise = self._episode_promise(episode_id, DEFERRED if deferred else LIVE)
+        promise = self._promises.of_episode(episode_id, DEFERRED if deferred else LIVE)
         verdict: Mapping[str, Any] = {}
         if self._kept is not None and self._decision[1]:
             verdict = self._kept.verdict(standing, promise)
@@ -1041,32 +900,29 @@ class Recorder:
             self._videos.add_deferred(episode_id, trajectory.path, deferred)
         self._ended.add(trajectory.path)
 
-    def _end_live_video(
-        self, recorder: VideoRecorder, facts: Mapping[str, Any], standing: Standing
+    def _end_live_videos(
+        self, videos: LiveVideos, facts: Mapping[str, Any], standing: Standing
     ) -> None:
-        """Finish a video that was drawn live; what is known goes with it."""
-        if not recorder.enabled or recorder.closed:
-            return
+        """Finish the videos that were drawn live; what is known goes with them."""
         if standing is Standing.DROPPED:
-            recorder.discard()
+            videos.discard()
             return
-        if self._kept is not None and standing is Standing.CHOSEN:
-            recorder.metadata["selection"] = self._kept.chosen_facts()
-        stats = self.stats_recorder
-        if "complete" not in recorder.metadata:
-            # Else an end that was interrupted is taken up again.
-            recorder.metadata.update(facts)
-        recorder.metadata.update(length=stats.steps, reward=stats.rewards)
-        try:
-            recorder.close()
-        except Error as error:
-            if not self._tolerates("video", error):
-                raise
-        finally:
-            if recorder.closed and self._kept and standing is Standing.CANDIDATE:
-                self._kept.hold_live(self._next_episode_id - 1, recorder)
-            elif recorder.closed:
+        stats, kept = self.stats_recorder, self._kept
+        known = {**facts, "length": stats.steps, "reward": stats.rewards}
+        if kept is not None and standing is Standing.CHOSEN:
+            known["selection"] = kept.chosen_facts()
+
+        def list_one(recorder: VideoRecorder) -> None:
+            if kept is not None and standing is Standing.CANDIDATE:
+                kept.hold_live(self._next_episode_id - 1, recorder)
+            else:
                 self._videos.add_live(recorder)
+
+        try:
+            videos.end(known, list_one)
+        finally:
+            if standing is Standing.CHOSEN:
+                videos.name_again()
 
     def live_video_facts(self) -> dict[str, Any]:
         """Return what is known of a live video from its episode's beginning."""
@@ -1113,12 +969,6 @@ class Recorder:
             "faults": self._faults.listed(),
             "versions": dict(versions()),
         }
-
-
-def _name_again(video: VideoRecorder) -> None:
-    """Give the finished videos of an episode their second names, if they have any."""
-    if video.finished and video.path is not None and "also_named" in video.metadata:
-        give_second_names(Path(video.path))
 
 
 # Asking the system for the process's number at every step takes as long as counting it.

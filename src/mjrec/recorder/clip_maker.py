@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Beginning videos that are counted in steps: rendered later where that can be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ..simulation.state_source import EpisodeStart
+from .clips import Clip
+from .deferred_clip import ClipLogs, DeferredClip
+from .ended_trajectories import EndedTrajectories
+from .episode_videos import EpisodeVideos
+from .live_clip import LiveClip
+from .live_videos import LiveVideoMaker, name_again
+from .options import DEFERRED
+from .subject import Subject
+from .trajectory_recorder import Pace
+from .video_promises import VideoPromises
+from .video_recorder import VideoRecorder
+
+__all__ = ["ClipMaker"]
+
+
+class ClipMaker:
+    """Makes what records the clips of a run.
+
+    Args:
+        subject: what is recorded.
+        promises: where videos will be, and what is said of them.
+        live: makes what records those that are drawn at once.
+        pace: how simulated time becomes frames.
+        episode_facts: returns what is known of the running episode, for the header of
+            a log that begins now.
+        before: returns what was before that moment in the episode.
+        can_be_deferred: tells whether what begins so can be rendered later.
+        tolerates: tells whether to go on after an error.
+        videos: lists those that are over.
+        ended: takes over the logs of those that are over.
+    """
+
+    def __init__(
+        self,
+        *,
+        subject: Subject,
+        promises: VideoPromises,
+        live: LiveVideoMaker,
+        pace: Pace,
+        episode_facts: Callable[[EpisodeStart], Mapping[str, Any]],
+        before: Callable[[], Mapping[str, Any]],
+        can_be_deferred: Callable[[EpisodeStart], bool],
+        tolerates: Callable[[Exception], bool],
+        videos: EpisodeVideos,
+        ended: EndedTrajectories,
+    ) -> None:
+        self._promises = promises
+        self._live = live
+        self._can_be_deferred = can_be_deferred
+        self._tolerates = tolerates
+        self._videos = videos
+        self._ended = ended
+        self._logs: ClipLogs | None = None
+        if subject.clip_states is not None and subject.rendering.mode == DEFERRED:
+            self._logs = ClipLogs(
+                directory=promises.directory,
+                infix=promises.infix,
+                states=subject.clip_states,
+                pace=pace,
+                facts=episode_facts,
+                before=before,
+                tolerates=tolerates,
+                on_end=self._add_deferred,
+            )
+
+    def make(self, steps: int | None, *, episode_id: int, total_steps: int) -> Clip:
+        """Return what records a clip that begins now.
+
+        Args:
+            steps: how many were taken when a step began it; None where it begins with
+                an episode.
+            episode_id: of the running episode.
+            total_steps: how many were taken in any case.
+        """
+        path = self._promises.clip_path(episode_id, steps)
+        named = ("episode", episode_id) if steps is None else ("step", steps)
+        second_name = self._promises.second_name(*named)
+        if self._logs is not None:
+            start = self._logs.states.begin_episode()
+            if self._can_be_deferred(start):
+                promise = self._promises.of_video(path, DEFERRED)
+                return DeferredClip(
+                    self._logs,
+                    start,
+                    first_step=total_steps,
+                    episode_id=episode_id,
+                    video=path.with_name(f"{path.name}.mp4"),
+                    facts={"kept": False, "video": {**promise, **second_name}},
+                )
+        recorders = self._live.at(path)
+        for recorder in recorders:
+            recorder.metadata.update(first_step=total_steps, last_episode_id=episode_id)
+        recorders[0].metadata.update(second_name)
+        return LiveClip(
+            recorders,
+            self._live.pictures,
+            on_end=self._add_live,
+            tolerates=self._tolerates,
+        )
+
+    def _add_live(self, recorders: Sequence[VideoRecorder]) -> None:
+        for recorder in recorders:
+            self._videos.add_live(recorder)
+        name_again(recorders[0])
+
+    def _add_deferred(self, clip: DeferredClip) -> None:
+        self._videos.add_deferred_clip(clip)
+        self._ended.add_clip(clip.first_part)

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The videos of an episode that are drawn while it runs, one for each camera."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..annotation import Caption
+from ..errors import Error
+from ..formats.second_names import give_second_names
+from .options import RecorderOptions
+from .subject import EpisodePictures, Subject
+from .video_recorder import VideoRecorder
+
+__all__ = ["LiveVideoMaker", "LiveVideos", "name_again", "name_further_videos"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveVideoMaker:
+    """Makes what records the videos of one moment, from each camera.
+
+    Attributes:
+        subject: what is recorded.
+        options: what was asked for.
+        facts: returns what is known of the running episode, for metadata.
+        caption: returns what is written on the pictures of this moment.
+    """
+
+    subject: Subject
+    options: RecorderOptions
+    facts: Callable[[], Mapping[str, Any]]
+    caption: Callable[[], Caption]
+
+    @property
+    def pictures(self) -> tuple[EpisodePictures, ...]:
+        """Where the pictures come from, of the first camera and of the others."""
+        return (self.subject.pictures, *self.subject.further_pictures.values())
+
+    def at(self, path: Path, *, enabled: bool = True) -> tuple[VideoRecorder, ...]:
+        """Return what records the first camera's video, and the others' if it can.
+
+        Args:
+            path: of the first one, without its ending.
+            enabled: False makes one that records nothing.
+        """
+        first = self._one(path, self.subject.pictures, enabled=enabled)
+        if not first.enabled:
+            return (first,)
+        further = self.subject.further_pictures.items()
+        return (
+            first,
+            *(
+                self._one(path.with_name(f"{path.name}.{name}"), pictures)
+                for name, pictures in further
+            ),
+        )
+
+    def _one(
+        self, base_path: Path, pictures: EpisodePictures, *, enabled: bool = True
+    ) -> VideoRecorder:
+        options = self.options
+        return VideoRecorder(
+            pictures,
+            base_path=base_path,
+            metadata=self.facts(),
+            enabled=enabled,
+            fps=options.fps,
+            max_fps=options.max_fps,
+            frame_hashes=True,
+            clock=self.subject.clock,
+            declared=self.subject.declared,
+            facts=pictures.facts,
+            strict=options.strict,
+            caption=self.caption if options.annotate else None,
+        )
+
+
+class LiveVideos:
+    """The videos of one episode.
+
+    Args:
+        recorders: what records them; the first camera's comes first.
+        pictures: where they come from.
+        tolerates: tells whether to go on after an error.
+        on_picture_error: called with one that is not tolerated while a picture is
+            taken: it may be the environment's own.
+    """
+
+    def __init__(
+        self,
+        recorders: Sequence[VideoRecorder],
+        pictures: Sequence[EpisodePictures],
+        *,
+        tolerates: Callable[[Exception], bool],
+        on_picture_error: Callable[[Exception], object],
+    ) -> None:
+        self._recorders = recorders
+        self._pictures = pictures
+        self._tolerates = tolerates
+        self._on_picture_error = on_picture_error
+
+    def begin(self) -> None:
+        """Take the pictures of the reset."""
+        for pictures in self._pictures:
+            pictures.begin_episode()
+        for recorder in self._recorders:
+            recorder.capture_frame()
+
+    def take(self, *, is_there: bool, last: bool) -> None:
+        """Take the pictures of a step.
+
+        Args:
+            is_there: False where the environment has reset itself already.
+            last: the episode is over.
+        """
+        for recorder in self._recorders:
+            if not recorder.functional:
+                continue
+            if not is_there:
+                recorder.metadata["final_frame"] = "missing"
+                continue
+            try:
+                recorder.capture_frame()
+                if last:
+                    recorder.capture_last()
+            except Exception as error:
+                if not self._tolerates(error):
+                    self._on_picture_error(error)
+                    raise
+                recorder.give_up(str(error))
+
+    def take_last(self) -> None:
+        """Take the pictures of the last step, where they were left out."""
+        for recorder in self._recorders:
+            try:
+                recorder.capture_last()
+            except Exception as error:
+                if not self._tolerates(error):
+                    raise
+                recorder.give_up(str(error))
+
+    def give_up(self, reason: str) -> None:
+        """Take no more pictures, and say why; those that were taken stay."""
+        for recorder in self._recorders:
+            recorder.give_up(reason)
+
+    def discard(self) -> None:
+        """End without a video and without metadata."""
+        for recorder in self._recorders:
+            recorder.discard()
+
+    def end(
+        self, facts: Mapping[str, Any], on_closed: Callable[[VideoRecorder], object]
+    ) -> None:
+        """Finish the files. Where it was interrupted, the next call goes on.
+
+        Args:
+            facts: what is known of the episode, for the metadata; of its end what the
+                first call says.
+            on_closed: called with each that is closed.
+        """
+        if not self._recorders:
+            return
+        first, *others = self._recorders
+        with contextlib.ExitStack() as ends:
+            # Run from the last to the first: the metadata of the first video is the
+            # sign that all are there.
+            ends.callback(self._end_one, first, facts, on_closed)
+            ends.callback(name_further_videos, first, others)
+            for recorder in others:
+                ends.callback(self._end_one, recorder, facts, on_closed)
+
+    def name_again(self) -> None:
+        """Give the finished videos their second names, if they have any."""
+        for first in self._recorders[:1]:
+            name_again(first)
+
+    def _end_one(
+        self,
+        recorder: VideoRecorder,
+        facts: Mapping[str, Any],
+        on_closed: Callable[[VideoRecorder], object],
+    ) -> None:
+        if recorder.closed:
+            return
+        is_told = "complete" in recorder.metadata
+        recorder.metadata.update(
+            {
+                key: value
+                for key, value in facts.items()
+                if not (is_told and key in _OF_THE_END)
+            }
+        )
+        try:
+            recorder.close()
+        except Error as error:
+            if not self._tolerates(error):
+                raise
+        finally:
+            if recorder.closed:
+                on_closed(recorder)
+
+
+# What an end that is taken up again must not say otherwise.
+_OF_THE_END = ("complete", "reason", "exception", "terminated", "truncated")
+
+
+def name_further_videos(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:
+    """Let the metadata of a first camera's video name the others."""
+    names = [Path(v.path).name for v in others if v.finished and v.path is not None]
+    if names:
+        first.metadata["further_videos"] = names
+
+
+def name_again(first: VideoRecorder) -> None:
+    """Give a first camera's video and the others their second names, if there are any.
+
+    Args:
+        first: what has recorded it.
+    """
+    if first.finished and first.path is not None and "also_named" in first.metadata:
+        give_second_names(Path(first.path))
