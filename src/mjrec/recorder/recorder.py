@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import time
@@ -21,7 +22,6 @@ from ..errors import (
     NoPictures,
     PicturesDiffer,
 )
-from ..formats.journal import JournalEntry, JournalWriter
 from ..formats.manifest import Manifest, write_manifest
 from ..formats.monitor_directory import (
     journal_name,
@@ -38,6 +38,7 @@ from .clips import Clips
 from .deferred_video import DeferredVideo
 from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
+from .episode_journal import EpisodeJournal
 from .episode_videos import EpisodeVideos
 from .faults import Faults, What
 from .kept_videos import KeptVideos
@@ -137,8 +138,10 @@ class Recorder:
         self._stays = False
         self._next_episode_id = self._place.first_episode_id
         self._episode_start: dict[str, Any] = {}
-        self._journal = JournalWriter(
-            self.directory / journal_name(self._place.infix), env_info=self._env_info
+        self._journal = EpisodeJournal(
+            self.directory / journal_name(self._place.infix),
+            env_info=self._env_info,
+            tolerates=functools.partial(self._tolerates, "journal"),
         )
         self.stats_recorder = StatsRecorder(
             str(self.directory),
@@ -356,7 +359,8 @@ class Recorder:
         try:
             if done:
                 # First of all, so that no failing video can lose the episode.
-                self._journal_episode()
+                self._finished = self._finished_episode()
+                self._journal.add(self._finished)
         finally:
             try:
                 if self._trajectory is not None:
@@ -450,7 +454,7 @@ class Recorder:
             episode_facts=self._episode_facts,
             before=self._before_clip,
             can_be_deferred=self._can_be_deferred,
-            tolerates=self._tolerates_in_video,
+            tolerates=functools.partial(self._tolerates, "video"),
             videos=self._videos,
             ended=self._ended,
         )
@@ -472,9 +476,6 @@ class Recorder:
             "reward_before": stats.rewards or 0.0,
             "reset_time": self._reset_clock,
         }
-
-    def _tolerates_in_video(self, error: Exception) -> bool:
-        return self._tolerates("video", error)
 
     def _finish_models(self, states: StateSource) -> None:
         try:
@@ -569,7 +570,7 @@ class Recorder:
         self._live_videos = LiveVideos(
             recorders,
             self._live_maker.pictures,
-            tolerates=self._tolerates_in_video,
+            tolerates=functools.partial(self._tolerates, "video"),
             on_picture_error=self.note_error,
         )
         self._live_videos.begin()
@@ -731,29 +732,6 @@ class Recorder:
                 self._stop_frames(self._trajectory, error)
         if self._live_videos is not None:
             self._live_videos.take_last()
-
-    def _journal_episode(self) -> None:
-        self._finished = episode = self._finished_episode()
-        try:
-            self._journal.append(
-                JournalEntry(
-                    episode_id=episode.episode_id,
-                    length=episode.length,
-                    reward=episode.reward,
-                    type=episode.type,
-                    start_time=episode.start_time,
-                    end_time=episode.end_time,
-                    seed=episode.seed,
-                    options=episode.options,
-                    terminated=episode.terminated,
-                    truncated=episode.truncated,
-                )
-            )
-        except OSError as error:
-            path = self.directory / journal_name(self._place.infix)
-            named = FileNotWritten(path, error.strerror or error)
-            if not self._tolerates("journal", named):
-                raise named from error
 
     def _finished_episode(self) -> FinishedEpisode:
         stats = self.stats_recorder
