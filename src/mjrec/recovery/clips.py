@@ -83,8 +83,9 @@ def _episode_of(part: Path) -> int:
         episode_id = _facts(part).get("episode_id")
     except UnreadableFile:
         return -1
-    is_number = type(episode_id) is int and 0 <= episode_id < MOST_EPISODES
-    return episode_id if is_number else -1
+    if type(episode_id) is int and 0 <= episode_id < MOST_EPISODES:
+        return episode_id
+    return -1
 
 
 def _facts(part: Path) -> Mapping[str, Any]:

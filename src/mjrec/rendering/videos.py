@@ -426,7 +426,7 @@ def _write_video(
     out: Path,
     draw: Callable[[], Iterable[Frame]],
     *,
-    captions: Captions | None,
+    captions: Iterable[Caption] | None,
     fps: Fraction,
     on_frame: Callable[[], object],
 ) -> tuple[VideoFile, BlankFrames]:
@@ -457,7 +457,7 @@ def _encode(
     out: Path,
     frames: Iterable[Frame],
     *,
-    captions: Captions | None,
+    captions: Iterable[Caption] | None,
     fps: Fraction,
     tell: Callable[[int], object],
 ) -> tuple[VideoFile, BlankFrames]:
