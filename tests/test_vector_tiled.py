@@ -3,6 +3,9 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -230,3 +233,30 @@ def test_without_videos_there_is_none(tmp_path: Path) -> None:
     with mjrec.Monitor(vector, tmp_path, False, tiled=True) as env:
         play(env, 3)
     assert not list(tmp_path.glob("*.mp4"))
+
+
+KILLED = """
+import os, signal, sys
+
+import mjrec
+from vector_environments import VectorCorridor
+
+env = mjrec.Monitor(VectorCorridor((2, 3)), sys.argv[1], lambda _: True, tiled=True)
+env.reset()
+for _ in range(4):
+    env.step(env.action_space.sample())
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_recovering_lists_what_a_killed_process_had_finished(tmp_path: Path) -> None:
+    """The tiled video of each episode, with the others of the first."""
+    subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        check=False,
+    )
+    mjrec.recover(tmp_path)
+    listed = {Path(video).name for video, _ in mjrec.load_results(tmp_path)["videos"]}
+    assert listed == {path.name for path in tmp_path.glob("*.mp4")}
+    assert sum(name.endswith("video000000.tiled.mp4") for name in listed) == 1

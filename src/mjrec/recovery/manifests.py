@@ -20,6 +20,7 @@ from ..formats.locks import wait_for_lock
 from ..formats.manifest import Manifest, read_manifest, write_manifest
 from ..formats.monitor_directory import (
     Infix,
+    episode_of,
     journal_name,
     manifest_lock_name,
     manifest_name,
@@ -35,6 +36,7 @@ from ..formats.video_metadata import (
     is_done,
     metadata_path,
 )
+from ..formats.video_names import tiled_name
 from ..results.recorded_environment import GYM_VERSION
 from ..results.sources import MonitorResults
 from .clips import pending_clips, videos_begun_by_steps
@@ -200,6 +202,7 @@ def _manifest(
             broken += [about for _, about in finished_videos(video)]
         elif video.exists():
             finished += finished_videos(video)
+    finished += [names for names in _tiled_videos(remains) if names not in finished]
     first = known.first_episode_id or 0
     pending = [
         _as_listed(entry, old_details)
@@ -247,6 +250,21 @@ def _names_of_video(remains: Remains, episode_id: int) -> tuple[str, str] | None
 def _all_videos(remains: Remains, first: tuple[str, str]) -> list[tuple[str, str]]:
     """Return the names of an episode's first video and of its further cameras'."""
     return finished_videos(remains.directory / first[0])
+
+
+def _tiled_videos(remains: Remains) -> list[tuple[str, str]]:
+    """Return the names of finished videos of all sub-environments, each a pair.
+
+    They belong to no first video: that one may have been rendered later, or never.
+    """
+    return [
+        (path.name, metadata_path(path).name)
+        for path in remains.paths
+        if (number := episode_of(path.name)) is not None
+        and path.name == tiled_name(f"{video_prefix(remains.infix, number)}.mp4")
+        and metadata_path(path).exists()
+        and not is_broken(metadata_path(path))
+    ]
 
 
 def _pending(remains: Remains, episode_id: int) -> dict[str, Any]:
