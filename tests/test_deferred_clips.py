@@ -21,8 +21,9 @@ from recordings import manifest_of
 import mjrec
 from mjrec.commands import main
 from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.trajectory_log_facts import append_facts
 from mjrec.rendering.finishing import finish_pending
-from mjrec.rendering.pending import look_at, recordings
+from mjrec.rendering.pending import key_of, look_at, recordings
 
 
 class Blinking(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -43,7 +44,8 @@ class Blinking(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 def hopper(length: int = 5, **made: Any) -> gymnasium.Env[Any, Any]:
     """Return a hopper whose episodes are short, and small pictures of it."""
-    size = {"width": 48, "height": 48}
+    # So wide that a caption has room.
+    size = {"width": 256, "height": 48}
     return Blinking(
         gymnasium.make("Hopper-v5", max_episode_steps=length, **size, **made)
     )
@@ -78,7 +80,7 @@ def reach(env: Any, steps: int) -> None:
 def record(directory: Path, env: Any, steps: int, **options: Any) -> None:
     """Record so many steps of an environment, and all videos of them."""
     ride = hop if isinstance(env, gymnasium.Env) else reach
-    with mjrec.Monitor(env, directory, **options) as monitor:
+    with mjrec.Monitor(env, directory, **{"workers": 1, **options}) as monitor:
         ride(monitor, steps)
 
 
@@ -130,7 +132,7 @@ def check_same(live: Path, deferred: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"camera": "track", "annotate": True}, {"max_fps": 50}]
+    "options", [{}, {"camera": "track", "annotate": True, "max_fps": 50}]
 )
 def test_pictures_are_those_that_were_drawn_live(
     options: dict[str, Any], tmp_path: Path
@@ -154,7 +156,7 @@ def test_resets_that_change_the_model_are_seen(annotate: bool, tmp_path: Path) -
         "step_trigger": lambda step: step == 1,
         "video_length": 9,
         "height": 48,
-        "width": 64,
+        "width": 256,
         "annotate": annotate,
         "env_id": "dm_control/reacher-easy",
     }
@@ -369,3 +371,32 @@ def test_clips_belong_to_their_monitor(tmp_path: Path) -> None:
     assert len({key.infix for key in recordings(tmp_path)}) == 2
     record(tmp_path, hopper(), 5, force=True, **options)
     assert len(recordings(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../there.mp4",
+        "openaigym.video.9.9.video000000.mp4",
+        "openaigym.video.{infix}.video000000.step000002.mp4",
+        None,
+    ],
+)
+def test_no_other_video_is_written_over(name: str | None, tmp_path: Path) -> None:
+    """Logs may be anybody's: the name of a video has to be that of its own clip."""
+    record(tmp_path, hopper(), 3, step_trigger=lambda step: step == 1, workers=0)
+    [key] = recordings(tmp_path)
+    [log] = tmp_path.glob("openaigym.clip.*")
+    named = None if name is None else name.format(infix=key.infix)
+    append_facts(log, {"video": {"recording": "deferred", "name": named or ""}})
+    before = sorted(tmp_path.iterdir())
+    [outcome] = finish(tmp_path)
+    assert "not that of its own" in str(outcome.failure)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_video_is_found_by_its_own_name(tmp_path: Path) -> None:
+    """Whoever has read the manifest knows no other."""
+    record(tmp_path, hopper(), 3, step_trigger=lambda step: step == 1, workers=0)
+    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
+    assert [key_of(entry["video"])] == recordings(tmp_path) == [key_of(entry["clip"])]
