@@ -46,8 +46,12 @@ env = gymnasium.make(
 env = mjrec.Monitor(env, directory, lambda episode: episode % 5 == 0, render=render,
                     workers=1, trajectory_callable=True, quality="full")
 
+class Crash(Exception):
+    # Not a RuntimeError, which Python's own threading.Condition would swallow.
+    pass
+
 def crash(*_):
-    raise RuntimeError("crashed")
+    raise Crash("crashed")
 
 env.reset(seed=0)
 print("begun", flush=True)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 import numbers
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -14,6 +15,7 @@ from .errors import InvalidArgument
 __all__ = [
     "Schedule",
     "capped_cubic_video_schedule",
+    "check_takes_one",
     "disable_videos",
     "schedule_from_text",
     "schedule_name",
@@ -67,6 +69,31 @@ def to_schedule(video_callable: object) -> Schedule:
         f"{type(video_callable).__name__}: {video_callable!r}. For a video of every "
         "episode use video_callable=lambda episode_id: True."
     )
+
+
+def check_takes_one(function: Callable[..., Any], name: str, what: str) -> None:
+    """Check that a function can be called with one thing, as far as that can be seen.
+
+    Args:
+        function: given by the user.
+        name: of the option that it was given as.
+        what: it will be called with.
+
+    Raises:
+        InvalidArgument: it takes more, or nothing.
+    """
+    try:
+        signature = inspect.signature(function)
+    except ValueError:
+        # Of what is written in C nobody may know.
+        return
+    try:
+        signature.bind(None)
+    except TypeError as error:
+        raise InvalidArgument(
+            f"{name} is called with one argument, {what}, and "
+            f"{schedule_name(function)}{signature} cannot be: {error}."
+        ) from error
 
 
 def schedule_name(schedule: Schedule) -> str:

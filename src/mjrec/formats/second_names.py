@@ -125,7 +125,8 @@ def _link(file: Path, link: Path) -> None:
         if not _is_same(file, link):
             logger.warning(
                 "%s is there already and is another file than %s, which was to have "
-                "that name too. It is left alone; rename one of them.",
+                "that name too. It is left alone; give each monitor of a directory a "
+                "name_prefix of its own.",
                 link,
                 file.name,
             )

@@ -32,6 +32,7 @@ __all__ = [
     "name_part",
     "second_name_of",
     "tiled_name",
+    "view_of",
     "with_part",
     "without_part",
 ]
@@ -47,6 +48,10 @@ _AMBIGUOUS = re.compile(
 # Directories have names of 255 bytes, and there are other parts.
 _LONGEST_PART = 80
 _DIGEST = 8
+
+_VIEW = re.compile(
+    r"\.video\d{6,18}(?:\.step\d+)?(?:\.(?P<view>[^.]+))?\.mp4$", re.ASCII
+)
 
 # What Gymnasium's RecordVideo calls its files, for any `name_prefix` that is portable.
 _SECOND_NAME = re.compile(
@@ -131,6 +136,16 @@ def tiled_name(video: str) -> str:
         video: the name that it would have otherwise.
     """
     return with_part(video, _TILED)
+
+
+def view_of(video: str) -> str:
+    """Return which of an episode's videos one is; empty for the first camera's.
+
+    >>> view_of("openaigym.video.0.7.video000027.step000137.side.mp4")
+    'side'
+    """
+    match = _VIEW.search(video)
+    return "" if match is None else match["view"] or ""
 
 
 def is_second_name(name: str) -> bool:

@@ -62,7 +62,7 @@ def camera_pictures(
             raise InvalidArgument(
                 "tiled=True lays the pictures of several cameras, or those of the "
                 "sub-environments of a vector environment, side by side, and here is "
-                f"one of each: got camera={camera!r}. Give camera=[...]."
+                f"one of each: got the camera {camera!r}. Give several."
             )
         return CameraPictures(camera=cameras[0], pictures=pictures_from(cameras[0]))
     plain = [None if each is None else plain_camera(each) for each in cameras]

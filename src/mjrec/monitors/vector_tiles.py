@@ -81,6 +81,7 @@ class TiledVideo:
         self._clock = clock
         self._declared = declared
         self._video: VideoRecorder | None = None
+        self._has_warned = False
         # The episode that the pictures are of, and how far it has come.
         self._episode_id = -1
         self._progress: dict[str, Any] = {}
@@ -177,9 +178,21 @@ class TiledVideo:
         if is_reset:
             # The first tile shows the next episode already; the others are right.
             video.metadata["final_frame"] = "missing"
+            self._warn_of_missing_frames()
         self._take(video.capture_frame)
         if is_over:
             self._take(video.capture_last)
+
+    def _warn_of_missing_frames(self) -> None:
+        if self._has_warned:
+            return
+        self._has_warned = True
+        logger.warning(
+            "The last frame of each tiled video shows the first sub-environment after "
+            "its reset, and others that have ended likewise: with SAME_STEP all of "
+            "them are there to be drawn only when that is over. The sub-environments' "
+            "own videos are whole where they are objects in this process."
+        )
 
     def _take(self, take: Callable[[], None]) -> None:
         """Take pictures, or do without them where that was asked for."""

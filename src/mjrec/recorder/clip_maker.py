@@ -96,10 +96,9 @@ class ClipMaker:
                     video=path.with_name(f"{path.name}.mp4"),
                     facts={"kept": False, "video": {**promise, **second_name}},
                 )
-        recorders = self._live.at(path)
+        recorders = self._live.at(path, second_name=second_name)
         for recorder in recorders:
             recorder.metadata.update(first_step=total_steps, last_episode_id=episode_id)
-        recorders[0].metadata.update(second_name)
         return LiveClip(
             recorders,
             self._live.pictures,

@@ -12,6 +12,7 @@ from typing import Any
 from ..annotation import Caption
 from ..errors import Error
 from ..formats.second_names import give_second_names
+from ..formats.video_names import second_name_of
 from .options import RecorderOptions
 from .subject import EpisodePictures, Subject
 from .video_recorder import VideoRecorder
@@ -40,24 +41,32 @@ class LiveVideoMaker:
         """Where the pictures come from, of the first camera and of the others."""
         return (self.subject.pictures, *self.subject.further_pictures.values())
 
-    def at(self, path: Path, *, enabled: bool = True) -> tuple[VideoRecorder, ...]:
+    def at(
+        self, path: Path, *, second_name: Mapping[str, str], enabled: bool = True
+    ) -> tuple[VideoRecorder, ...]:
         """Return what records the first camera's video, and the others' if it can.
 
         Args:
             path: of the first one, without its ending.
+            second_name: what it is called besides, as `VideoPromises` says it.
             enabled: False makes one that records nothing.
         """
         first = self._one(path, self.subject.pictures, enabled=enabled)
-        if not first.enabled:
+        if first.path is None:
             return (first,)
-        further = self.subject.further_pictures.items()
-        return (
-            first,
-            *(
-                self._one(path.with_name(f"{path.name}.{name}"), pictures)
-                for name, pictures in further
-            ),
-        )
+        first.metadata.update(second_name)
+        others = [
+            self._one(path.with_name(f"{path.name}.{name}"), pictures)
+            for name, pictures in self.subject.further_pictures.items()
+        ]
+        for other in others:
+            assert other.path is not None
+            first_name, name = Path(first.path).name, Path(other.path).name
+            other.metadata["first_video"] = first_name
+            for second in second_name.values():
+                called = second_name_of(name, second, first=first_name)
+                other.metadata["also_named"] = called
+        return (first, *others)
 
     def _one(
         self, base_path: Path, pictures: EpisodePictures, *, enabled: bool = True

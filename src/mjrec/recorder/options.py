@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from ..annotation import check_annotation
 from ..errors import InvalidArgument
 from ..frames import check_quality
 from ..rates import to_rate
+from ..schedules import check_takes_one
 from .selection import selection_from
 from .tracking import FinishedEpisode, Tracker
 
@@ -104,6 +106,8 @@ class RecorderOptions:
         self._check_clips()
         self._check_keep()
         self._check_trackers()
+        if self.annotate:
+            check_annotation()
 
     def _check_clips(self) -> None:
         if self.step_trigger is not None:
@@ -112,6 +116,7 @@ class RecorderOptions:
                     "step_trigger must be a function from the number of steps taken so "
                     f"far to a bool, got {self.step_trigger!r}."
                 )
+            check_takes_one(self.step_trigger, "step_trigger", "the number of steps")
             if self.video_callable is not None:
                 raise InvalidArgument(
                     "step_trigger chooses videos by steps and video_callable by "
@@ -167,6 +172,10 @@ class RecorderOptions:
                     "trackers must be a mjrec.trackers.Tracker or a sequence of them, "
                     f"got {tracker!r} of type {type(tracker).__name__}."
                 )
+        if len(set(map(id, self.all_trackers))) < len(self.all_trackers):
+            raise InvalidArgument(
+                f"A tracker is there twice in {given!r}, and would be told all twice."
+            )
 
     @property
     def has_clips(self) -> bool:

@@ -561,10 +561,11 @@ class Recorder:
 
     def _begin_live_videos(self, episode_id: int, *, enabled: bool) -> None:
         recorders = self._live_maker.at(
-            self._promises.path(episode_id), enabled=enabled
+            self._promises.path(episode_id),
+            second_name=self._promises.second_name("episode", episode_id),
+            enabled=enabled,
         )
         main = self.video_recorder = recorders[0]
-        main.metadata.update(self._promises.second_name("episode", episode_id))
         if not main.enabled:
             return
         self._live_videos = LiveVideos(
@@ -761,10 +762,10 @@ class Recorder:
         if self._trackers:
             self._trackers.videos(self._videos.news())
 
-    def _note_tracker_fault(self, name: str, error: Exception) -> None:
-        self._faults.note(
-            "tracker", f"{name}: {error}", episode_id=self._next_episode_id - 1
-        )
+    def _note_tracker_fault(
+        self, name: str, error: Exception, episode_id: int | None
+    ) -> None:
+        self._faults.note("tracker", f"{name}: {error}", episode_id=episode_id)
 
     def _tolerates(self, what: What, error: BaseException) -> bool:
         """Note what of the running episode is lost; tell whether to go on."""

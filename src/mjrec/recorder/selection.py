@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
 from ..errors import InvalidArgument, UnknownName
-from ..schedules import schedule_name
+from ..schedules import check_takes_one, schedule_name
 from .tracking import FinishedEpisode
 
 __all__ = ["RULES", "Keep", "Selection", "Standing", "selection_from"]
@@ -130,6 +130,7 @@ def selection_from(keep: object) -> Selection:
         InvalidArgument: it is neither text nor a function, or N is not 1 or more.
     """
     if callable(keep):
+        check_takes_one(keep, "keep", "the sequence of finished episodes")
         return _ByFunction(schedule_name(keep), keep)
     if not isinstance(keep, str):
         raise InvalidArgument(

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..formats.video_names import view_of
 from .tracking import FinishedEpisode, FinishedVideo, Run, Tracker
 
 __all__ = ["ToldTrackers"]
@@ -25,7 +26,8 @@ class ToldTrackers:
     Args:
         run: what they are told of.
         trackers: who is told.
-        on_fault: called with the class name of one that has raised, and what.
+        on_fault: called with the class name of one that has raised, what, and the
+            number of the episode that it was told of, or None.
     """
 
     def __init__(
@@ -33,14 +35,14 @@ class ToldTrackers:
         run: Run,
         trackers: Iterable[Tracker],
         *,
-        on_fault: Callable[[str, Exception], object],
+        on_fault: Callable[[str, Exception, int | None], object],
     ) -> None:
         self._run = run
         self._trackers: Sequence[Tracker] = tuple(trackers)
         self._on_fault = on_fault
         # Of episodes whose videos are still to come.
         self._episodes: dict[int, FinishedEpisode] = {}
-        self._tell("begin")
+        self._tell(None, "begin")
 
     def __bool__(self) -> bool:
         """Whether anybody listens."""
@@ -55,7 +57,7 @@ class ToldTrackers:
         """
         if has_video and self._trackers:
             self._episodes[episode.episode_id] = episode
-        self._tell("episode", episode)
+        self._tell(episode.episode_id, "episode", episode)
 
     def videos(self, finished: Iterable[tuple[int, Path, Path]]) -> None:
         """Tell of videos that are finished.
@@ -65,33 +67,37 @@ class ToldTrackers:
         """
         for episode_id, path, metadata_path in finished:
             self._tell(
+                episode_id,
                 "video",
                 FinishedVideo(
                     path=path,
                     metadata_path=metadata_path,
                     episode_id=episode_id,
                     episode=self._episodes.get(episode_id),
+                    view=view_of(path.name),
                 ),
             )
 
     def end(self) -> None:
         """Tell of the end of the run; nobody is called any more after it."""
-        self._tell("end")
+        self._tell(None, "end")
         self._trackers = ()
         self._episodes.clear()
 
-    def _tell(self, what: str, *facts: Any) -> None:
+    def _tell(self, episode_id: int | None, what: str, *facts: Any) -> None:
         for tracker in self._trackers:
             try:
                 getattr(tracker, what)(self._run, *facts)
             except Exception as error:  # whatever somebody's tracker does
-                self._dismiss(tracker, error)
+                self._dismiss(tracker, error, episode_id)
 
-    def _dismiss(self, tracker: Tracker, error: Exception) -> None:
+    def _dismiss(
+        self, tracker: Tracker, error: Exception, episode_id: int | None
+    ) -> None:
         name = type(tracker).__name__
         logger.exception("%s has failed and is told nothing more.", name)
         self._trackers = tuple(each for each in self._trackers if each is not tracker)
-        self._on_fault(name, error)
+        self._on_fault(name, error, episode_id)
         # So that it lets go of what it holds open, as far as it still can.
         with contextlib.suppress(Exception):
             tracker.end(self._run)

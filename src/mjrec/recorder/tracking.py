@@ -73,7 +73,10 @@ class FinishedVideo:
     Attributes:
         path: the file.
         metadata_path: all about it, JSON.
-        episode_id: of its episode.
+        episode_id: of its episode, or of the one in which it begins.
+        view: what it shows where there are several of an episode, as the names of the
+            files say it: a further camera, or `tiled` for all sub-environments; empty
+            for the first camera.
         episode: its episode; None where that is not over or was not completed.
     """
 
@@ -81,6 +84,7 @@ class FinishedVideo:
     metadata_path: Path
     episode_id: int
     episode: FinishedEpisode | None
+    view: str = ""
 
 
 class Tracker:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import tempfile
@@ -399,11 +398,9 @@ class VideoRecorder:
         """Complete the note by what the second picture has told."""
         if not isinstance(self._writer, VideoWriter) or self._writer.frame_count == 0:
             return
-        facts: Mapping[str, Any] = {}
-        # They are for the metadata in the end; a note is no reason to stop.
-        with contextlib.suppress(Exception):
-            facts = self._facts() if self._facts else {}
-        self._note(self._writer, facts)
+        # What they raise is raised: caught here, the exception of a signal's handler
+        # would be lost, and the metadata needs them in the end.
+        self._note(self._writer, self._facts() if self._facts else {})
 
     def _forget_note(self) -> None:
         if self._is_noted and self.path is not None:

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from ..recorder.tracking import FinishedEpisode
+from ..recorder.tracking import FinishedEpisode, FinishedVideo
 
-__all__ = ["group_of", "scalars_of"]
+__all__ = ["group_of", "name_of", "scalars_of"]
 
 
 def group_of(episode: FinishedEpisode | None) -> str:
@@ -19,3 +19,8 @@ def scalars_of(episode: FinishedEpisode) -> dict[str, float]:
     if episode.success is not None:
         scalars["success"] = float(episode.success)
     return scalars
+
+
+def name_of(video: FinishedVideo) -> str:
+    """Return what comes behind the slash: `video`, or `video_side` of a further one."""
+    return f"video_{video.view}" if video.view else "video"

@@ -15,7 +15,7 @@ from ..recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
 from ..worker_thread import WorkerThread
 from .preview import animated_gif
 from .required_packages import require
-from .scalars import group_of, scalars_of
+from .scalars import group_of, name_of, scalars_of
 
 if TYPE_CHECKING:
     from .event_file import EventFile
@@ -105,7 +105,7 @@ class _Preview:
     path: Path
     frame_count: int
     fps: Fraction
-    group: str
+    tag: str
     step: int
 
 
@@ -115,7 +115,7 @@ def _preview(video: FinishedVideo, episode: FinishedEpisode | None) -> _Preview:
         path=video.path,
         frame_count=frame_count,
         fps=fps,
-        group=group_of(episode),
+        tag=f"{group_of(episode)}/{name_of(video)}",
         step=episode.total_steps if episode else 0,
     )
 
@@ -151,7 +151,7 @@ class _TensorBoardRun:
     def write_video(self, video: FinishedVideo) -> None:
         preview = _preview(video, video.episode or self._last_episode)
         self._file.write_text(
-            f"{preview.group}/video_file",
+            f"{preview.tag}_file",
             f"episode {video.episode_id}: `{video.path.name}`, "
             f"{preview.frame_count} frames at {float(preview.fps):g} fps, "
             f"in `{video.path.parent}`",
@@ -175,6 +175,4 @@ class _TensorBoardRun:
         gif = animated_gif(
             preview.path, frame_count=preview.frame_count, fps=preview.fps
         )
-        self._file.write_gif(
-            f"{preview.group}/video", gif, step=preview.step, wall_time=time.time()
-        )
+        self._file.write_gif(preview.tag, gif, step=preview.step, wall_time=time.time())

@@ -9,12 +9,11 @@ from typing import Any
 from ..errors import InvalidArgument
 from ..recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
 from .required_packages import require
-from .scalars import group_of, scalars_of
+from .scalars import group_of, name_of, scalars_of
 
 __all__ = ["WandbTracker"]
 
 _STEPS = "total_steps"
-_VIDEO = "video"
 _VIDEO_STEPS = "video_total_steps"
 
 
@@ -61,6 +60,11 @@ class WandbTracker(Tracker):
                 "WandbTracker takes a run, or how to make one, not both; got a run and "
                 f"{', '.join(self._init)}."
             )
+        if run is not None and not callable(getattr(run, "define_metric", None)):
+            raise InvalidArgument(
+                "WandbTracker takes a run as wandb.init returns it, or project= and "
+                f"other arguments to make one, got {run!r}."
+            )
         self._given = run
         self._service: _WandbRun | None = None
         self._last_episodes: dict[Run, FinishedEpisode | None] = {}
@@ -87,7 +91,8 @@ class WandbTracker(Tracker):
             str(video.path), caption=f"episode {video.episode_id}", format="mp4"
         )
         steps = episode.total_steps if episode else 0
-        self._log(run, episode, {_VIDEO_STEPS: steps, _VIDEO: picture})
+        name = name_of(video)
+        self._log(run, episode, {_VIDEO_STEPS: steps, name: picture}, video=name)
 
     def end(self, run: Run) -> None:
         """Finish the run of W&B, if it was made here and this was its last monitor."""
@@ -108,13 +113,18 @@ class WandbTracker(Tracker):
         return _WandbRun(made, is_ours=True)
 
     def _log(
-        self, run: Run, episode: FinishedEpisode | None, values: dict[str, Any]
+        self,
+        run: Run,
+        episode: FinishedEpisode | None,
+        values: dict[str, Any],
+        *,
+        video: str | None = None,
     ) -> None:
         assert self._service is not None
         group = group_of(episode)
         if run.env_index is not None:
             group = f"{group}/env{run.env_index}"
-        self._service.log(group, values)
+        self._service.log(group, values, video=video)
 
 
 class _WandbRun:
@@ -126,10 +136,17 @@ class _WandbRun:
         self._process_id = os.getpid()
         self._groups: set[str] = set()
 
-    def log(self, group: str, values: dict[str, Any]) -> None:
+    def log(
+        self, group: str, values: dict[str, Any], *, video: str | None = None
+    ) -> None:
         if group not in self._groups:
             self._groups.add(group)
             self._define(group)
+        if video is not None and f"{group}/{video}" not in self._groups:
+            self._groups.add(f"{group}/{video}")
+            self._run.define_metric(
+                f"{group}/{video}", step_metric=f"{group}/{_VIDEO_STEPS}"
+            )
         self._run.log({f"{group}/{name}": value for name, value in values.items()})
 
     def leave(self) -> None:
@@ -141,6 +158,3 @@ class _WandbRun:
         for steps in (_STEPS, _VIDEO_STEPS):
             self._run.define_metric(f"{group}/{steps}")
         self._run.define_metric(f"{group}/*", step_metric=f"{group}/{_STEPS}")
-        self._run.define_metric(
-            f"{group}/{_VIDEO}", step_metric=f"{group}/{_VIDEO_STEPS}"
-        )
