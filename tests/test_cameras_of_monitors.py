@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +63,22 @@ def test_manifest_and_metadata_name_all_videos(tmp_path: Path, render: str) -> N
     assert cameras[0] == "track"
     assert len(cameras) == 2
     assert cameras[1] != "track"
+
+
+@pytest.mark.parametrize("render", ["live", "deferred"])
+def test_further_videos_name_the_first_and_their_second_name(
+    tmp_path: Path, render: str
+) -> None:
+    """Whoever has one file finds the others."""
+    record(tmp_path, camera=["track", -1], render=render, name_prefix="rl")
+    [first, further] = sorted(
+        tmp_path.glob("openaigym.*.mp4"), key=lambda p: len(str(p))
+    )
+    about = json.loads(further.with_suffix(".meta.json").read_text())
+    assert about["first_video"] == first.name
+    assert (tmp_path / about["also_named"]).samefile(further)
+    about = json.loads(first.with_suffix(".meta.json").read_text())
+    assert about["further_videos"] == [further.name]
 
 
 @pytest.mark.parametrize("render", ["live", "deferred"])
@@ -126,4 +144,31 @@ def test_what_cannot_be_is_told_before_anything_is_made(
     """One error, with what was asked for in it."""
     with pytest.raises(mjrec.InvalidArgument, match=words):
         record(tmp_path / "run", **options)
+    assert not (tmp_path / "run").exists()
+
+
+WITHOUT_PILLOW = """
+import sys
+
+sys.modules["PIL"] = None
+import gymnasium, mjrec
+
+try:
+    mjrec.Monitor(gymnasium.make("Hopper-v5"), sys.argv[1], annotate=True)
+except mjrec.MissingDependency as error:
+    print(error)
+"""
+
+
+def test_captions_without_pillow_are_an_error_of_the_constructor(
+    tmp_path: Path,
+) -> None:
+    """It says how to install it, and nothing is left."""
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_PILLOW, str(tmp_path / "run")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert 'pip install "mjrec[annotate]"' in done.stdout
     assert not (tmp_path / "run").exists()

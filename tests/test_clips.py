@@ -190,6 +190,8 @@ def test_mujoco_clips_are_rendered_later(render: str | None, tmp_path: Path) -> 
     ("options", "words"),
     [
         ({"step_trigger": 5}, "step_trigger must be a function"),
+        ({"step_trigger": lambda: True}, "called with one argument"),
+        ({"keep": lambda a, b: [0]}, "called with one argument"),
         ({"step_trigger": bool, "video_callable": bool}, "one of them"),
         ({"video_length": 0}, "positive whole number"),
         ({"video_length": True}, "positive whole number"),

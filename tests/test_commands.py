@@ -12,10 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pytest
 from recordings import frames_in, metadata_of, videos_in
 
-from mjrec import load_results
+from mjrec import Monitor, load_results
 from mjrec.commands import main
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.trajectory import TrajectoryHeader
@@ -359,6 +360,25 @@ def test_list_shows_every_episode(mjrec: Any, tmp_path: Path) -> None:
     assert status == 0
     assert out.count("truncated") == 2
     assert next(tmp_path.glob("*.mp4")).name in out
+
+
+def test_list_names_videos_of_more_or_less_than_an_episode(
+    mjrec: Any, tmp_path: Path
+) -> None:
+    """Those that are counted in steps, and that of an episode that was cut off."""
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
+    options = {"height": 32, "width": 32, "workers": 1}
+    with Monitor(
+        env, tmp_path, step_trigger=lambda step: step == 1, video_length=4, **options
+    ) as env:
+        for _ in range(2):
+            env.reset(seed=0)
+            for _ in range(3):
+                env.step([0.0])
+    status, out, _ = mjrec("list", tmp_path)
+    assert status == 0
+    [video] = tmp_path.glob("*.mp4")
+    assert out.splitlines()[-2:] == ["Other videos:", f"  {video.name}"]
 
 
 def test_list_json_is_a_line_for_each_episode(mjrec: Any, tmp_path: Path) -> None:

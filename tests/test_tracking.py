@@ -141,6 +141,48 @@ def test_interruption_in_a_tracker_is_an_interruption(tmp_path: Path) -> None:
     assert mjrec.load_results(tmp_path)["episode_lengths"] == [3]
 
 
+def test_tracker_given_twice_is_an_error(tmp_path: Path) -> None:
+    """It would be told all twice."""
+    tracker = Listening()
+    with pytest.raises(mjrec.InvalidArgument, match="twice"):
+        record(tmp_path / "run", "InvertedPendulum-v5", trackers=[tracker, tracker])
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("render", ["live", "deferred"])
+def test_videos_of_several_cameras_are_told_apart(tmp_path: Path, render: str) -> None:
+    """By what their names say; the first camera's by nothing."""
+    tracker = Listening()
+    record(
+        tmp_path,
+        "HalfCheetah-v5",
+        episodes=1,
+        camera=["track", -1],
+        render=render,
+        trackers=tracker,
+    )
+    assert sorted(video.view for video in tracker.of("video")) == ["", "-1"]
+
+
+@pytest.mark.parametrize(
+    ("method", "episode_id"),
+    [("begin", None), ("episode", 0), ("video", 0), ("end", None)],
+)
+def test_fault_of_a_tracker_names_what_it_was_told_of(
+    tmp_path: Path, method: str, episode_id: int | None
+) -> None:
+    """The episode, or none where it was told of the run."""
+
+    def fail(*_: Any) -> None:
+        raise ConnectionError("no server")
+
+    tracker = Listening()
+    setattr(tracker, method, fail)
+    record(tmp_path, "InvertedPendulum-v5", trackers=tracker)
+    [fault] = manifest_of(tmp_path)["mjrec"]["faults"]
+    assert fault["episode_id"] == episode_id
+
+
 @pytest.mark.parametrize("given", [5, "wandb", [Listening(), print], Listening])
 def test_what_is_no_tracker_is_told_before_anything_is_made(
     tmp_path: Path, given: Any

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +16,8 @@ import rich.table
 import tyro
 
 from .. import json_text
-from ..formats.video_metadata import finished_videos
+from ..formats.monitor_directory import iter_monitor_files
+from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
 from .help_text import flowing_help
 
@@ -48,7 +49,13 @@ def list_episodes(
     if not console.is_terminal:
         # A log has no width, and a folded name cannot be copied.
         console = rich.console.Console(width=_LOG_WIDTH)
-    console.print(episode_table(episodes))
+    shown: list[Episode] = []
+    console.print(episode_table(_kept(episodes, shown)))
+    others = _other_videos(directory, shown)
+    if others:
+        # Names must survive copying, so no line is folded.
+        lines = ["Other videos:", *(f"  {name}" for name in others)]
+        console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
     return 0
 
 
@@ -70,6 +77,34 @@ def episode_table(episodes: Iterator[Episode]) -> rich.table.Table:
             _video(episode),
         )
     return table
+
+
+def _kept(episodes: Iterator[Episode], seen: list[Episode]) -> Iterator[Episode]:
+    """Yield episodes, and keep those that have a video."""
+    for episode in episodes:
+        if episode.video is not None:
+            seen.append(episode)
+        yield episode
+
+
+def _other_videos(directory: Path, episodes: Iterable[Episode]) -> list[str]:
+    """Return the names of finished videos that are of no completed episode alone.
+
+    Such as those that are counted in steps, or show all sub-environments.
+    """
+    known = {
+        name
+        for episode in episodes
+        if episode.video is not None
+        for name in (episode.video.name, *_further_videos(episode))
+    }
+    return [
+        path.name
+        for path in iter_monitor_files(directory)
+        if path.suffix == ".mp4"
+        and path.name not in known
+        and metadata_path(path).exists()
+    ]
 
 
 def _video(episode: Episode) -> str:
