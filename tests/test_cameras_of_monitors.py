@@ -170,5 +170,5 @@ def test_captions_without_pillow_are_an_error_of_the_constructor(
         text=True,
         check=True,
     )
-    assert 'pip install "mjrec[annotate]"' in done.stdout
+    assert "pip install 'mjrec[annotate]'" in done.stdout
     assert not (tmp_path / "run").exists()
