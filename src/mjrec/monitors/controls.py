@@ -6,18 +6,17 @@ from __future__ import annotations
 import functools
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from ..environments.scenes import Scenes
-from ..errors import RenderError
 from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
 from ..recorder.ended_trajectories import Rendering
 from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
-from ..recorder.options import DEFERRED, WARN, RecorderOptions
+from ..recorder.options import DEFERRED, RecorderOptions
 from ..recorder.recorder import Recorder
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.subject import Subject
@@ -49,7 +48,6 @@ class MonitorControls(MonitorLifetime):
     _recorder: Recorder
     _guard: ExitGuard
     _options: RecorderOptions
-    _told_failures = False
 
     @property
     def directory(self) -> Path:
@@ -145,15 +143,8 @@ class MonitorControls(MonitorLifetime):
             recorder.note_error(error)
             raise
 
-    def _raise_failures(self) -> None:
-        failures = self._recorder.failures()
-        if not failures or self._told_failures:
-            return
-        self._told_failures = True
-        error = RenderError(self.directory, failures)
-        if self._options.on_error != WARN:
-            raise error
-        logger.warning("%s", error)
+    def _failures(self) -> Mapping[str, str]:
+        return self._recorder.failures()
 
     def _start(
         self,

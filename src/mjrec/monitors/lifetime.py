@@ -3,15 +3,29 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal, NoReturn, Self, SupportsIndex
 
-from ..errors import NotPicklable
+from ..errors import NotPicklable, RenderError
+from ..recorder.options import WARN, RecorderOptions
 
 __all__ = ["MonitorLifetime"]
+
+logger = logging.getLogger(__name__)
 
 
 class MonitorLifetime:
     """A context manager that waits for its videos unless it is left by an exception."""
+
+    _options: RecorderOptions
+    _told_failures = False
+
+    @property
+    def directory(self) -> Path:
+        """The monitor directory, absolute."""
+        raise NotImplementedError
 
     def close(self, *, wait: bool = True) -> None:
         """Finish the recordings, then close the environment. Idempotent.
@@ -24,6 +38,25 @@ class MonitorLifetime:
     def _note_error(self, error: BaseException) -> None:
         """Note that the environment, or its user, has raised."""
         raise NotImplementedError
+
+    def _failures(self) -> Mapping[str, str]:
+        """Return why videos could not be rendered, by their names."""
+        raise NotImplementedError
+
+    def _raise_failures(self) -> None:
+        """Say once which videos could not be rendered.
+
+        Raises:
+            RenderError: there are some, and `on_error` is "raise".
+        """
+        failures = self._failures()
+        if not failures or self._told_failures:
+            return
+        self._told_failures = True
+        error = RenderError(self.directory, failures)
+        if self._options.on_error != WARN:
+            raise error
+        logger.warning("%s", error)
 
     def __enter__(self) -> Self:
         return self

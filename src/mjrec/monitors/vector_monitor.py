@@ -14,10 +14,10 @@ from typing import Any
 import gymnasium
 
 from ..environments.gymnasium_pictures import gymnasium_pictures
-from ..errors import RenderError, ResetNeeded, ResetNotAllowed
+from ..errors import ResetNeeded, ResetNotAllowed
 from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
-from ..recorder.options import WARN, RecorderOptions
+from ..recorder.options import RecorderOptions
 from .controls import MonitorControls
 from .lifetime import MonitorLifetime
 from .vector_inside import InsideRecording, environments_inside
@@ -101,7 +101,6 @@ class VectorMonitor(
                 env, mode, directory, options, frames=frames, view=view, env_id=env_id
             )
         self._options = options
-        self._told_failures = False
         self._had_error = False
         self._recording = recording
         self._tiled = None
@@ -279,15 +278,8 @@ class VectorMonitor(
             # Drawing has loaded OpenGL by now, which tears itself down at exit.
             self._guard.run_first_at_exit()
 
-    def _raise_failures(self) -> None:
-        failures = self._recording.failures()
-        if not failures or self._told_failures:
-            return
-        self._told_failures = True
-        error = RenderError(self.directory, failures)
-        if self._options.on_error != WARN:
-            raise error
-        logger.warning("%s", error)
+    def _failures(self) -> Mapping[str, str]:
+        return self._recording.failures()
 
 
 def _tiles(
