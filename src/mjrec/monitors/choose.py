@@ -176,6 +176,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     Raises:
         InvalidArgument: `env` is none of these, or an argument cannot be.
         NoPictures: videos were asked for of an environment that gives no pictures.
+        MissingDependency: `annotate`, and there is no Pillow.
         PicturesDiffer: `render="deferred"`, and what the environment shows cannot be
             made from its state; the message names what stands in the way.
         ExistingRecordings: the directory holds recordings, and neither `force` nor
