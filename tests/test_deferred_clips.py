@@ -149,6 +149,7 @@ def test_pictures_are_those_that_were_drawn_live(
     assert not parts(tmp_path / "deferred")
 
 
+@pytest.mark.dm_control
 @pytest.mark.parametrize("annotate", [False, True])
 def test_resets_that_change_the_model_are_seen(annotate: bool, tmp_path: Path) -> None:
     """Of a task whose target lies elsewhere in each episode."""

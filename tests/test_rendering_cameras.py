@@ -518,7 +518,8 @@ def record(
 class Rolling(MujocoEnv):
     """A ball on an endless floor."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012  Gymnasium's way
+    # Gymnasium 1.0 wants just these.
+    metadata = {"render_modes": ["human", "rgb_array", "depth_array"]}  # noqa: RUF012  Gymnasium's way
 
     def __init__(self, model: Path) -> None:
         box = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
