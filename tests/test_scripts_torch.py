@@ -12,8 +12,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-# The Python of an environment: its pip tells what it would install, and otherwise writes
-# down what it was told to install.
+# The Python of an environment: its pip tells what it would install, and otherwise
+# writes down what it was told to install.
 PYTHON = """#!/bin/sh
 case "$*" in
   *"import torch"*) exit 1 ;;
