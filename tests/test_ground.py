@@ -16,6 +16,7 @@ import pytest
 import mjrec
 from mjrec import ExistingRecordings, InvalidArgument, InvalidFrame, UnknownName
 from mjrec.atomic_files import replacing, write_text
+from mjrec.formats.monitor_directory import infix_of
 from mjrec.frames import check_frame, check_size, pad_to_even
 from mjrec.json_text import dumps, float_from_json, loads
 
@@ -71,6 +72,15 @@ def test_file_appears_whole(tmp_path: Path) -> None:
         assert temporary.parent == tmp_path
     assert path.read_text() == "half"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_unfinished_file_of_a_hidden_one_is_known_as_a_monitors(tmp_path: Path) -> None:
+    """Or nobody would remove what a killed process has left of it."""
+    note = tmp_path / ".openaigym.video.0.7.video000015.mp4.note.part"
+    with replacing(note) as temporary:
+        assert infix_of(temporary.name) == "0.7"
+        temporary.touch()
+    assert note.exists()
 
 
 def test_failure_leaves_the_old_file(tmp_path: Path) -> None:

@@ -19,8 +19,13 @@ __all__ = ["replacing", "temporary_path", "write_text"]
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a new name for an unfinished `path`, in the same directory."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    """Return a new name for an unfinished `path`, in the same directory.
+
+    It is hidden by one dot, also where `path` is hidden itself: by that dot whoever
+    puts a directory in order knows the file.
+    """
+    name = path.name.removeprefix(".")
+    return path.with_name(f".{name}.{secrets.token_hex(4)}.part")
 
 
 @contextlib.contextmanager
