@@ -243,7 +243,7 @@ class OutsideRecording(VectorRecording):
     def _seed_of(self, index: int, seed: Any) -> Any:
         if isinstance(seed, list | tuple):
             return seed[index]
-        if isinstance(seed, int) and _is_async(self._env):
+        if isinstance(seed, int) and _async_in(self._env) is not None:
             return seed + index
         # One generator for all: it is the vector environment's seed.
         return seed
@@ -343,7 +343,7 @@ def _rendering_choice(env: _VectorEnv, asked: str | None) -> RenderingChoice:
 
 def _way_out(env: _VectorEnv) -> str:
     """Return how states, and all frames, can be recorded all the same."""
-    if _is_async(env):
+    if _async_in(env) is not None:
         return (
             "Put Monitor around each of them, inside the functions that make them: "
             "AsyncVectorEnv([lambda: mjrec.Monitor(gymnasium.make(...), directory, "
@@ -356,17 +356,20 @@ def _way_out(env: _VectorEnv) -> str:
     )
 
 
-def _is_async(env: _VectorEnv) -> bool:
-    return isinstance(env.unwrapped, gymnasium.vector.AsyncVectorEnv)
+def _async_in(env: _VectorEnv) -> gymnasium.vector.AsyncVectorEnv | None:
+    """Return the AsyncVectorEnv below all wrappers; None for others."""
+    base: Any = env.unwrapped
+    return base if isinstance(base, gymnasium.vector.AsyncVectorEnv) else None
 
 
 def _env_id(env: _VectorEnv) -> str:
     if env.spec is not None:
         return env.spec.id
-    if _is_async(env):
+    base = _async_in(env)
+    if base is not None:
         told = {
             match[1] if (match := _WITH_SPEC.fullmatch(text)) else None
-            for text in env.unwrapped.call("__str__")  # type: ignore[attr-defined]
+            for text in base.call("__str__")
         }
         if len(told) == 1 and (env_id := told.pop()) is not None:
             return env_id
@@ -382,11 +385,11 @@ def _env_id(env: _VectorEnv) -> str:
 def _rates(env: _VectorEnv) -> list[Fraction | None]:
     """Return the steps per second of each sub-environment, as far as they can say."""
     # In another process there is no asking for what may be missing: the process ends.
-    if _is_async(env) and all(
-        all(env.unwrapped.call("has_wrapper_attr", name))  # type: ignore[attr-defined]
-        for name in ("model", "data", "dt")
+    base = _async_in(env)
+    if base is not None and all(
+        all(base.call("has_wrapper_attr", name)) for name in ("model", "data", "dt")
     ):
-        steps = env.unwrapped.call("dt")  # type: ignore[attr-defined]
+        steps = base.call("dt")
         return [rate_from_timestep(float(dt)) if dt else None for dt in steps]
     return [None] * env.num_envs
 
