@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ..errors import Error
-from .live_videos import name_further_videos
+from .live_videos import end_each
 from .subject import EpisodePictures
 from .video_recorder import VideoRecorder
 
@@ -64,17 +63,12 @@ class LiveClip:
 
     def end(self, facts: Mapping[str, Any]) -> None:
         """Finish the files. Where it was interrupted, the next call goes on."""
-        first, *others = self._videos
         for video in self._videos:
             video.metadata.update(facts)
-        with contextlib.ExitStack() as ends:
-            # Run from the last to the first: the metadata of the first video is the
-            # sign that all are there.
-            ends.callback(self._on_end, self._videos)
-            ends.callback(self._close, first)
-            ends.callback(name_further_videos, first, others)
-            for video in others:
-                ends.callback(self._close, video)
+        try:
+            end_each(self._videos, self._close)
+        finally:
+            self._on_end(self._videos)
 
     def _take(self) -> None:
         for video in self._videos:

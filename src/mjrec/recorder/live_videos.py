@@ -17,7 +17,7 @@ from .options import RecorderOptions
 from .subject import EpisodePictures, Subject
 from .video_recorder import VideoRecorder
 
-__all__ = ["LiveVideoMaker", "LiveVideos", "name_again", "name_further_videos"]
+__all__ = ["LiveVideoMaker", "LiveVideos", "end_each", "name_again"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +92,7 @@ class LiveVideos:
     """The videos of one episode.
 
     Args:
-        recorders: what records them; the first camera's comes first.
+        recorders: what records them, one or more; the first camera's comes first.
         pictures: where they come from.
         tolerates: tells whether to go on after an error.
         on_picture_error: called with one that is not tolerated while a picture is
@@ -172,21 +172,11 @@ class LiveVideos:
                 first call says.
             on_closed: called with each that is closed.
         """
-        if not self._recorders:
-            return
-        first, *others = self._recorders
-        with contextlib.ExitStack() as ends:
-            # Run from the last to the first: the metadata of the first video is the
-            # sign that all are there.
-            ends.callback(self._end_one, first, facts, on_closed)
-            ends.callback(name_further_videos, first, others)
-            for recorder in others:
-                ends.callback(self._end_one, recorder, facts, on_closed)
+        end_each(self._recorders, lambda each: self._end_one(each, facts, on_closed))
 
     def name_again(self) -> None:
         """Give the finished videos their second names, if they have any."""
-        for first in self._recorders[:1]:
-            name_again(first)
+        name_again(self._recorders[0])
 
     def _end_one(
         self,
@@ -218,8 +208,28 @@ class LiveVideos:
 _OF_THE_END = ("complete", "reason", "exception", "terminated", "truncated")
 
 
-def name_further_videos(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:
-    """Let the metadata of a first camera's video name the others."""
+def end_each(
+    recorders: Sequence[VideoRecorder], end: Callable[[VideoRecorder], object]
+) -> None:
+    """End the videos of one moment, also where ending one of them raises.
+
+    The metadata of the first camera's video is the sign that all are there, and names
+    the others: it comes last.
+
+    Args:
+        recorders: what has recorded them; the first camera's comes first.
+        end: called with each.
+    """
+    first, *others = recorders
+    with contextlib.ExitStack() as ends:
+        # Run from the last to the first.
+        ends.callback(end, first)
+        ends.callback(_name_further_videos, first, others)
+        for recorder in others:
+            ends.callback(end, recorder)
+
+
+def _name_further_videos(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:
     names = [Path(v.path).name for v in others if v.finished and v.path is not None]
     if names:
         first.metadata["further_videos"] = names
