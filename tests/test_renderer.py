@@ -482,6 +482,7 @@ def test_a_gymnasium_environment_keeps_its_context() -> None:
     assert np.array_equal(before, after)
 
 
+@pytest.mark.dm_control
 def test_dm_control_keeps_its_context_and_gives_the_same_picture() -> None:
     """Its model and data wrappers are taken as they are."""
     suite = pytest.importorskip("dm_control.suite")

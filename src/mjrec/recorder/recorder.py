@@ -22,6 +22,7 @@ from ..errors import (
     NoPictures,
     PicturesDiffer,
 )
+from ..fingerprint import machine_fingerprint
 from ..formats.manifest import Manifest, write_manifest
 from ..formats.monitor_directory import (
     journal_name,
@@ -304,7 +305,8 @@ class Recorder:
         succeeds. A reset is then allowed in any case. Nothing more is taken of the
         environment's state, which may be half of a step.
         """
-        if self.stats_recorder.done is False and self._ending is None:
+        is_running = self.stats_recorder.done is False or self._lacks_last_step()
+        if is_running and self._ending is None:
             self._ending = ending(error)
 
     def before_step(self, action: Any = None) -> None:
@@ -638,6 +640,7 @@ class Recorder:
             **self._episode_start,
             "environment": self._subject.environment,
             "versions": dict(versions()),
+            "machine": dict(machine_fingerprint()),
             "model": None if start is None else start.model,
             "scene": None if start is None else start.scene,
             "refusal": None if start is None else start.refusal,
@@ -786,13 +789,13 @@ class Recorder:
     def _how_it_ended(self, otherwise: str) -> dict[str, Any]:
         """Return whether the running episode is complete, and what ended it."""
         if self.stats_recorder.done and self._lacks_last_step():
-            return {"complete": False, "reason": INTERRUPT}
+            return {"complete": False, **(self._ending or {"reason": INTERRUPT})}
         if self.stats_recorder.done:
             return {"complete": True, **self._flags}
         return {"complete": False, **(self._ending or {"reason": otherwise})}
 
     def _lacks_last_step(self) -> bool:
-        """Whether Ctrl-C has come between the counting of a step and its row."""
+        """Whether a signal's handler has raised between a step's counting and its row."""
         trajectory = self._trajectory
         if trajectory is None or trajectory.is_stopped:
             return False

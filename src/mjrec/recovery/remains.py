@@ -37,7 +37,10 @@ __all__ = [
     "remains_of",
 ]
 
-_PART = re.compile(r"\.(?P<final>openaigym\..+)\.(?:[0-9a-f]{8}|note)\.part")
+# A note is rewritten as every file is: an unfinished one has both endings.
+_PART = re.compile(
+    r"\.(?P<final>openaigym\..+?)(?:\.note\.part\.[0-9a-f]{8}|\.[0-9a-f]{8}|\.note)\.part"
+)
 _MODEL_PART = re.compile(r"\.openaigym\.model\..+\.[0-9a-f]{8}\.part")
 _VIDEO_PART = re.compile(
     r"\.(?P<video>openaigym\.video\..+\.video\d{6,}(?:\.[^/]+)?)"

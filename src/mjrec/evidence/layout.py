@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands where in a packed run.
+
+::
+
+    run.zip
+    └── run/                            one folder, of the zip's name
+        ├── bagit.txt                   BagIt 1.0 (RFC 8493)
+        ├── bag-info.txt
+        ├── manifest-sha512.txt
+        ├── tagmanifest-sha512.txt
+        └── data/                       the RO-Crate
+            ├── ro-crate-metadata.json
+            ├── README.md
+            ├── CITATION.cff
+            ├── environment.json        what the recording was made with
+            ├── statistics.csv          a row for each episode
+            └── recordings/             the monitor directory
+                └── openaigym.*
+
+Packing writes it and verifying reads it; they share nothing else.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+__all__ = [
+    "CITATION",
+    "CRATE",
+    "ENVIRONMENT",
+    "FORMAT_KEY",
+    "FORMAT_VERSION",
+    "PAYLOAD",
+    "README",
+    "RECORDINGS",
+    "STATISTICS",
+]
+
+PAYLOAD: Final = "data"
+# Below the payload.
+CRATE: Final = "ro-crate-metadata.json"
+README: Final = "README.md"
+CITATION: Final = "CITATION.cff"
+ENVIRONMENT: Final = "environment.json"
+STATISTICS: Final = "statistics.csv"
+RECORDINGS: Final = "recordings"
+
+# In bag-info.txt. It rises when a reader must know of a change.
+FORMAT_KEY: Final = "Mjrec-Evidence-Version"
+FORMAT_VERSION: Final = 1

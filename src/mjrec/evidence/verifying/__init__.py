@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a packed run, or a monitor directory, to what it proves."""
