@@ -86,7 +86,7 @@ class Verification:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing failed; what was not checkable is no failure, and no proof."""
+        """Whether nothing failed; not being checkable is no failure, and no proof."""
         return not self.failures
 
     def count(self, verdict: Verdict) -> int:
