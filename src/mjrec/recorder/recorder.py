@@ -795,7 +795,7 @@ class Recorder:
         return {"complete": False, **(self._ending or {"reason": otherwise})}
 
     def _lacks_last_step(self) -> bool:
-        """Whether a signal's handler has raised before the last step's row was written."""
+        """Whether a signal's handler raised before the last step's row was written."""
         trajectory = self._trajectory
         if trajectory is None or trajectory.is_stopped:
             return False
