@@ -115,6 +115,8 @@ def test_name_and_random_state() -> None:
         "framework": "dm_control",
         "id": "dm_control/cheetah-run",
         "kwargs": None,
+        "wrappers": [],
+        "max_episode_steps": 1000,
     }
     assert dm_control_scenes(env, env_id="mine").environment is None
     state = json.loads(json.dumps(scenes.random_state()))

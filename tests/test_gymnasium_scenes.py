@@ -185,6 +185,8 @@ def test_what_makes_the_environment_again() -> None:
         "framework": "gymnasium",
         "id": "InvertedPendulum-v5",
         "kwargs": None,
+        "wrappers": [],
+        "max_episode_steps": 1000,
     }
     assert gymnasium_scenes(HalfCheetahEnv()).environment is None
 

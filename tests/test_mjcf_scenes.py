@@ -46,6 +46,8 @@ def test_pictures_follow_from_states(model: Path) -> None:
         "framework": "mjcf",
         "id": "mjcf/hinge",
         "kwargs": {},
+        "wrappers": [],
+        "max_episode_steps": 3,
     }
     assert "Overlay overrides render()" in str(gymnasium_scenes(Overlay(env)).obstacle)
 

@@ -17,6 +17,7 @@ from ..simulation.viewer_settings import place_free_camera
 from .dm_control_contexts import ContextsOnDemand
 from .dm_control_pictures import drawn_by_physics, picture_size
 from .scenes import Scenes, class_name, generator_state, is_defined_by, overriding_class
+from .wrapping import around_dm_env
 
 __all__ = ["dm_control_scenes"]
 
@@ -68,7 +69,7 @@ def dm_control_scenes(
             authored=lambda: _authored(env),
         ),
         obstacle=_obstacle(env.physics) if by_physics else None,
-        environment=_environment(env_id),
+        environment=_environment(env, env_id),
         random_state=lambda: _random_state(env),
     )
 
@@ -147,11 +148,12 @@ def _authored(env: Any) -> AuthoredModel | None:
     return AuthoredModel("model.xml", {"model.xml": text, **mjcf.get_assets()})
 
 
-def _environment(env_id: str | None) -> dict[str, Any] | None:
+def _environment(env: Any, env_id: str | None) -> dict[str, Any] | None:
     if env_id is None or not env_id.startswith(_SUITE):
         return None
     # With which arguments it was made, it does not say.
-    return {"framework": "dm_control", "id": env_id, "kwargs": None}
+    known = {"framework": "dm_control", "id": env_id, "kwargs": None}
+    return {**known, **around_dm_env(env)}
 
 
 def _random_state(env: Any) -> Any:

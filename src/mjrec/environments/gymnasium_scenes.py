@@ -21,6 +21,7 @@ from .scenes import (
     overriding_class,
     plain_arguments,
 )
+from .wrapping import around_gymnasium
 
 if TYPE_CHECKING:
     from ..simulation.episode_states import EpisodeStates
@@ -73,7 +74,10 @@ def gymnasium_scenes(
     base: Any = env.unwrapped
     scenes = _mjcf(base, view) if _is_mjcf(base) else _scenes(env, base, view)
     obstacle = None if own_view else _override_above(env) or scenes.obstacle
-    return dataclasses.replace(scenes, obstacle=obstacle)
+    environment = scenes.environment
+    if environment is not None:
+        environment = {**environment, **around_gymnasium(env)}
+    return dataclasses.replace(scenes, obstacle=obstacle, environment=environment)
 
 
 def _is_mjcf(base: Any) -> bool:

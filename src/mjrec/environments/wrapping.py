@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands between a monitor and the environment that it records.
+
+An action that was recorded above a wrapper need not be what the environment got, so
+whoever makes the environment again must know of wrappers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import gymnasium
+
+from .scenes import class_name
+
+__all__ = ["around_dm_env", "around_gymnasium"]
+
+# They hand actions, rewards and the ends of episodes on as they are. `TimeLimit` does
+# not, and is told apart, by its number.
+_TRANSPARENT = frozenset(
+    {
+        "gymnasium.wrappers.common.OrderEnforcing",
+        "gymnasium.wrappers.common.PassiveEnvChecker",
+        "gymnasium.wrappers.common.RecordEpisodeStatistics",
+        "gymnasium.wrappers.common.TimeLimit",
+        "gymnasium.wrappers.rendering.RecordVideo",
+        "mjrec.environments.dm_env_episodes.StepLimit",
+        "mjrec.monitors.dm_env_monitor.DmEnvMonitor",
+        "mjrec.monitors.gymnasium_monitor.GymnasiumMonitor",
+    }
+)
+# Where dm_env's wrappers, dm_control's and ours, keep what they wrap.
+_INSIDE = ("_env", "_environment", "environment")
+
+
+def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """Return what is around the innermost environment.
+
+    Args:
+        env: as the user wrapped it.
+
+    Returns:
+        `wrappers`, the full names of the classes of wrappers, outermost first, that may
+        change what goes through them, and `max_episode_steps`, the least limit of a
+        `TimeLimit`, or None.
+    """
+    layers: list[Any] = []
+    while isinstance(env, gymnasium.Wrapper):
+        layers.append(env)
+        env = env.env
+    return _facts(layers, (getattr(e, "_max_episode_steps", None) for e in layers))
+
+
+def around_dm_env(env: Any) -> dict[str, Any]:
+    """Return the same of a dm_env environment; limits are dm_control's own, and ours.
+
+    What a wrapper keeps under a name of its own is not found, and then the wrapper
+    counts as the environment; `wrappers` names it all the same, because it is none of
+    dm_control's environments.
+    """
+    layers: list[Any] = []
+    while not _is_innermost(env):
+        layers.append(env)
+        inner = _inside(env)
+        if inner is None:
+            break
+        env = inner
+    return _facts(layers, map(_dm_env_limit, [*layers, env]))
+
+
+def _facts(layers: list[Any], limits: Iterable[Any]) -> dict[str, Any]:
+    names = (class_name(type(layer)) for layer in layers)
+    known = [int(limit) for limit in limits if _is_limit(limit)]
+    return {
+        "wrappers": [name for name in names if name not in _TRANSPARENT],
+        "max_episode_steps": min(known, default=None),
+    }
+
+
+def _dm_env_limit(env: Any) -> Any:
+    own = _attributes(env)
+    return own.get("_max_steps", own.get("_step_limit"))
+
+
+def _is_limit(limit: Any) -> bool:
+    return isinstance(limit, int | float) and math.isfinite(limit)
+
+
+def _is_innermost(env: Any) -> bool:
+    return class_name(type(env)) in (
+        "dm_control.rl.control.Environment",
+        "dm_control.composer.environment.Environment",
+    )
+
+
+def _inside(env: Any) -> Any:
+    own = _attributes(env)
+    return next((own[name] for name in _INSIDE if name in own), None)
+
+
+def _attributes(env: Any) -> dict[str, Any]:
+    """Return the attributes that an object has itself, without asking what it wraps."""
+    return getattr(env, "__dict__", {})
