@@ -19,7 +19,7 @@ ROWS = (
     {
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
-        *("frame_grid", "annotation"),
+        *("frame_grid", "annotation", "fingerprint", "surroundings"),
     },
     {"formats"},
     {"results"},
@@ -30,6 +30,7 @@ ROWS = (
     {"environments"},
     {"monitors"},
     {"sessions", "machine_report"},
+    {"evidence"},
     {"commands"},
 )
 
@@ -111,6 +112,19 @@ def test_imports_are_seen(code: str, imported: str, tmp_path: Path) -> None:
 def row(name: str) -> int:
     """Return the number of the row that a module belongs to."""
     return next(i for i, names in enumerate(ROWS) if name.split(".")[0] in names)
+
+
+@pytest.mark.parametrize(
+    ("half", "other"), [("packing", "verifying"), ("verifying", "packing")]
+)
+def test_packing_and_verifying_meet_in_the_layout(half: str, other: str) -> None:
+    """Neither imports the other, so that no mistake of one is believed by the other."""
+    own = [
+        (name, path) for name, path in MODULES if name.startswith(f"evidence.{half}")
+    ]
+    assert own
+    for name, path in own:
+        assert not [i for i in imports(name, path) if f"evidence.{other}" in i], name
 
 
 @pytest.mark.parametrize(("name", "path"), MODULES, ids=[n for n, _ in MODULES])

@@ -22,6 +22,7 @@ from .environments.options import EnvironmentOptions
 from .environments.policies import (
     Policy,
     load_policy,
+    policy_file,
     working_directory_importable,
 )
 from .errors import GLError, InvalidArgument
@@ -165,6 +166,7 @@ def record_session(
             tiled=session.tiled,
             annotate=session.annotate,
             name_prefix=session.name_prefix,
+            policy_file=policy_file(session.policy),
             **_view(named, session),
         )
         # A name is that of one environment, never of a vector environment.

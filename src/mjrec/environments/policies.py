@@ -32,7 +32,13 @@ from ..errors import Error, PolicyError, UnknownName
 from .episode_seeds import EpisodeSeeds
 from .working_directory import working_directory_importable
 
-__all__ = ["Actions", "Policy", "load_policy", "working_directory_importable"]
+__all__ = [
+    "Actions",
+    "Policy",
+    "load_policy",
+    "policy_file",
+    "working_directory_importable",
+]
 
 _BUILT_IN = ("random", "zero")
 _FORMS = (
@@ -94,6 +100,20 @@ def load_policy(text: str, environment: Any) -> Policy:
     with working_directory_importable():
         chosen = _chosen(text, environment)
     return _ForeignPolicy(text, _chooser(text, chosen), actions)
+
+
+def policy_file(text: str) -> Path | None:
+    """Return the file of the module that a policy, which is loaded, comes from.
+
+    Args:
+        text: as given to `load_policy`.
+
+    Returns:
+        None for the built-in ones, and for modules that are in no file.
+    """
+    module = sys.modules.get(text.partition(":")[0]) if ":" in text else None
+    file = getattr(module, "__file__", None)
+    return None if file is None else Path(file)
 
 
 class _RandomPolicy:

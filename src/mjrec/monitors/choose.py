@@ -58,6 +58,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     annotate: bool = False,
     tiled: bool = False,
     trackers: Tracker | Sequence[Tracker] = (),
+    policy_file: str | os.PathLike[str] | None = None,
     env_id: str | None = None,
 ) -> GymnasiumMonitor | VectorMonitor | DmEnvMonitor:
     """Record what happens to an environment into a monitor directory.
@@ -166,6 +167,8 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
         tiled: one video of all `camera`s side by side, instead of one for each. Of a
             vector environment: also a video of all sub-environments side by side.
         trackers: who is told of finished episodes and videos, see `mjrec.trackers`.
+        policy_file: the file in which the policy is, such as a checkpoint. Its sha256
+            goes into the manifest, for whoever packs the recording as evidence.
         env_id: the environment's name in the recordings. None is the name in its
             spec; dm_env environments have none, so theirs is worth giving, as
             `dm_control/<domain>-<task>`.
@@ -217,6 +220,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             annotate=annotate,
             tiled=tiled,
             trackers=trackers,
+            policy_file=policy_file,
             allow_early_reset=(
                 monitor.allows_early_reset
                 if allow_early_reset is None

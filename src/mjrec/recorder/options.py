@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -69,6 +71,7 @@ class RecorderOptions:
     annotate: bool = False
     tiled: bool = False
     trackers: Tracker | Sequence[Tracker] = ()
+    policy_file: str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
         type_of_mode(self.mode)
@@ -106,6 +109,7 @@ class RecorderOptions:
         self._check_clips()
         self._check_keep()
         self._check_trackers()
+        self._check_policy_file()
         if self.annotate:
             check_annotation()
 
@@ -175,6 +179,16 @@ class RecorderOptions:
         if len(set(map(id, self.all_trackers))) < len(self.all_trackers):
             raise InvalidArgument(
                 f"A tracker is there twice in {given!r}, and would be told all twice."
+            )
+
+    def _check_policy_file(self) -> None:
+        given = self.policy_file
+        if given is None:
+            return
+        if not isinstance(given, str | os.PathLike) or not Path(given).is_file():
+            raise InvalidArgument(
+                "policy_file must be the path of the file in which the policy is, "
+                f"whose sha256 the manifest will say, got {given!r}, which is no file."
             )
 
     @property

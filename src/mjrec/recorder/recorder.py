@@ -34,6 +34,7 @@ from ..formats.trajectory_log import RowBlocks
 from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
+from ..surroundings import file_sha256, look_around
 from .clip_maker import ClipMaker
 from .clips import Clips
 from .deferred_video import DeferredVideo
@@ -186,6 +187,8 @@ class Recorder:
             selection=None if self._kept is None else self._kept.facts(),
         )
         self._clips = self._new_clips() if options.has_clips else None
+        self._surroundings = look_around()
+        self._policy = _policy_facts(options)
         self.closed = False
 
     @property
@@ -499,7 +502,7 @@ class Recorder:
         # error in any case: no simulation is disturbed, and nothing else would say it.
         self._tell_of_videos()
         self._trackers.end()
-        self._write_results()
+        self._write_results(is_last=True)
         self.closed = True
         self.stats_recorder.closed = True
         self._journal.close()
@@ -921,7 +924,7 @@ class Recorder:
             **({} if self._kept is None else {"selection": self._kept.facts()}),
         }
 
-    def _write_results(self) -> None:
+    def _write_results(self, *, is_last: bool = False) -> None:
         self.stats_recorder.flush()
         write_manifest(
             self.directory / manifest_name(self._place.infix),
@@ -929,13 +932,15 @@ class Recorder:
                 stats=Path(self.stats_recorder.path).name,
                 videos=tuple(self._videos.finished()),
                 env_info=self._env_info,
-                mjrec=self._details(),
+                mjrec=self._details(is_last=is_last),
             ),
         )
 
-    def _details(self) -> dict[str, Any]:
+    def _details(self, *, is_last: bool) -> dict[str, Any]:
         """Return what gym's manifests do not say."""
         kept = self._kept
+        # Nobody waits for it in mid-recording.
+        around = self._surroundings.found(wait=is_last)
         return {
             "format_version": _FORMAT_VERSION,
             "schedule": {
@@ -950,7 +955,15 @@ class Recorder:
             "broken": self._videos.broken(),
             "faults": self._faults.listed(),
             "versions": dict(versions()),
+            "surroundings": None if around is None else {**around, **self._policy},
         }
+
+
+def _policy_facts(options: RecorderOptions) -> dict[str, Any]:
+    if options.policy_file is None:
+        return {"policy": None}
+    path = Path(options.policy_file).absolute()
+    return {"policy": {"file": str(path), "sha256": file_sha256(path)}}
 
 
 # Asking the system for the process's number at every step takes as long as counting it.
