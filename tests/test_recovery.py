@@ -504,6 +504,16 @@ def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path: Path) -> None
     assert_in_order(tmp_path)
 
 
+def test_a_note_that_was_being_rewritten_leaves_nothing(tmp_path: Path) -> None:
+    """The unfinished file of a note is no note."""
+    part = tmp_path / f".{video_prefix(INFIX, 0)}.mp4.note.part.0123abcd.part"
+    part.touch()
+    recovery = mjrec.recover(tmp_path)
+    assert [file.name for file in recovery.files] == [part.name]
+    assert not part.exists()
+    assert not mjrec.recover(tmp_path)
+
+
 def test_a_renderer_that_was_killed_leaves_its_video_pending(
     killed: Callable[[str], Path],
 ) -> None:

@@ -7,6 +7,7 @@ import contextlib
 import functools
 import logging
 import os
+import sys
 import time
 import weakref
 from collections.abc import Callable, Mapping
@@ -308,8 +309,7 @@ class Recorder:
         succeeds. A reset is then allowed in any case. Nothing more is taken of the
         environment's state, which may be half of a step.
         """
-        is_running = self.stats_recorder.done is False or self._lacks_last_step()
-        if is_running and self._ending is None:
+        if self.stats_recorder.done is False and self._ending is None:
             self._ending = ending(error)
 
     def before_step(self, action: Any = None) -> None:
@@ -792,7 +792,8 @@ class Recorder:
     def _how_it_ended(self, otherwise: str) -> dict[str, Any]:
         """Return whether the running episode is complete, and what ended it."""
         if self.stats_recorder.done and self._lacks_last_step():
-            return {"complete": False, **(self._ending or {"reason": INTERRUPT})}
+            # What the handler raised is on its way through here.
+            return {"complete": False, **ending(sys.exception(), otherwise=INTERRUPT)}
         if self.stats_recorder.done:
             return {"complete": True, **self._flags}
         return {"complete": False, **(self._ending or {"reason": otherwise})}
