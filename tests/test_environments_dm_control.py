@@ -21,12 +21,15 @@ dm_env = pytest.importorskip("dm_env")
 pytest.importorskip("dm_control")
 
 from absl.testing import absltest  # noqa: E402  after importorskip
+from dm_control import suite  # noqa: E402  likewise
 from dm_env import specs, test_utils  # noqa: E402  after importorskip
 
 from mjrec.environments.dm_control_environments import (  # noqa: E402  likewise
+    arguments_of,
     begin_episode,
     make_dm_control,
 )
+from mjrec.environments.dm_control_scenes import dm_control_scenes  # noqa: E402
 from mjrec.environments.dm_env_episodes import (  # noqa: E402  likewise
     StepLimit,
     is_terminated,
@@ -262,3 +265,16 @@ def test_a_mujoco_that_dm_control_does_not_know_names_the_fix(
     assert said.startswith("MissingDependency dm_control/cheetah-run")
     assert 'pip install "mujoco<4"' in said
     assert "flex_vertedge" in said
+
+
+def test_a_recording_says_with_what_its_task_was_made() -> None:
+    """Also under the limit of ours; of somebody else's environment nobody knows."""
+    options = EnvironmentOptions(
+        seed=5, max_steps=3, kwargs={"task_kwargs": {"time_limit": 2}}
+    )
+    env = make_dm_control("cartpole", "swingup", options)
+    recorded = dm_control_scenes(env, env_id="dm_control/cartpole-swingup").environment
+    assert recorded is not None
+    assert recorded["kwargs"] == {"task_kwargs": {"random": 5, "time_limit": 2}}
+    other = suite.load("cartpole", "swingup")
+    assert arguments_of(other) is None

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,9 +18,12 @@ from .dm_env_episodes import StepLimit
 from .episode_seeds import EpisodeSeeds
 from .options import EnvironmentOptions
 
-__all__ = ["begin_episode", "make_dm_control", "step"]
+__all__ = ["arguments_of", "begin_episode", "make_dm_control", "step"]
 
 _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
+
+# Nothing in an environment says with which arguments it was made.
+_made: weakref.WeakKeyDictionary[Any, dict[str, Any]] = weakref.WeakKeyDictionary()
 
 
 def make_dm_control(
@@ -51,7 +55,24 @@ def make_dm_control(
         environment = suite.load(domain, task, **arguments)
     except Exception as error:
         raise dm_control_failure(f"dm_control/{domain}-{task}", error) from error
+    _made[environment.task] = arguments
     return _limited(environment, options)
+
+
+def arguments_of(env: dm_env.Environment) -> dict[str, Any] | None:
+    """Return what `suite.load` was given besides domain and task.
+
+    Args:
+        env: a task of the suite, or a wrapper that shows its `task`.
+
+    Returns:
+        None where it was not `make_dm_control` that made it.
+    """
+    try:
+        return _made.get(getattr(env, "task", None))
+    except TypeError:
+        # No task, or one that can be no key.
+        return None
 
 
 def begin_episode(env: dm_env.Environment, seeds: EpisodeSeeds) -> Any:

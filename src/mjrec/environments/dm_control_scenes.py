@@ -15,8 +15,16 @@ from ..simulation.scene_pictures import camera_label, option_without_rangefinder
 from ..simulation.scene_view import SceneView
 from ..simulation.viewer_settings import place_free_camera
 from .dm_control_contexts import ContextsOnDemand
+from .dm_control_environments import arguments_of
 from .dm_control_pictures import drawn_by_physics, picture_size
-from .scenes import Scenes, class_name, generator_state, is_defined_by, overriding_class
+from .scenes import (
+    Scenes,
+    class_name,
+    generator_state,
+    is_defined_by,
+    overriding_class,
+    plain_arguments,
+)
 from .wrapping import around_dm_env
 
 __all__ = ["dm_control_scenes"]
@@ -151,8 +159,9 @@ def _authored(env: Any) -> AuthoredModel | None:
 def _environment(env: Any, env_id: str | None) -> dict[str, Any] | None:
     if env_id is None or not env_id.startswith(_SUITE):
         return None
-    # With which arguments it was made, it does not say.
-    known = {"framework": "dm_control", "id": env_id, "kwargs": None}
+    arguments = arguments_of(env)
+    kwargs = None if arguments is None else plain_arguments(arguments)
+    known = {"framework": "dm_control", "id": env_id, "kwargs": kwargs}
     return {**known, **around_dm_env(env)}
 
 
