@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where in a text an identity is, and the text without it.
+
+What is matched how, in capitals or not:
+
+- URLs of repositories, addresses of mail and ORCIDs: anywhere.
+- Paths of homes and working directories: with everything that begins with them;
+  and whatever is called `/home/<name>` or `/Users/<name>`, whoever that is.
+- Full names: their words in this order or with the last one first, joined by a space,
+  a dot, a comma, a hyphen, an underline or nothing; the last word alone where it has
+  six letters or more, between what is no letter.
+- Login names and names of machines with six letters or more: anywhere, also inside
+  other words. With four or five: between what is no letter, or as a word of
+  `CamelCase`.
+- Those with fewer, and those that are ordinary words here (`root`, `user`, `hopper`):
+  only as a whole part of a path, before `@` of a name of a machine, or after it.
+  HalfCheetah has joints called `rootx`, and nobody is named by that.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterable, Iterator
+
+from .identity import HOME_OF_ANYBODY, Identity
+
+__all__ = ["IdentityMatcher"]
+
+_SHORTEST_INSIDE_WORDS = 6
+_SHORTEST_WORD = 4
+
+# Accounts and machines that thousands have, and words of simulations and of the files
+# here, which are surnames too.
+_WORDS = """
+    actions admin administrator agent analysis anonymous author authors automation
+    backup base bash batch bench bin black blue body box branch brown browser build
+    builder camera chief circleci class client cloud cluster code colab command
+    compute computer conda container contributor contributors control core cpu cube
+    daemon data debian default desktop dev developer developers device docker
+    ec2-user engine env environment episode experiment export fedora field file
+    floor frame framework games git github gitlab gold gpu gray green grey group
+    guest gym gymnasium head headnode home hopper host house http humanoid image
+    index info institute item jobs jovyan jupyter kaggle kept kernel lab laboratory
+    labs lane laptop large length library light linux linuxbrew little local
+    localhost login long machine mail main maintainer maintainers manager manifest
+    march mark master meta mjrec modal mode model monitor mujoco name network newton
+    nobody node none notebook null number observation office openaigym operator
+    options oracle other packages page parallel park path people person physics pink
+    pixel place plane play player plot point policy pool power price print private
+    process project public pusher python queue random rate ray reacher reader record
+    recorder recording red release remote render replay report research reward robot
+    robotics root run runner runtime sample sandbox scene school science script seed
+    self server service session shared shell ship short silver sim simulation
+    simulator site slave small software source space spark spot staff stage staging
+    standard state statistics stats step store student study swimmer sync system
+    target task team temp tendon terminal test tester text time tmp tools torch
+    tower trace track train trainer training trajectory trial type ubuntu university
+    unix unknown user username users vagrant value var version video view viewer
+    virtual walker wall water web wheel white width window windows work worker
+    workspace workstation world write writer zero
+"""
+_ORDINARY = frozenset(_WORDS.split())
+
+_JOINTS = r"[\s._,-]*"
+# What may follow a part of a path.
+_PART_END = r"(?=[/\\\s\"':,;)\]>]|$)"
+_MACHINE = r"[a-z0-9][\w.-]*"
+
+# Texts in what is no text.
+_ASCII_RUN = re.compile(rb"[\x20-\x7e]{4,}")
+_UTF16_RUNS = (
+    re.compile(rb"(?:[\x20-\x7e]\0){4,}"),
+    re.compile(rb"(?:\0[\x20-\x7e]){4,}"),
+)
+# In compressed data and in numbers any four letters occur by chance, in every few
+# hundred megabytes; inside so long a run of text they do not.
+_LONG_RUN = 12
+
+
+class IdentityMatcher:
+    """Finds an identity in texts, in names of files and in bytes.
+
+    Args:
+        identity: what to look for.
+    """
+
+    def __init__(self, identity: Identity) -> None:
+        patterns = list(_patterns(identity))
+        self._texts = _alternatives(patterns)
+        self._names = _alternatives([*patterns, *_short_parts(identity)])
+        self._literals = _literals(identity)
+
+    def replaced(self, text: str) -> str:
+        """Return a text with placeholders: `<home>`, `<path>`, `<user>`, `<host>`."""
+        return self._texts.sub(lambda match: f"<{_placeholder(match)}>", text)
+
+    def replaced_in_name(self, name: str) -> str:
+        """Return a file's name, or a part of one, with words that are portable there.
+
+        A short login name counts there too, between dots, hyphens and underlines.
+        """
+        return self._names.sub(_placeholder, name)
+
+    def found_in(self, text: str) -> list[str]:
+        """Return what of the identity is in a text, each once."""
+        return _unique(match[0] for match in self._texts.finditer(text))
+
+    def found_in_name(self, name: str) -> list[str]:
+        """Return what of the identity is in a file's name, each once."""
+        return _unique(match[0] for match in self._names.finditer(name))
+
+    def found_in_bytes(self, content: bytes, *, by_chance: bool = False) -> list[str]:
+        """Return what is in bytes, be they a text, in UTF-8 or UTF-16, or hold some.
+
+        Args:
+            content: anything.
+            by_chance: whether few letters may stand there by chance: it is compressed,
+                or it is numbers.
+        """
+        found: list[str] = []
+        if not by_chance:
+            try:
+                found += self.found_in(content.decode())
+            except UnicodeDecodeError:
+                found += self._found_in_runs(content, by_chance=False)
+        else:
+            found += self._found_in_runs(content, by_chance=True)
+        for pattern, encoding in zip(
+            _UTF16_RUNS, ("utf-16-le", "utf-16-be"), strict=True
+        ):
+            runs = [run.decode(encoding) for run in pattern.findall(content)]
+            found += self._found(runs, by_chance=by_chance)
+        found += [text for text, data in self._literals if data in content]
+        return _unique(found)
+
+    def _found_in_runs(self, content: bytes, *, by_chance: bool) -> list[str]:
+        runs = [run.decode("ascii") for run in _ASCII_RUN.findall(content)]
+        return self._found(runs, by_chance=by_chance)
+
+    def _found(self, runs: list[str], *, by_chance: bool) -> list[str]:
+        # In one text, because there are many.
+        return [
+            match[0]
+            for match in self._texts.finditer("\n".join(runs))
+            if not by_chance
+            or len(match[0]) >= _SHORTEST_INSIDE_WORDS
+            or len(_line_of(match)) >= _LONG_RUN
+        ]
+
+
+def _line_of(match: re.Match[str]) -> str:
+    text = match.string
+    end = text.find("\n", match.end())
+    return text[text.rfind("\n", 0, match.start()) + 1 : end if end >= 0 else None]
+
+
+def _alternatives(patterns: Iterable[tuple[str, str]]) -> re.Pattern[str]:
+    """Return one pattern; the name of the group that matched ends in a placeholder."""
+    groups = (
+        f"(?P<_{number}_{placeholder}>{pattern})"
+        for number, (placeholder, pattern) in enumerate(patterns)
+    )
+    return re.compile("|".join(groups), re.IGNORECASE)
+
+
+def _placeholder(match: re.Match[str]) -> str:
+    return str(match.lastgroup).rpartition("_")[2]
+
+
+def _patterns(identity: Identity) -> Iterator[tuple[str, str]]:
+    """Yield placeholders and what they replace; of two that fit, the first does."""
+    for remote in _longest_first(identity.remotes):
+        yield "path", re.escape(remote)
+    for address in _longest_first(identity.addresses):
+        yield "user", rf"(?<!\w){re.escape(address)}(?!\w)"
+    kinds = dict.fromkeys(identity.homes, "home")
+    kinds.update((path, "path") for path in identity.directories if path not in kinds)
+    for path in _longest_first(kinds):
+        yield kinds[path], rf"(?<!\w){re.escape(path)}(?![\w-])"
+    yield "home", rf"(?<!\w){HOME_OF_ANYBODY}"
+    for person in _longest_first(identity.people):
+        yield from (("user", pattern) for pattern in _of_person(person))
+    for host in _longest_first(identity.hosts):
+        yield "host", _of_name(host, rf"(?<=\w@){re.escape(host)}(?![\w-])")
+    for user in _longest_first(identity.users):
+        before_machine = rf"(?<![\w.+-]){re.escape(user)}(?=@{_MACHINE})"
+        yield "user", _of_name(user, before_machine)
+
+
+def _of_person(person: str) -> Iterator[str]:
+    words = [re.escape(word) for word in re.findall(r"[^\s._,-]+", person)]
+    if len(words) > 1:
+        *first, last = words
+        yield _JOINTS.join(words)
+        yield _JOINTS.join([last, *first])
+    if words and _is_distinctive(words[-1], _SHORTEST_INSIDE_WORDS):
+        yield rf"(?<![^\W\d_]){words[-1]}(?![^\W\d_])"
+
+
+def _of_name(name: str, beside_at: str) -> str:
+    escaped = re.escape(name)
+    if _is_distinctive(name, _SHORTEST_INSIDE_WORDS):
+        return escaped
+    if _is_distinctive(name, _SHORTEST_WORD):
+        capital = re.escape(name[0].upper() + name[1:].lower())
+        return (
+            rf"(?<![^\W\d_]){escaped}(?![^\W\d_])"
+            rf"|(?-i:(?<![A-Z]){capital}(?![a-z]))"
+        )
+    return rf"(?<=[/\\]){escaped}{_PART_END}|{beside_at}"
+
+
+def _short_parts(identity: Identity) -> Iterator[tuple[str, str]]:
+    for placeholder, names in (("user", identity.users), ("host", identity.hosts)):
+        for name in _longest_first(names):
+            if _is_distinctive(name, 1):
+                escaped = re.escape(name)
+                yield placeholder, rf"(?<![^\W_]){escaped}(?![^\W_])"
+
+
+def _is_distinctive(name: str, length: int) -> bool:
+    """Tell whether a name of at least `length` is no ordinary word, and no number."""
+    has_letters = any(character.isalpha() for character in name)
+    return len(name) >= length and has_letters and name.lower() not in _ORDINARY
+
+
+def _longest_first(texts: Iterable[str]) -> list[str]:
+    return sorted(texts, key=lambda text: (-len(text), text))
+
+
+def _literals(identity: Identity) -> list[tuple[str, bytes]]:
+    """Return what is not of ASCII, as bytes in every encoding."""
+    texts = (
+        text for f in dataclasses.fields(identity) for text in getattr(identity, f.name)
+    )
+    return [
+        (text, text.encode(encoding, errors="replace"))
+        for text in texts
+        if not text.isascii() and len(text) > 1
+        for encoding in ("utf-8", "utf-16-le", "utf-16-be")
+    ]
+
+
+def _unique(found: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(found))
