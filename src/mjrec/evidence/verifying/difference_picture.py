@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A picture of how a shipped frame differs from what is drawn: three side by side."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Final
+
+import numpy as np
+
+from ...frames import Frame
+
+__all__ = ["difference_picture", "png"]
+
+# As Blender's reports of its own pictures do.
+_AMPLIFIED: Final = 16
+_GAP: Final = 4
+_MIDDLE: Final = 128
+
+
+def difference_picture(drawn: Frame, shipped: Frame) -> Frame:
+    """Return the drawn picture, the shipped one, and their difference, amplified.
+
+    Where nothing differs, the third is grey; where the shipped one is brighter, so is
+    the third, 16 times as much.
+    """
+    height = min(drawn.shape[0], shipped.shape[0])
+    width = min(drawn.shape[1], shipped.shape[1])
+    one, other = drawn[:height, :width], shipped[:height, :width]
+    difference = _AMPLIFIED * (other.astype(np.int32) - one) + _MIDDLE
+    gap = np.full((height, _GAP, 3), 255, np.uint8)
+    shown = np.clip(difference, 0, 255).astype(np.uint8)
+    return np.concatenate([one, gap, other, gap, shown], axis=1)
+
+
+def png(frame: Frame) -> bytes:
+    """Return a picture as a PNG file."""
+    height, width = frame.shape[:2]
+    # Before each row stands which filter it has: none.
+    rows = np.zeros((height, 1 + 3 * width), np.uint8)
+    rows[:, 1:] = frame.reshape(height, 3 * width)
+    # Eight bits of red, green and blue; nothing else is ever otherwise.
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        (
+            _chunk(b"IHDR", header),
+            _chunk(b"IDAT", zlib.compress(rows.tobytes(), 9)),
+            _chunk(b"IEND", b""),
+        )
+    )
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return (
+        struct.pack(">I", len(data))
+        + kind
+        + data
+        + struct.pack(">I", zlib.crc32(kind + data))
+    )

@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which recorded pictures a video is to show, and how they are to be drawn.
+
+It is the trajectory that says so, which the other levels check, and not the video's
+metadata: that has to fit. Which trajectory it is follows from the video's name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from ...annotation import Caption, check_annotation
+from ...errors import Error, MissingDependency, NoPictures
+from ...formats.monitor_directory import (
+    Infix,
+    episode_of,
+    infix_of,
+    trajectory_prefix,
+)
+from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.video_metadata import StepRuns
+from ...formats.video_names import view_of
+from ...frame_grid import grid_shape
+from ...rendering.captions import Captions
+from ...rendering.recorded_facts import open_for_rendering
+from ...rendering.recorded_pictures import ChosenFrames, check_has_pictures
+from ...rendering.videos import (
+    further_video_paths,
+    is_annotated,
+    usual_fps,
+    video_path,
+)
+from ...rendering.views import PlainCamera, View, plain_camera
+from .shipped_video import ShippedVideo
+
+__all__ = ["DoesNotFit", "DrawingPlan", "NotDrawable", "plan_drawing"]
+
+
+class NotDrawable(Exception):
+    """There is nothing that pictures of a video could be drawn from."""
+
+
+class DoesNotFit(Exception):
+    """A video's metadata says something else than its trajectory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawingPlan:
+    """How the pictures of a video are drawn.
+
+    Attributes:
+        trajectory: what they are drawn from.
+        indices: the numbers of its pictures, in the order of the video's frames.
+        view: how they are drawn.
+        cameras: all of them, where they are in one picture.
+        captions: what is written on them, by frame; None where nothing is.
+        mujoco: the version that recorded it, or None.
+    """
+
+    trajectory: Path
+    indices: Sequence[int]
+    view: View
+    cameras: Sequence[PlainCamera | None] | None
+    captions: Sequence[Caption] | None
+    mujoco: str | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """What is seen in a video, and of which pictures."""
+
+    view: View
+    chosen: ChosenFrames
+    is_annotated: bool
+    fps: Fraction | None
+    cameras: Sequence[PlainCamera | None] | None = None
+
+
+def plan_drawing(video: ShippedVideo) -> DrawingPlan:
+    """Return how the pictures of a video are drawn again.
+
+    Raises:
+        NotDrawable: they cannot be, for a reason that proves nothing.
+        DoesNotFit: the metadata contradicts the trajectory.
+    """
+    path = _trajectory_of(video.path)
+    try:
+        reader = open_for_rendering(path)
+    except Error as error:
+        raise DoesNotFit(f"its trajectory cannot be read: {error}") from error
+    with reader:
+        facts = reader.header.facts
+        try:
+            seen = _seen(video, path, reader)
+            _check_fits(video, reader, seen)
+            captions = _captions(reader, seen)
+        except Error as error:
+            raise DoesNotFit(str(error)) from error
+    return DrawingPlan(
+        trajectory=path,
+        indices=seen.chosen.indices,
+        view=seen.view,
+        cameras=seen.cameras,
+        captions=captions,
+        mujoco=_mujoco(facts),
+    )
+
+
+def _trajectory_of(video: Path) -> Path:
+    number, infix = episode_of(video.name), Infix.parse(infix_of(video.name) or "")
+    if number is None or infix is None:
+        raise NotDrawable("its name is not that of an episode's video")
+    stem = trajectory_prefix(infix, number)
+    for ending in (".h5", ".log"):
+        path = video.with_name(f"{stem}{ending}")
+        if path.exists():
+            return path
+    raise NotDrawable(
+        f"there is no trajectory {stem}.h5 to draw from: the states of its episode "
+        "were not recorded (mode='evaluation' or trajectory_callable records them), or "
+        "it is a video that is counted in steps"
+    )
+
+
+def _seen(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> _Seen:
+    """Return what a video is to show, after its own trajectory."""
+    facts = reader.header.facts
+    recorded = facts.get("video")
+    if recorded is None:
+        raise DoesNotFit(
+            f"{path.name} says that no video of its episode was to be recorded"
+        )
+    views = _original_views(path, facts)
+    if video.name in views and recorded.get("recording") == "live":
+        reason = recorded.get("reason") or video.live_reason or "nobody says why"
+        raise NotDrawable(f"it was drawn live, by the environment itself: {reason}")
+    try:
+        check_has_pictures(reader)
+    except NoPictures as error:
+        raise NotDrawable(str(error).removesuffix(".")) from error
+    if video.name not in views:
+        return _seen_again(video, reader)
+    camera, tiles = views[video.name]
+    chosen = ChosenFrames(list(range(reader.frame_count)), 1)
+    return _Seen(
+        view=_sized(video, reader, camera, tiles),
+        cameras=tiles,
+        chosen=chosen,
+        is_annotated=is_annotated(facts),
+        fps=usual_fps(facts, chosen),
+    )
+
+
+def _original_views(
+    path: Path, facts: Mapping[str, Any]
+) -> dict[str, tuple[PlainCamera | None, Sequence[PlainCamera | None] | None]]:
+    """Return the camera, or the cameras in one picture, of each recorded video."""
+    recorded = facts["video"]
+    first = video_path(path, facts).name
+    cameras = list(recorded.get("cameras") or ())
+    if recorded.get("tiled") and len(cameras) > 1:
+        return {first: (None, (None, *map(plain_camera, cameras[1:])))}
+    further = [other.name for other in further_video_paths(path, facts)]
+    views = dict(zip(further, map(plain_camera, cameras[1:]), strict=False))
+    return {first: (None, None), **{name: (c, None) for name, c in views.items()}}
+
+
+def _sized(
+    video: ShippedVideo,
+    reader: TrajectoryReader,
+    camera: PlainCamera | None,
+    tiles: Sequence[Any] | None,
+) -> View:
+    """Return the view of a recorded video: as recorded, or smaller."""
+    facts = reader.header.facts
+    quality = facts["video"].get("quality", "full")
+    if video.quality != quality:
+        raise DoesNotFit(
+            f"its metadata says quality {video.quality}, and its trajectory {quality}"
+        )
+    rows, columns = grid_shape(len(tiles or (None,)))
+    height, width = video.height // rows, video.width // columns
+    scene = facts["scene"]
+    recorded = scene.get("height"), scene.get("width")
+    if (height, width) != recorded and not video.is_smaller:
+        raise DoesNotFit(
+            f"its metadata says {width}x{height} pixels, and its trajectory "
+            f"{recorded[1]}x{recorded[0]}"
+        )
+    return View(camera=camera, height=height, width=width)
+
+
+def _seen_again(video: ShippedVideo, reader: TrajectoryReader) -> _Seen:
+    """Return what a video shows that was rendered again, beside the recorded ones."""
+    if video.camera is None:
+        raise NotDrawable(
+            f"it is none of the videos that its trajectory names ({view_of(video.name)}"
+            "), and its metadata names no camera"
+        )
+    every, rest = divmod(video.stride, reader.header.facts.get("stride", 1))
+    if rest or not every:
+        raise DoesNotFit(f"no recorded pictures are {video.stride} steps apart")
+    last = reader.frame_count - 1
+    return _Seen(
+        view=View(
+            camera=_variant_camera(video, reader.header.facts),
+            height=video.height,
+            width=video.width,
+            quality=video.quality,
+        ),
+        chosen=ChosenFrames([*range(0, last, every), last], every),
+        is_annotated=video.pillow is not None,
+        fps=None,
+    )
+
+
+def _variant_camera(
+    video: ShippedVideo, facts: Mapping[str, Any]
+) -> PlainCamera | None:
+    """Return the camera of a video that was rendered again; None is as recorded."""
+    label = facts["scene"].get("label")
+    return None if video.camera == label else video.camera
+
+
+def _check_fits(video: ShippedVideo, reader: TrajectoryReader, seen: _Seen) -> None:
+    count = len(seen.chosen.indices)
+    if video.frame_count != count:
+        raise DoesNotFit(
+            f"its metadata says {video.frame_count} frames, and its trajectory has "
+            f"{count} pictures"
+        )
+    stride = reader.header.facts.get("stride", 1) * seen.chosen.every
+    steps = reader.frame_steps[list(seen.chosen.indices)].tolist()
+    runs = StepRuns(steps, stride=stride).ranges
+    if [list(run) for run in video.frame_steps] != runs:
+        raise DoesNotFit(
+            "its metadata says other steps of its frames than its trajectory: "
+            f"{_brief(video.frame_steps)}, not {_brief(runs)}"
+        )
+    if seen.fps is not None and video.fps != seen.fps:
+        raise DoesNotFit(
+            f"its metadata says {video.fps} frames a second, and its trajectory "
+            f"{seen.fps}"
+        )
+
+
+def _captions(reader: TrajectoryReader, seen: _Seen) -> Sequence[Caption] | None:
+    if not seen.is_annotated:
+        return None
+    try:
+        check_annotation()
+    except MissingDependency as error:
+        raise NotDrawable(str(error).removesuffix(".")) from error
+    return list(Captions(reader, seen.chosen.indices))
+
+
+def _mujoco(facts: Mapping[str, Any]) -> str | None:
+    versions = facts.get("versions")
+    version = versions.get("mujoco") if isinstance(versions, Mapping) else None
+    return version if isinstance(version, str) else None
+
+
+def _brief(runs: Sequence[Sequence[int]]) -> str:
+    shown = ", ".join("-".join(map(str, run)) for run in runs[:3])
+    return f"{shown} ..." if len(runs) > 3 else shown

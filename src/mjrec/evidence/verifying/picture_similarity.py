@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How alike two pictures are, seen as an encoder sees them.
+
+Pictures are compared as the planes that a video holds: luma, and colour at half the
+height and width. Turned back into red, green and blue, a picture without any loss but
+that of its colours' resolution would seem as far off as a forged one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...frames import Frame, pad_to_even
+
+__all__ = [
+    "BLOCK",
+    "SAMPLES_OF_BLOCK",
+    "Planes",
+    "Similarity",
+    "frame_of",
+    "planes_of",
+    "similarity",
+]
+
+# Two pictures that are equal have an infinite one, which JSON cannot say.
+_BEST_PSNR: Final = 100.0
+# In pixels, and the samples of all planes in it.
+BLOCK: Final = 8
+SAMPLES_OF_BLOCK: Final = BLOCK**2 * 3 // 2
+# Of the definition of SSIM, for samples of eight bits.
+_C1: Final = (0.01 * 255) ** 2
+_C2: Final = (0.03 * 255) ** 2
+
+# BT.709, limited range, as the encoder is told: what red, green and blue weigh, and how
+# far each plane reaches.
+_RED, _BLUE = 0.2126, 0.0722
+_LUMA = np.array([_RED, 1 - _RED - _BLUE, _BLUE], np.float32)
+_LUMA_RANGE, _COLOUR_RANGE = 219.0, 224.0
+
+
+class Planes(NamedTuple):
+    """A picture as yuv420p holds it.
+
+    Attributes:
+        luma: `(height, width) uint8`.
+        blue: the difference from blue, `(height / 2, width / 2) uint8`.
+        red: the difference from red, likewise.
+    """
+
+    luma: NDArray[np.uint8]
+    blue: NDArray[np.uint8]
+    red: NDArray[np.uint8]
+
+
+class Similarity(NamedTuple):
+    """How alike two pictures are.
+
+    Attributes:
+        psnr: peak signal to noise of all samples of the three planes, in dB; 100 where
+            they are equal.
+        ssim: structural similarity of luma, the mean over blocks of 8 by 8 pixels.
+        block: the root mean square of the difference in that block of 8 by 8 pixels in
+            which it is largest, in levels of 255. A change of a few pixels moves the
+            other two by next to nothing.
+    """
+
+    psnr: float
+    ssim: float
+    block: float
+
+
+def planes_of(frame: Frame) -> Planes:
+    """Return the planes of a drawn picture, its sides padded to even ones.
+
+    They are those that the encoder is given, to within a level.
+    """
+    rgb = pad_to_even(frame).astype(np.float32) / 255
+    luma: NDArray[np.float32] = rgb @ _LUMA
+    height, width = luma.shape
+    # The colours of two by two pixels are their mean.
+    quarter = rgb.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
+    quarter_luma = quarter @ _LUMA
+    blue = (quarter[..., 2] - quarter_luma) / (2 * (1 - _BLUE))
+    red = (quarter[..., 0] - quarter_luma) / (2 * (1 - _RED))
+    return Planes(
+        _levels(16 + _LUMA_RANGE * luma),
+        _levels(128 + _COLOUR_RANGE * blue),
+        _levels(128 + _COLOUR_RANGE * red),
+    )
+
+
+def frame_of(planes: Planes) -> Frame:
+    """Return planes as a picture, for people to look at."""
+    luma = (planes.luma.astype(np.float32) - 16) / _LUMA_RANGE
+    blue, red = (
+        (np.repeat(np.repeat(plane, 2, 0), 2, 1).astype(np.float32) - 128)
+        / _COLOUR_RANGE
+        for plane in (planes.blue, planes.red)
+    )
+    r = luma + 2 * (1 - _RED) * red
+    b = luma + 2 * (1 - _BLUE) * blue
+    g = (luma - _LUMA[0] * r - _LUMA[2] * b) / _LUMA[1]
+    return _levels(255 * np.stack([r, g, b], axis=-1))
+
+
+def similarity(one: Planes, other: Planes) -> Similarity:
+    """Return how alike two pictures of one size are."""
+    squares = [
+        np.square(a.astype(np.float32) - b) for a, b in zip(one, other, strict=True)
+    ]
+    samples = sum(plane.size for plane in squares)
+    error = float(sum(plane.sum(dtype=np.float64) for plane in squares)) / samples
+    return Similarity(_psnr(error), _ssim(one.luma, other.luma), _block(squares))
+
+
+def _psnr(error: float) -> float:
+    if not error:
+        return _BEST_PSNR
+    return min(_BEST_PSNR, 10 * math.log10(255**2 / error))
+
+
+def _block(squares: list[NDArray[np.float32]]) -> float:
+    luma, blue, red = squares
+    half = BLOCK // 2
+    cells = (
+        _blocks(luma, half).sum(axis=(1, 3))
+        + _blocks(blue, half // 2).sum(axis=(1, 3))
+        + _blocks(red, half // 2).sum(axis=(1, 3))
+    )
+    # Blocks overlap by half, so that no corner of four of them hides what is small.
+    cells = np.pad(cells, ((0, 1), (0, 1)))
+    sums = cells[:-1, :-1] + cells[1:, :-1] + cells[:-1, 1:] + cells[1:, 1:]
+    return math.sqrt(float(sums.max()) / SAMPLES_OF_BLOCK)
+
+
+def _ssim(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+    a, b = (_blocks(plane.astype(np.float32), BLOCK) for plane in (one, other))
+    axes = (1, 3)
+    mean_a, mean_b = a.mean(axes), b.mean(axes)
+    var_a = np.square(a).mean(axes) - mean_a**2
+    var_b = np.square(b).mean(axes) - mean_b**2
+    both = (a * b).mean(axes) - mean_a * mean_b
+    alike = (2 * mean_a * mean_b + _C1) * (2 * both + _C2)
+    scale = (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
+    return float((alike / scale).mean())
+
+
+def _blocks(plane: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """Return a plane in blocks, its last rows and columns repeated to fill them."""
+    height, width = plane.shape
+    rows, columns = -(-height // side), -(-width // side)
+    padding = (0, rows * side - height), (0, columns * side - width)
+    padded = np.pad(plane, padding, mode="edge")
+    return padded.reshape(rows, side, columns, side)
+
+
+def _levels(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
