@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings that name nobody, of somebody who is named in all of them."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from identity_search import find
+from PIL import Image, PngImagePlugin
+
+import mjrec
+from mjrec.evidence.packing.anonymity import remaining_identity
+from mjrec.evidence.packing.identity import Identity
+from mjrec.json_text import loads
+
+WORDS = (
+    "mbrunelli",
+    "m.brunelli@uni-pavia.example",
+    "Brunelli",
+    "Margherita",
+    "brunelli-ws7",
+    "brunlab",
+    "secret-gait",
+    "home/",
+)
+
+# What is run as that person, with the directory and the authors.
+_ANONYMOUS = """
+import sys, pathlib
+from mjrec.evidence.packing.anonymity import remaining_identity
+from mjrec.evidence.packing.identity import identity_of_user
+from mjrec.formats.manifest import read_manifest
+for directory in map(pathlib.Path, sys.argv[1:]):
+    manifests = map(read_manifest, directory.glob("*.manifest.json"))
+    surroundings = [manifest.mjrec["surroundings"] for manifest in manifests]
+    authors = ["Margherita Brunelli <m.brunelli@uni-pavia.example>"]
+    identity = identity_of_user(surroundings, authors)
+    make_anonymous(directory, identity=identity)
+    for where, what in remaining_identity(directory, identity):
+        print(where, what)
+"""
+
+
+class Somebody:
+    """A person with an account, a machine, a repository and a model.
+
+    Args:
+        place: where the home directories are.
+    """
+
+    def __init__(self, place: Path) -> None:
+        self.home = place / "home" / "mbrunelli"
+        self.work = self.home / "secret-gait"
+        (self.work / "models").mkdir(parents=True)
+        shutil.copy(Path(__file__).with_name("identity_recording.py"), self.work)
+        (self.work / "policy.pt").write_bytes(b"weights")
+        self._write_model()
+        self._git("init", "--quiet")
+        self._git("config", "user.email", "m.brunelli@uni-pavia.example")
+        self._git("config", "user.name", "Margherita Brunelli")
+        self._git("remote", "add", "origin", "git@github.com:brunlab/secret-gait.git")
+        self._git("add", ".")
+        self._git("commit", "--quiet", "--message", "Walk")
+        self.commit = self._git("rev-parse", "HEAD").strip()
+
+    def run(self, *arguments: str) -> str:
+        """Run Python with arguments, and return what it says."""
+        return self._called([*_on_another_host(), sys.executable, *arguments])
+
+    def record(self) -> Path:
+        """Return a directory with a directory of each kind of recordings."""
+        self.run("identity_recording.py", "runs")
+        return self.work / "runs"
+
+    def _write_model(self) -> None:
+        assets = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+        xml = (assets / "inverted_pendulum.xml").read_text()
+        texture = '<texture name="t" type="2d" file="logo.png"/>'
+        xml = xml.replace(
+            "<worldbody>",
+            f'<asset>{texture}<material name="m" texture="t"/></asset><worldbody>'
+            f"<!-- as measured in {self.home} -->",
+        )
+        path = self.work / "models" / "pendulum.xml"
+        path.write_text(f"<!-- written by Margherita Brunelli -->\n{xml}")
+        texts = PngImagePlugin.PngInfo()
+        texts.add_text("Author", "M. Brunelli", zip=True)
+        Image.new("RGB", (4, 4), (90, 0, 0)).save(
+            path.with_name("logo.png"), pnginfo=texts
+        )
+
+    def _git(self, *arguments: str) -> str:
+        return self._called(["git", *arguments])
+
+    def _called(self, command: list[str]) -> str:
+        names = dict.fromkeys(("USER", "LOGNAME"), "mbrunelli")
+        done = subprocess.run(
+            command,
+            cwd=self.work,
+            env={**os.environ, **names, "HOME": str(self.home)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout
+        return done.stdout
+
+
+@functools.cache
+def _on_another_host() -> list[str]:
+    """Return what makes a command run on a machine of another name, if it may be."""
+    script = 'hostname brunelli-ws7 && exec "$@"'
+    command = ["unshare", "--uts", "sh", "-c", script, "sh"]
+    try:
+        done = subprocess.run([*command, "true"], capture_output=True, check=False)
+    except FileNotFoundError:
+        return []
+    return command if done.returncode == 0 else []
+
+
+@pytest.fixture(scope="module")
+def somebody(tmp_path_factory: pytest.TempPathFactory) -> Somebody:
+    return Somebody(tmp_path_factory.mktemp("disk"))
+
+
+@pytest.fixture(scope="module")
+def recorded(somebody: Somebody) -> Path:
+    return somebody.record()
+
+
+@pytest.fixture(scope="module")
+def anonymous(
+    somebody: Somebody, recorded: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Copies of the recordings, as hard links, of which nobody says who made them."""
+    stage = tmp_path_factory.mktemp("stage")
+    for directory in recorded.iterdir():
+        shutil.copytree(directory, stage / directory.name, copy_function=os.link)
+    before = _contents(recorded)
+    said = somebody.run("-c", _ANONYMOUS, str(stage / "pendulum"), str(stage / "diary"))
+    assert said == ""
+    assert _contents(recorded) == before
+    return stage
+
+
+def test_nothing_of_the_identity_is_left(somebody: Somebody, anonymous: Path) -> None:
+    """No login, host, home, repository, address or author, in no form in no file."""
+    assert find(anonymous, [*WORDS, somebody.commit]) == []
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        r"manifest\.json$",
+        r"meta\.json$",
+        r"\.jsonl$",
+        r"\.h5 > /@facts",
+        r"diary\.video\d+\.json$",
+        r"zip > source/pendulum\.xml$",
+        r"zip > source/logo\.png \(zTXt\)",
+        r"mjb\.gz \(unpacked\)",
+        r"\.mp4 \(name\)",
+        r"stats\.json \(name\)",
+    ],
+)
+def test_the_search_finds_it_where_it_was(recorded: Path, where: str) -> None:
+    """In what was recorded, the same search finds it in each kind of place."""
+    assert any(re.search(where, place) for place, _ in find(recorded, WORDS))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "utf-16-be"])
+def test_the_search_and_the_gate_find_it_in_every_encoding(
+    tmp_path: Path, encoding: str
+) -> None:
+    """Both find a name amid bytes that are no text."""
+    content = bytes(range(256)) + "by MBrunelli".encode(encoding) + b"\xff\xfe\x00"
+    (tmp_path / "file").write_bytes(content)
+    identity = Identity(users=("mbrunelli",))
+    assert find(tmp_path, ["mbrunelli"]) == [("file", "mbrunelli")]
+    assert remaining_identity(tmp_path, identity) == [("file", "MBrunelli")]
+
+
+def test_the_gate_finds_it_in_each_kind_of_place(
+    somebody: Somebody, recorded: Path
+) -> None:
+    """What looks last of all finds the identity wherever another search does."""
+    identity = Identity(users=("mbrunelli",), people=("Margherita Brunelli",))
+    left = {where for where, _ in remaining_identity(recorded, identity)}
+    for ending in (
+        "manifest.json",
+        ".jsonl",
+        ".csv",
+        ".mp4",
+        "unpacked",
+        "pendulum.xml",
+    ):
+        assert any(where.endswith(ending) for where in left), ending
+    assert any("@facts" in where for where in left)
+
+
+def test_all_is_readable_and_says_the_same(recorded: Path, anonymous: Path) -> None:
+    """Statistics, episodes and trajectories are as before, arrays bit for bit."""
+    old, new = (mjrec.load_results(d / "pendulum") for d in (recorded, anonymous))
+    assert new["episode_rewards"] == old["episode_rewards"]
+    assert new["timestamps"] == old["timestamps"]
+    episodes = [
+        list(mjrec.iter_episodes(d / "pendulum")) for d in (recorded, anonymous)
+    ]
+    assert [e.length for e in episodes[0]] == [e.length for e in episodes[1]] == [4, 4]
+    for before, after in zip(
+        _trajectories(recorded), _trajectories(anonymous), strict=True
+    ):
+        for name in ("states", "actions", "rewards", "terminated", "frame_steps"):
+            np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
+        assert before.snapshots.keys() == after.snapshots.keys()
+        for name, rows in before.snapshots.items():
+            np.testing.assert_array_equal(rows, after.snapshots[name])
+
+
+def test_files_are_renamed_and_so_is_what_refers_to_them(anonymous: Path) -> None:
+    """The uid with the name in it is another one, in every file."""
+    directory = anonymous / "pendulum"
+    manifest = _read(directory / "openaigym.manifest.0.user-final.manifest.json")
+    assert manifest["stats"] == "openaigym.episode_batch.0.user-final.stats.json"
+    for names in manifest["videos"]:
+        assert all((directory / name).is_file() for name in names)
+    assert {t.facts["infix"] for t in _trajectories(anonymous)} == {"0.user-final"}
+    metadata = _read(directory / manifest["videos"][0][1])
+    assert metadata["also_named"] == "user-run-episode-0.mp4"
+    assert (directory / "user-run-episode-0.mp4").is_file()
+    assert metadata["encoder_version"]["cmdline"][-1] == manifest["videos"][0][0]
+
+
+def test_placeholders_stand_for_what_was_there(anonymous: Path) -> None:
+    """Options, arguments and reasons keep what names nobody."""
+    [trajectory, _] = _trajectories(anonymous)
+    assert trajectory.facts["options"] == {"goal": "<path>/goal.npy"}
+    kwargs = trajectory.facts["environment"]["kwargs"]
+    assert kwargs["xml_file"] == "<path>/models/pendulum.xml"
+    assert trajectory.facts["model"]["seal"] is None
+    details = _read(next((anonymous / "pendulum").glob("*.manifest.json")))["mjrec"]
+    assert "no key in <path>/wandb.key" in details["faults"][0]["reason"]
+    surroundings = details["surroundings"]
+    assert surroundings["command"] == [
+        Path(sys.executable).name,
+        "identity_recording.py",
+        "runs",
+    ]
+    assert surroundings["code"]["remote"] is None
+    assert surroundings["policy"]["file"] == "policy.pt"
+
+
+def test_the_model_compiles_to_the_same(recorded: Path, anonymous: Path) -> None:
+    """From sources without comments, and without the compiled one, which had a path."""
+    assert not list((anonymous / "pendulum").glob("*.mjb.gz"))
+    [old, new] = [_trajectories(d)[0].model() for d in (recorded, anonymous)]
+    for name in ("qpos0", "geom_size", "body_mass", "tex_data", "names"):
+        np.testing.assert_array_equal(getattr(old, name), getattr(new, name))
+
+
+def test_pictures_are_the_same(anonymous: Path) -> None:
+    """What is rendered of the recording without its author has the recorded hashes."""
+    [trajectory, _] = _trajectories(anonymous)
+    [hashes] = (anonymous / "pendulum").glob("*.video000000.framehash")
+    again = [hashlib.sha256(frame).hexdigest() for frame in mjrec.render(trajectory)]
+    lines = hashes.read_text().splitlines()
+    assert again == [line.split()[-1] for line in lines if not line.startswith("#")]
+
+
+def _trajectories(directory: Path) -> list[mjrec.Trajectory]:
+    paths = sorted((directory / "pendulum").glob("*.h5"))
+    return [mjrec.load_trajectory(path) for path in paths]
+
+
+def _read(path: Path) -> Any:
+    return loads(path.read_bytes())
+
+
+def _contents(directory: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in _files(directory)}
+
+
+def _files(directory: Path) -> Iterator[Path]:
+    return (path for path in sorted(directory.rglob("*")) if path.is_file())
