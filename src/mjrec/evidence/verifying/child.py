@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process that checks what may be anybody's, within limits; run by its parent.
+
+Whatever a hostile file does to HDF5's, MuJoCo's, OpenGL's or ffmpeg's code, it does it
+here. The request is a line of JSON on the standard input, whose end is the order to
+end. What is found is said on what was the standard output, a line of JSON each:
+
+- `{"level": L}`: this level's checks begin;
+- `{"check": {...}}`: one is done;
+- `{"count": [done, total]}`: how much of the level is done;
+- `{"failure": text}`: the level's checks ended by an error of ours;
+- `{"end": true}`: all levels are done.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import itertools
+import logging
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ... import json_text
+from ...rendering.child_python import (
+    say_stacks_when_asked,
+    take_standard_output,
+)
+from ..verification import Level
+from .carried_checks import check_to_json, task_from_json
+from .file_checks import check_files
+from .statistics_checks import check_statistics
+from .task import Checker
+
+__all__ = ["main"]
+
+logger = logging.getLogger(__name__)
+
+_SECONDS_BETWEEN_COUNTS = 0.1
+_MOST_CHECKS = 100_000
+
+
+def main() -> int:
+    """Do what the standard input asks for."""
+    answers = take_standard_output()
+    say_stacks_when_asked()
+    request = json_text.loads(sys.stdin.buffer.readline())
+    _set_limits(request["limits"])
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    say = functools.partial(_say, answers)
+    bag = request["bag"]
+    task = task_from_json(request["task"])
+    for level in task.level.included:
+        say(level=level.value)
+        try:
+            checker = _checker(level, None if bag is None else Path(bag))
+            for check in itertools.islice(checker(task, _Counter(say)), _MOST_CHECKS):
+                say(check=check_to_json(check))
+        except MemoryError:
+            say(failure="it needs more memory than it may use")
+            return 1
+        except Exception as error:
+            logger.exception("The checks of the level %s ended.", level)
+            say(failure=f"{type(error).__name__}: {error}")
+            return 1
+    say(end=True)
+    return 0
+
+
+def _checker(level: Level, bag: Path | None) -> Checker:
+    # Physics and pixels need MuJoCo, and are loaded where they are asked for.
+    match level:
+        case Level.FILES:
+            return functools.partial(check_files, bag=bag)
+        case Level.STATS:
+            return functools.partial(check_statistics, is_packed=bag is not None)
+        case Level.PHYSICS:
+            physics = importlib.import_module(".physics_checks", __package__)
+            return _as_checker(physics.check_physics)
+        case Level.PIXELS:
+            pixels = importlib.import_module(".pixel_checks", __package__)
+            return _as_checker(pixels.check_pixels)
+
+
+def _as_checker(function: Any) -> Checker:
+    checker: Checker = function
+    return checker
+
+
+class _Counter:
+    """Says how much is done, not too often.
+
+    Args:
+        say: says a thing to the parent.
+    """
+
+    def __init__(self, say: Callable[..., None]) -> None:
+        self._say = say
+        self._said_at = 0.0
+
+    def __call__(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if done >= total or now - self._said_at > _SECONDS_BETWEEN_COUNTS:
+            self._said_at = now
+            self._say(count=[int(done), int(total)])
+
+
+def _say(answers: int, **said: Any) -> None:
+    line = json_text.dumps(said).encode() + b"\n"
+    while line:
+        line = line[os.write(answers, line) :]
+
+
+def _set_limits(limits: Mapping[str, int]) -> None:
+    """Set the limits of this process and of all that it starts."""
+    for name, wanted in limits.items():
+        kind = getattr(resource, name)
+        _, most = resource.getrlimit(kind)
+        allowed = wanted if most == resource.RLIM_INFINITY else min(wanted, most)
+        resource.setrlimit(kind, (allowed, allowed))
+
+
+def _end_with_parent() -> None:
+    """End this process and those of its group when the parent is gone."""
+    with contextlib.suppress(OSError, ValueError):
+        sys.stdin.buffer.read()
+    os.killpg(0, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

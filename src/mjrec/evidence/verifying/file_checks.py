@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The level `files`: every file is there, unchanged, and there are no others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from ..verification import Check
+from .bag_checks import check_bag, no_bag
+from .recorded_file_checks import check_recorded_files
+from .task import Count, Task
+
+__all__ = ["check_files"]
+
+
+def check_files(task: Task, count: Count, *, bag: Path | None) -> Iterator[Check]:
+    """Yield what is found about the files.
+
+    Args:
+        task: what is asked for.
+        count: told how much is done.
+        bag: the folder that is a bag; None where nothing was packed.
+    """
+    if bag is None:
+        yield no_bag()
+    else:
+        yield from check_bag(bag, count)
+    yield from check_recorded_files(task.recordings, count, is_packed=bag is not None)
