@@ -18,6 +18,7 @@ from .list_episodes import list_episodes
 from .record import record
 from .recover import recover
 from .render import render
+from .verify import verify
 
 __all__ = ["main"]
 
@@ -26,6 +27,7 @@ _COMMANDS: dict[str, Callable[..., int]] = {
     "render": render,
     "recover": recover,
     "list": list_episodes,
+    "verify": verify,
     "doctor": doctor,
 }
 
