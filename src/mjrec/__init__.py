@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from .errors import (
     ArchiveError,
+    ArchiveTooLarge,
     BlankVideo,
     ClosedError,
     DifferentEnvironment,
@@ -24,22 +25,29 @@ from .errors import (
     FileNotWritten,
     FrameCountError,
     GLError,
+    IdentityLeft,
     InvalidArgument,
     InvalidFrame,
     MissingDependency,
     NoPictures,
     NotPicklable,
+    PackError,
     PicturesDiffer,
     PolicyError,
     RenderError,
     ResetNeeded,
     ResetNotAllowed,
+    UnfinishedRecordings,
     UnknownName,
     UnreadableFile,
     UntrustedModel,
 )
 
 if TYPE_CHECKING:
+    from .evidence.packing import pack as pack
+    from .evidence.verification import Check as Check
+    from .evidence.verification import Verification as Verification
+    from .evidence.verifying import verify as verify
     from .formats.archive import write_archive as write_archive
     from .formats.frames_to_videos import save_video as save_video
     from .formats.video_writer import VideoWriter as VideoWriter
@@ -69,6 +77,7 @@ if TYPE_CHECKING:
     from .simulation.trajectories import load_trajectory as load_trajectory
 
 _LAZY = {
+    "Check": "evidence.verification",
     "DmEnvMonitor": "monitors.dm_env_monitor",
     "Episode": "results",
     "GymnasiumMonitor": "monitors.gymnasium_monitor",
@@ -78,6 +87,7 @@ _LAZY = {
     "Terminated": "signals",
     "Trajectory": "simulation.trajectories",
     "VectorMonitor": "monitors.vector_monitor",
+    "Verification": "evidence.verification",
     "VideoRecorder": "recorder.video_recorder",
     "VideoWriter": "formats.video_writer",
     "capped_cubic_video_schedule": "schedules",
@@ -90,11 +100,13 @@ _LAZY = {
     "load_results": "results",
     "load_trajectory": "simulation.trajectories",
     "merge_stats_files": "results",
+    "pack": "evidence.packing",
     "recover": "recovery",
     "render": "rendering.pictures",
     "render_states": "rendering.pictures",
     "save_video": "formats.frames_to_videos",
     "use_gl": "gl",
+    "verify": "evidence.verifying",
     "write_archive": "formats.archive",
 }
 
@@ -102,7 +114,9 @@ _LAZY = {
 # `DmEnvMonitor` needs dm_env.
 __all__ = [
     "ArchiveError",
+    "ArchiveTooLarge",
     "BlankVideo",
+    "Check",
     "ClosedError",
     "DifferentEnvironment",
     "DirectoryInUse",
@@ -116,12 +130,14 @@ __all__ = [
     "FrameCountError",
     "GLError",
     "GymnasiumMonitor",
+    "IdentityLeft",
     "InvalidArgument",
     "InvalidFrame",
     "MissingDependency",
     "Monitor",
     "NoPictures",
     "NotPicklable",
+    "PackError",
     "PicturesDiffer",
     "PolicyError",
     "Recovery",
@@ -131,10 +147,12 @@ __all__ = [
     "StatsRecorder",
     "Terminated",
     "Trajectory",
+    "UnfinishedRecordings",
     "UnknownName",
     "UnreadableFile",
     "UntrustedModel",
     "VectorMonitor",
+    "Verification",
     "VideoRecorder",
     "VideoWriter",
     "capped_cubic_video_schedule",
@@ -147,11 +165,13 @@ __all__ = [
     "load_results",
     "load_trajectory",
     "merge_stats_files",
+    "pack",
     "recover",
     "render",
     "render_states",
     "save_video",
     "use_gl",
+    "verify",
     "write_archive",
 ]
 

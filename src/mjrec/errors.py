@@ -26,6 +26,10 @@
     ├── GLError                             no backend renders, or the wrong one
     ├── PolicyError                         a policy raised or gave a bad action
     ├── ArchiveError                        write_archive's checks
+    ├── PackError                       a run cannot be packed as asked
+    │   ├── UnfinishedRecordings        something is to be rendered or recovered
+    │   ├── ArchiveTooLarge             max_size, also with smaller videos
+    │   └── IdentityLeft                anonymous=True, and somebody is named
     ├── UnreadableFile                      a damaged or foreign file
     │   └── UntrustedModel                  a stranger's, and without its sources
     └── MissingDependency (also ImportError)  an extra is not installed
@@ -43,6 +47,7 @@ from typing import Any
 
 __all__ = [
     "ArchiveError",
+    "ArchiveTooLarge",
     "BlankVideo",
     "ClosedError",
     "DifferentEnvironment",
@@ -55,16 +60,19 @@ __all__ = [
     "FileNotWritten",
     "FrameCountError",
     "GLError",
+    "IdentityLeft",
     "InvalidArgument",
     "InvalidFrame",
     "MissingDependency",
     "NoPictures",
     "NotPicklable",
+    "PackError",
     "PicturesDiffer",
     "PolicyError",
     "RenderError",
     "ResetNeeded",
     "ResetNotAllowed",
+    "UnfinishedRecordings",
     "UnknownName",
     "UnreadableFile",
     "UntrustedModel",
@@ -171,11 +179,17 @@ class FileNotWritten(Error, OSError):
         path: the file.
     """
 
-    def __init__(self, path: Path, reason: object) -> None:
+    def __init__(
+        self,
+        path: Path,
+        reason: object,
+        *,
+        then: str = "the next close() or `mjrec render` tries again",
+    ) -> None:
         self.path = path
         super().__init__(
             f"Cannot write {path}: {reason}. What is there stays as it is; where space "
-            "was lacking, free some: the next close() or `mjrec render` tries again."
+            f"was lacking, free some: {then}."
         )
 
 
@@ -308,6 +322,75 @@ class PolicyError(Error):
 
 class ArchiveError(Error):
     """A check of `write_archive` failed; nothing was written."""
+
+
+class PackError(Error):
+    """A run cannot be packed as asked; nothing was written."""
+
+
+class UnfinishedRecordings(PackError):
+    """Something of the recordings is still to be done.
+
+    Attributes:
+        directory: where the recordings are.
+        names: the base names of what is not finished.
+    """
+
+    _SHOWN = 5
+
+    def __init__(self, directory: Path, names: Sequence[str], *, advice: str) -> None:
+        self.directory = directory
+        self.names = list(names)
+        shown = ", ".join(self.names[: self._SHOWN])
+        more = len(self.names) - self._SHOWN
+        rest = f" and {more} more" if more > 0 else ""
+        super().__init__(
+            f"The recordings in {directory} are not finished: {shown}{rest}. {advice}"
+        )
+
+
+class ArchiveTooLarge(PackError):
+    """A packed run would be larger than allowed, also with smaller videos.
+
+    Attributes:
+        size: of the smallest archive that there could be, in bytes.
+        limit: the most that was allowed.
+        largest: the names and sizes of the largest files in it.
+    """
+
+    def __init__(
+        self, size: int, limit: int, largest: Sequence[tuple[str, int]], *, reason: str
+    ) -> None:
+        self.size = size
+        self.limit = limit
+        self.largest = list(largest)
+        listed = "".join(f"\n  {size:>12}  {name}" for name, size in self.largest)
+        super().__init__(
+            f"The packed run would have {size} bytes, and max_size allows {limit}. "
+            f"{reason} Choose episodes (episodes=[0, 8], --episodes 0,8), or allow "
+            f"more. The largest files, in bytes:{listed}"
+        )
+
+
+class IdentityLeft(PackError):
+    """With `anonymous=True`: something that names somebody is still in the archive.
+
+    Attributes:
+        found: the files, each with what was found in it.
+    """
+
+    _SHOWN = 10
+
+    def __init__(self, found: Sequence[tuple[str, str]]) -> None:
+        self.found = list(found)
+        shown = "; ".join(f"{name}: {what}" for name, what in found[: self._SHOWN])
+        more = len(self.found) - self._SHOWN
+        rest = f"; and {more} more" if more > 0 else ""
+        super().__init__(
+            f"The packed run would not be anonymous, so it was not written: {shown}"
+            f"{rest}. Record again without these (a uid, a camera's or a body's name, "
+            "a title), or leave out the episodes that have them."
+        )
 
 
 class UnreadableFile(Error):

@@ -35,6 +35,7 @@ __all__ = [
     "README",
     "RECORDINGS",
     "STATISTICS",
+    "STATISTICS_COLUMNS",
 ]
 
 PAYLOAD: Final = "data"
@@ -49,3 +50,10 @@ RECORDINGS: Final = "recordings"
 # In bag-info.txt. It rises when a reader must know of a change.
 FORMAT_KEY: Final = "Mjrec-Evidence-Version"
 FORMAT_VERSION: Final = 1
+
+# Of the table of episodes, in their order.
+STATISTICS_COLUMNS: Final = (
+    *("monitor", "episode_id", "type", "length", "reward"),
+    *("start_time", "end_time", "seed", "terminated", "truncated"),
+    *("video", "video_sha256", "trajectory"),
+)
