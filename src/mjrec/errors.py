@@ -26,10 +26,10 @@
     ├── GLError                             no backend renders, or the wrong one
     ├── PolicyError                         a policy raised or gave a bad action
     ├── ArchiveError                        write_archive's checks
-    ├── PackError                       a run cannot be packed as asked
-    │   ├── UnfinishedRecordings        something is to be rendered or recovered
-    │   ├── ArchiveTooLarge             max_size, also with smaller videos
-    │   └── IdentityLeft                anonymous=True, and somebody is named
+    ├── PackError                           a run cannot be packed as asked
+    │   ├── UnfinishedRecordings            something is to be rendered or recovered
+    │   ├── ArchiveTooLarge                 max_size, also with smaller videos
+    │   └── IdentityLeft                    anonymous=True, and somebody is named
     ├── UnreadableFile                      a damaged or foreign file
     │   └── UntrustedModel                  a stranger's, and without its sources
     └── MissingDependency (also ImportError)  an extra is not installed
