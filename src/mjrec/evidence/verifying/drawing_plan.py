@@ -87,7 +87,7 @@ def plan_drawing(video: ShippedVideo) -> DrawingPlan:
         NotDrawable: they cannot be, for a reason that proves nothing.
         DoesNotFit: the metadata contradicts the trajectory.
     """
-    path = _trajectory_of(video.path)
+    path = _trajectory_of(video)
     try:
         reader = open_for_rendering(path)
     except Error as error:
@@ -110,15 +110,17 @@ def plan_drawing(video: ShippedVideo) -> DrawingPlan:
     )
 
 
-def _trajectory_of(video: Path) -> Path:
+def _trajectory_of(video: ShippedVideo) -> Path:
     number, infix = episode_of(video.name), Infix.parse(infix_of(video.name) or "")
     if number is None or infix is None:
         raise NotDrawable("its name is not that of an episode's video")
     stem = trajectory_prefix(infix, number)
     for ending in (".h5", ".log"):
-        path = video.with_name(f"{stem}{ending}")
+        path = video.path.with_name(f"{stem}{ending}")
         if path.exists():
             return path
+    if video.is_live:
+        raise NotDrawable(_told_live(video.live_reason))
     raise NotDrawable(
         f"there is no trajectory {stem}.h5 to draw from: the states of its episode "
         "were not recorded (mode='evaluation' or trajectory_callable records them), or "
@@ -136,8 +138,7 @@ def _seen(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> _Seen:
         )
     views = _original_views(path, facts)
     if video.name in views and recorded.get("recording") == "live":
-        reason = recorded.get("reason") or video.live_reason or "nobody says why"
-        raise NotDrawable(f"it was drawn live, by the environment itself: {reason}")
+        raise NotDrawable(_told_live(recorded.get("reason") or video.live_reason))
     try:
         check_has_pictures(reader)
     except NoPictures as error:
@@ -152,6 +153,14 @@ def _seen(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> _Seen:
         chosen=chosen,
         is_annotated=is_annotated(facts),
         fps=usual_fps(facts, chosen),
+    )
+
+
+def _told_live(reason: str | None) -> str:
+    why = f", because {reason:.500}" if reason else ""
+    return (
+        f"it was drawn live, as the environment itself showed it{why}; nothing else "
+        "is recorded that it could be drawn from"
     )
 
 

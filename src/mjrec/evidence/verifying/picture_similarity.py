@@ -79,7 +79,7 @@ def planes_of(frame: Frame) -> Planes:
     They are those that the encoder is given, to within a level.
     """
     rgb = pad_to_even(frame).astype(np.float32) / 255
-    luma: NDArray[np.float32] = rgb @ _LUMA
+    luma = rgb @ _LUMA
     height, width = luma.shape
     # The colours of two by two pixels are their mean.
     quarter = rgb.reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
@@ -159,4 +159,5 @@ def _blocks(plane: NDArray[np.float32], side: int) -> NDArray[np.float32]:
 
 
 def _levels(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    levels: NDArray[np.uint8] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    return levels

@@ -41,7 +41,7 @@ from .difference_picture import difference_picture, png
 from .drawing_plan import DoesNotFit, DrawingPlan, NotDrawable, plan_drawing
 from .encoded_again import EncodedAgain
 from .likeness import OTHER_ENCODER, OTHER_RENDERER, Likeness
-from .picture_similarity import Planes, frame_of, planes_of, similarity
+from .picture_similarity import Planes, planes_of, similarity
 from .shipped_video import (
     GL_STRINGS,
     ShippedVideo,
@@ -213,7 +213,7 @@ class _Found:
     positions: Sequence[int]
     wrong: list[int] = field(default_factory=list)
     likenesses: tuple[Likeness, ...] = ()
-    pictures: tuple[Frame, Planes] | None = None
+    pictures: tuple[Planes, Planes] | None = None
     gl: tuple[str | None, ...] = ()
     bytes_equal: bool | None = None
     refusal: str | None = None
@@ -374,7 +374,7 @@ class _Studio:
             return {}
         drawn, shipped = found.pictures
         name = f"worst-{next(self._pictures):06d}.png"
-        picture = png(difference_picture(drawn, frame_of(shipped)))
+        picture = png(difference_picture(drawn, shipped))
         (self._task.pictures / name).write_bytes(picture)
         return {"picture": name}
 
@@ -398,10 +398,11 @@ class _Shipped:
 
 
 def _compare(found: _Found, position: int, drawn: Frame, shipped: Planes) -> None:
-    alike = similarity(planes_of(drawn), shipped)
+    planes = planes_of(drawn)
+    alike = similarity(planes, shipped)
     is_worst = [likeness.add(position, alike) for likeness in found.likenesses]
     if is_worst[0]:
-        found.pictures = drawn, shipped
+        found.pictures = planes, shipped
 
 
 def _other_renderer(video: ShippedVideo, found: _Found) -> str | None:
