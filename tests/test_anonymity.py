@@ -39,7 +39,7 @@ WORDS = (
 # What is run as that person, with the directory and the authors.
 _ANONYMOUS = """
 import sys, pathlib
-from mjrec.evidence.packing.anonymity import remaining_identity
+from mjrec.evidence.packing.anonymity import make_anonymous, remaining_identity
 from mjrec.evidence.packing.identity import identity_of_user
 from mjrec.formats.manifest import read_manifest
 for directory in map(pathlib.Path, sys.argv[1:]):

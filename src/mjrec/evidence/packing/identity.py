@@ -24,6 +24,9 @@ _PERSON_VARIABLES = ("GIT_AUTHOR_NAME", "GIT_COMMITTER_NAME")
 _ADDRESS_VARIABLES = ("EMAIL", "GIT_AUTHOR_EMAIL", "GIT_COMMITTER_EMAIL")
 _DIRECTORY_VARIABLES = ("PWD", "OLDPWD")
 
+# What is shorter (`../x`) is no address, and could stand anywhere.
+_SHORTEST_ADDRESS = 6
+
 _GIT_SETTINGS = r"^(user\.(name|email)|remote\..*\.(url|pushurl))$"
 _GIT_SECONDS = 10.0
 
@@ -167,14 +170,16 @@ class _Found:
 
     def add_author(self, author: str) -> None:
         for inside in _ADDRESS_OF_AUTHOR.findall(author):
-            self._add_address(inside)
+            # An affiliation is a name too.
+            is_address = "@" in inside or "://" in inside or _ORCID.search(inside)
+            (self._add_address if is_address else self._add_person)(inside)
         for found in (*_ADDRESS.findall(author), *_ORCID.findall(author)):
             self._add_address(found)
         name = _ADDRESS_OF_AUTHOR.sub(" ", author)
         self._add_person(" ".join(_ADDRESS.sub(" ", name).split()))
 
     def _add(self, kind: str, text: object) -> None:
-        if not isinstance(text, str) or not text.strip():
+        if not isinstance(text, str) or not text.strip() or "\0" in text:
             return
         text = text.strip()
         if kind in ("homes", "directories"):
@@ -199,6 +204,9 @@ class _Found:
     def _add_address(self, address: object) -> None:
         if not isinstance(address, str):
             return
+        if len(address) < _SHORTEST_ADDRESS:
+            self._add_person(address)
+            return
         self._add("addresses", address)
         for orcid in _ORCID.findall(address):
             self._add("addresses", orcid)
@@ -206,7 +214,7 @@ class _Found:
             self._add("users", address.split("@")[0])
 
     def _add_remote(self, remote: object) -> None:
-        if not isinstance(remote, str) or not remote.strip():
+        if not isinstance(remote, str) or len(remote.strip()) < _SHORTEST_ADDRESS:
             return
         self._add("remotes", remote)
         self._add_homes_in(remote)
@@ -214,8 +222,8 @@ class _Found:
         if match is None or remote.startswith("/"):
             return
         path = match["path"].strip("/")
-        self._add("remotes", path)
         if "/" in path:
+            self._add("remotes", path)
             self._add("users", path.split("/")[0])
 
     def _add_path(self, path: object) -> None:

@@ -21,47 +21,19 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from .identity import HOME_OF_ANYBODY, Identity
+from .ordinary_words import ORDINARY_WORDS
 
 __all__ = ["IdentityMatcher"]
 
 _SHORTEST_INSIDE_WORDS = 6
 _SHORTEST_WORD = 4
+_SHORTEST_PERSON_INSIDE_WORDS = 9
 
-# Accounts and machines that thousands have, and words of simulations and of the files
-# here, which are surnames too.
-_WORDS = """
-    actions admin administrator agent analysis anonymous author authors automation
-    backup base bash batch bench bin black blue body box branch brown browser build
-    builder camera chief circleci class client cloud cluster code colab command
-    compute computer conda container contributor contributors control core cpu cube
-    daemon data debian default desktop dev developer developers device docker
-    ec2-user engine env environment episode experiment export fedora field file
-    floor frame framework games git github gitlab gold gpu gray green grey group
-    guest gym gymnasium head headnode home hopper host house http humanoid image
-    index info institute item jobs jovyan jupyter kaggle kept kernel lab laboratory
-    labs lane laptop large length library light linux linuxbrew little local
-    localhost login long machine mail main maintainer maintainers manager manifest
-    march mark master meta mjrec modal mode model monitor mujoco name network newton
-    nobody node none notebook null number observation office openaigym operator
-    options oracle other packages page parallel park path people person physics pink
-    pixel place plane play player plot point policy pool power price print private
-    process project public pusher python queue random rate ray reacher reader record
-    recorder recording red release remote render replay report research reward robot
-    robotics root run runner runtime sample sandbox scene school science script seed
-    self server service session shared shell ship short silver sim simulation
-    simulator site slave small software source space spark spot staff stage staging
-    standard state statistics stats step store student study swimmer sync system
-    target task team temp tendon terminal test tester text time tmp tools torch
-    tower trace track train trainer training trajectory trial type ubuntu university
-    unix unknown user username users vagrant value var version video view viewer
-    virtual walker wall water web wheel white width window windows work worker
-    workspace workstation world write writer zero
-"""
-_ORDINARY = frozenset(_WORDS.split())
-
+_NO_LETTER_BEFORE = r"(?<![^\W\d_])"
+_NO_LETTER_AFTER = r"(?![^\W\d_])"
 _JOINTS = r"[\s._,-]*"
 # What may follow a part of a path.
 _PART_END = r"(?=[/\\\s\"':,;)\]>]|$)"
@@ -179,23 +151,30 @@ def _patterns(identity: Identity) -> Iterator[tuple[str, str]]:
     for path in _longest_first(kinds):
         yield kinds[path], rf"(?<!\w){re.escape(path)}(?![\w-])"
     yield "home", rf"(?<!\w){HOME_OF_ANYBODY}"
-    for person in _longest_first(identity.people):
-        yield from (("user", pattern) for pattern in _of_person(person))
+    people = [
+        re.findall(r"[^\s._,-]+", name) for name in _longest_first(identity.people)
+    ]
+    people = [words for words in people if words]
+    for words in people:
+        yield "user", _of_person(words)
     for host in _longest_first(identity.hosts):
         yield "host", _of_name(host, rf"(?<=\w@){re.escape(host)}(?![\w-])")
     for user in _longest_first(identity.users):
         before_machine = rf"(?<![\w.+-]){re.escape(user)}(?=@{_MACHINE})"
         yield "user", _of_name(user, before_machine)
+    for *_, last in people:
+        if _is_distinctive(last, _SHORTEST_INSIDE_WORDS):
+            yield "user", f"{_NO_LETTER_BEFORE}{re.escape(last)}{_NO_LETTER_AFTER}"
 
 
-def _of_person(person: str) -> Iterator[str]:
-    words = [re.escape(word) for word in re.findall(r"[^\s._,-]+", person)]
-    if len(words) > 1:
-        *first, last = words
-        yield _JOINTS.join(words)
-        yield _JOINTS.join([last, *first])
-    if words and _is_distinctive(words[-1], _SHORTEST_INSIDE_WORDS):
-        yield rf"(?<![^\W\d_]){words[-1]}(?![^\W\d_])"
+def _of_person(words: Sequence[str]) -> str:
+    *first, last = map(re.escape, words)
+    orders = {_JOINTS.join(order) for order in ([*first, last], [last, *first])}
+    pattern = "|".join(sorted(orders))
+    if sum(map(len, words)) >= _SHORTEST_PERSON_INSIDE_WORDS:
+        return pattern
+    # Of "An Li", "italian" would be one.
+    return f"{_NO_LETTER_BEFORE}(?:{pattern}){_NO_LETTER_AFTER}"
 
 
 def _of_name(name: str, beside_at: str) -> str:
@@ -205,7 +184,7 @@ def _of_name(name: str, beside_at: str) -> str:
     if _is_distinctive(name, _SHORTEST_WORD):
         capital = re.escape(name[0].upper() + name[1:].lower())
         return (
-            rf"(?<![^\W\d_]){escaped}(?![^\W\d_])"
+            rf"{_NO_LETTER_BEFORE}{escaped}{_NO_LETTER_AFTER}"
             rf"|(?-i:(?<![A-Z]){capital}(?![a-z]))"
         )
     return rf"(?<=[/\\]){escaped}{_PART_END}|{beside_at}"
@@ -222,7 +201,7 @@ def _short_parts(identity: Identity) -> Iterator[tuple[str, str]]:
 def _is_distinctive(name: str, length: int) -> bool:
     """Tell whether a name of at least `length` is no ordinary word, and no number."""
     has_letters = any(character.isalpha() for character in name)
-    return len(name) >= length and has_letters and name.lower() not in _ORDINARY
+    return len(name) >= length and has_letters and name.lower() not in ORDINARY_WORDS
 
 
 def _longest_first(texts: Iterable[str]) -> list[str]:

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What names a person or a machine, and where it is found."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from mjrec.evidence.packing.identity import Identity, identity_of_user
+from mjrec.evidence.packing.identity_matching import IdentityMatcher
+
+IDENTITY = Identity(
+    users=("mbrunelli", "ada", "root", "alan"),
+    people=("Margherita Brunelli", "Bob Green", "An Li"),
+    addresses=("mb@uni.example",),
+    hosts=("brunelli-ws7", "vm"),
+    homes=("/root", "/data/homes/mbrunelli"),
+    directories=("/srv/gait",),
+    remotes=("git@github.com:brunlab/gait.git",),
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("at /root/x.py, line 3", "at <home>/x.py, line 3"),
+        ("/home/bob/x and /Users/bob", "<home>/x and <home>"),
+        ("/srv/gait/runs", "<path>/runs"),
+        ("/srv/gaits", "/srv/gaits"),
+        ("git@github.com:brunlab/gait.git", "<path>"),
+        ("by MBRUNELLI2", "by <user>2"),
+        ("MbrunelliEnv", "<user>Env"),
+        ("Brunelli, Margherita; margherita.brunelli", "<user>; <user>"),
+        ("(c) brunelli", "(c) <user>"),
+        ("<mb@uni.example>", "<<user>>"),
+        ("ssh root@vm", "ssh <user>@<host>"),
+        ("/scratch/ada/x, ada@node7", "/scratch/<user>/x, <user>@node7"),
+        ("alan.balance AlanEnv", "<user>.balance <user>Env"),
+        ("on brunelli-ws7.uni", "on <host>.uni"),
+        ("An Li, italian, Li_An", "<user>, italian, <user>"),
+        ("Bob Green, green", "<user>, green"),
+    ],
+)
+def test_what_names_somebody_is_replaced(text: str, expected: str) -> None:
+    """Each kind of name has its placeholder, and is found where it is replaced."""
+    matcher = IdentityMatcher(IDENTITY)
+    assert matcher.replaced(text) == expected
+    assert bool(matcher.found_in(text)) == (text != expected)
+    assert matcher.replaced(expected) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["rootx", "root", "vm", "adapt", "ada", "balance", "vmax", "Madagascar"]
+)
+def test_short_and_ordinary_names_stay_inside_other_words(text: str) -> None:
+    """HalfCheetah's joint `rootx` is no account of anybody's."""
+    assert IdentityMatcher(IDENTITY).replaced(text) == text
+
+
+def test_names_of_files_stay_portable() -> None:
+    """A short login counts as a part of a name, and no bracket gets into it."""
+    matcher = IdentityMatcher(IDENTITY)
+    assert matcher.replaced_in_name("0.ada-run.vm_2") == "0.user-run.host_2"
+    assert matcher.replaced_in_name("0.rooty.mbrunelli") == "0.rooty.user"
+
+
+def test_few_letters_amid_numbers_are_chance() -> None:
+    """Four letters in compressed bytes are nobody's name; a line of text is one."""
+    matcher = IdentityMatcher(IDENTITY)
+    assert matcher.found_in_bytes(b"\x00\xffAlan\xfe\x01", by_chance=True) == []
+    assert matcher.found_in_bytes(b"\x00\xffAlan\xfe\x01") == ["Alan"]
+    said = b"\xffmade by Alan himself\xff"
+    assert matcher.found_in_bytes(said, by_chance=True) == ["Alan"]
+
+
+def test_names_of_other_alphabets_are_found_amid_bytes() -> None:
+    """Also where neither encoding can be read as a whole."""
+    matcher = IdentityMatcher(Identity(people=("Łukasz Wąs",)))
+    for encoding in ("utf-8", "utf-16-le"):
+        content = b"\xff\xfe\xff" + "Łukasz Wąs".encode(encoding) + b"\xff"
+        assert matcher.found_in_bytes(content) == ["Łukasz Wąs"]
+
+
+def test_whoever_recorded_is_known_from_the_recording(tmp_path: Path) -> None:
+    """On another machine, paths, the repository and variables tell it."""
+    identity = identity_of_user(
+        {
+            "command": ["python", "/home/ada/gait/train.py"],
+            "working_directory": "/home/ada/gait",
+            "code": {
+                "root": "/home/ada/gait",
+                "remote": "https://git.example/lab7/gait",
+            },
+            "variables": {"LD_LIBRARY_PATH": "/home/charles/lib"},
+            "policy": {"file": "/scratch/p7/policy.pt"},
+        }
+    )
+    assert {"ada", "charles", "lab7"} <= set(identity.users)
+    assert "/home/ada" in identity.homes
+    assert {"/home/ada/gait", "/scratch/p7"} <= set(identity.directories)
+    assert "https://git.example/lab7/gait" in identity.remotes
+
+
+def test_whoever_packs_is_known_from_the_system(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Variables, the machine's name, the working directory, and the authors given."""
+    monkeypatch.setenv("USER", "mbrunelli")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    identity = identity_of_user(authors=["Margherita Brunelli <mb@uni.example>"])
+    assert "mbrunelli" in identity.users
+    assert str(tmp_path) in identity.homes
+    assert str(tmp_path) in identity.directories
+    assert os.uname().nodename in identity.hosts
+    assert identity.people[-1:] == ("Margherita Brunelli",)
+    assert identity.addresses[-1:] == ("mb@uni.example",)
+
+
+def test_affiliations_and_short_addresses_name_only_as_names_do() -> None:
+    """`MIT` is a licence, too, and `../x` is a part of many paths."""
+    identity = identity_of_user(authors=["Ada Lovelace (MIT) <a@b>"])
+    assert identity.people[0] == "Ada Lovelace"
+    assert "MIT" in identity.users
+    assert "a@b" not in identity.addresses
+    assert IdentityMatcher(identity).replaced("under MIT") == "under MIT"
+
+
+@pytest.mark.parametrize(
+    "hostile",
+    [
+        {"command": "x", "code": [], "variables": 3, "policy": {"file": 7}},
+        {
+            "command": [None, "\0/home/a"],
+            "working_directory": "/\0",
+            "code": {"root": 1},
+        },
+        {"code": {"root": "/\0", "remote": "::::"}, "variables": {"HOME": ["x"]}},
+    ],
+)
+def test_surroundings_may_say_anything(hostile: dict[str, object]) -> None:
+    """What a file says of its surroundings raises nothing."""
+    assert identity_of_user([hostile]).hosts
