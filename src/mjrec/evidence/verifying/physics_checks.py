@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The level `physics`: the states follow from the actions, and the rewards from them.
+
+Of each recorded episode, one after the other, three things are asked:
+
+- whether its model is the one that its environment has;
+- whether each state follows from the one before, by MuJoCo alone (`step_checks`);
+- whether the environment, made again, goes through the same states, gives the same
+  rewards and observations, and ends where the recording ends (`environment_replay`).
+
+A state that does not follow by MuJoCo alone is a failure, even where the environment
+cannot be made again: it may do more than `mj_step`, such as moving a target, but only
+the environment itself can show that. Where it does, by giving those very states, the
+second question is not the one to ask, and is not checkable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ...environments.made_again import (
+    EnvironmentAgain,
+    EpisodeStart,
+    NotMadeAgain,
+    RecordedEnvironment,
+    make_again,
+    recorded_environment,
+)
+from ...environments.mjcf_again import MjcfAgain
+from ...errors import Error, UnreadableFile
+from ...formats.monitor_directory import episode_of, infix_of, iter_monitor_files
+from ...formats.trajectory_file import open_trajectory
+from ..verification import Check, Level, Verdict
+from .episode_physics import EpisodePhysics
+from .recorded_models import RecordedModels
+from .task import Count, Task
+
+__all__ = ["check_physics"]
+
+
+def check_physics(task: Task, count: Count) -> Iterator[Check]:
+    """Yield what there is to say of the physics of each recorded episode."""
+    paths = [
+        path for path in iter_monitor_files(task.recordings) if _is_trajectory(path)
+    ]
+    workshop = _Workshop(task)
+    try:
+        for number, path in enumerate(paths):
+            count(number, len(paths))
+            yield from _checks_of(path, workshop)
+        count(len(paths), len(paths))
+    finally:
+        workshop.close()
+
+
+def _is_trajectory(path: Path) -> bool:
+    is_one = path.name.startswith("openaigym.trajectory.")
+    return is_one and path.suffix in (".h5", ".log")
+
+
+def _checks_of(path: Path, workshop: _Workshop) -> Iterator[Check]:
+    subject = f"episode {episode_of(path.name)} of {infix_of(path.name)}"
+    if path.suffix == ".log":
+        yield Check(
+            level=Level.PHYSICS,
+            claim="the episode's states are recorded",
+            subject=subject,
+            verdict=Verdict.NOT_CHECKABLE,
+            reason=f"{path.name} was never finished; `mjrec recover` and `mjrec render` "
+            "finish what a killed process has left",
+        )
+        return
+    try:
+        with open_trajectory(path) as reader:
+            episode = EpisodePhysics(reader, subject, workshop.models)
+            yield from episode.checks(workshop.made)
+    except Error as error:
+        reason = error.reason if isinstance(error, UnreadableFile) else str(error)
+        yield Check(
+            level=Level.PHYSICS,
+            claim="the episode's states can be read",
+            subject=subject,
+            verdict=Verdict.FAIL,
+            reason=f"{path.name}: {reason}".rstrip("."),
+        )
+
+
+class _Workshop:
+    """What episodes share: their models, and the environment made last."""
+
+    def __init__(self, task: Task) -> None:
+        self.models = RecordedModels(task.recordings)
+        self._trust = task.trust
+        self._recorded: RecordedEnvironment | None = None
+        self._made: EnvironmentAgain | NotMadeAgain | None = None
+
+    def made(self, facts: Mapping[str, Any]) -> EnvironmentAgain:
+        """Return the environment of a recording; the next call may close it.
+
+        Raises:
+            NotMadeAgain: it is not made.
+        """
+        recorded = recorded_environment(facts)
+        if recorded.framework == "mjcf":
+            return self._of_sources(recorded, facts)
+        if recorded != self._recorded or self._made is None:
+            self.close()
+            self._recorded = recorded
+            try:
+                self._made = make_again(recorded, trust=self._trust)
+            except NotMadeAgain as refusal:
+                self._made = refusal
+        if isinstance(self._made, NotMadeAgain):
+            raise self._made
+        return self._made
+
+    def close(self) -> None:
+        """Close the environment; idempotent."""
+        made, self._made = self._made, None
+        if made is not None and not isinstance(made, NotMadeAgain):
+            made.close()
+
+    def _of_sources(
+        self, recorded: RecordedEnvironment, facts: Mapping[str, Any]
+    ) -> EnvironmentAgain:
+        try:
+            model = self.models.from_sources(facts)
+        except UnreadableFile as error:
+            raise NotMadeAgain(
+                f"its MJCF cannot be had: {error.reason}".rstrip(".")
+            ) from error
+        return MjcfAgain(recorded, model)
