@@ -353,7 +353,7 @@ class ArchiveTooLarge(PackError):
     """A packed run would be larger than allowed, also with smaller videos.
 
     Attributes:
-        size: of the smallest archive that there could be, in bytes.
+        size: what the smallest archive that was tried has at least, in bytes.
         limit: the most that was allowed.
         largest: the names and sizes of the largest files in it.
     """
@@ -366,7 +366,8 @@ class ArchiveTooLarge(PackError):
         self.largest = list(largest)
         listed = "".join(f"\n  {size:>12}  {name}" for name, size in self.largest)
         super().__init__(
-            f"The packed run would have {size} bytes, and max_size allows {limit}. "
+            f"The packed run would have {size} bytes at least, and max_size allows "
+            f"{limit}. "
             f"{reason} Choose episodes (episodes=[0, 8], --episodes 0,8), or allow "
             f"more. The largest files, in bytes:{listed}"
         )

@@ -15,6 +15,7 @@ from ..errors import Error
 from ..signals import exiting_on_signals
 from .doctor import doctor
 from .list_episodes import list_episodes
+from .pack import pack
 from .record import record
 from .recover import recover
 from .render import render
@@ -27,6 +28,7 @@ _COMMANDS: dict[str, Callable[..., int]] = {
     "render": render,
     "recover": recover,
     "list": list_episodes,
+    "pack": pack,
     "verify": verify,
     "doctor": doctor,
 }

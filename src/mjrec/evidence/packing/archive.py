@@ -4,52 +4,24 @@
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ... import json_text
-from ...errors import (
-    ArchiveTooLarge,
-    FileNotWritten,
-    IdentityLeft,
-    InvalidArgument,
-)
+from ...errors import Error, FileNotWritten, InvalidArgument
 from ...formats.monitor_directory import FILE_PREFIX
 from ...rendering.progress import Progress
-from ..layout import (
-    CITATION,
-    CRATE,
-    ENVIRONMENT,
-    FORMAT_KEY,
-    FORMAT_VERSION,
-    PAYLOAD,
-    README,
-    RECORDINGS,
-    STATISTICS,
-)
-from .anonymity import make_anonymous, remaining_identity
-from .bag import check_bagit, make_bag
-from .citation import citation
-from .contents import Contents, look_for_contents
-from .crate import crate
-from .environment_file import environment
-from .identity import Identity, identity_of_user
-from .packed_run import PackedRun, read_run
-from .readme import readme
+from .assembly import Assembly
+from .bag import check_bagit
+from .contents import look_for_contents
+from .identity import identity_of_user
+from .size_limit import archive_within
 from .sizes import byte_count
-from .smaller_videos import SCALES, draw_smaller, redrawable
-from .staging import TRY_AGAIN, copy_folder, publish, stage, staging_folder
-from .statements import Statements, state
-from .statistics_table import write_statistics
-from .zip_file import STORED, write_zip
+from .staging import TRY_AGAIN, publish, stage, staging_folder
+from .statements import state
 
 __all__ = ["pack"]
 
 _ENDING = ".zip"
-# Of the files that an archive that is too large is made of.
-_LARGEST = 10
 
 
 def pack(
@@ -122,7 +94,7 @@ def pack(
         else None
     )
     with staging_folder(target) as folder:
-        packing = _Packing(
+        assembly = Assembly(
             contents=contents,
             folder=folder,
             name=target.stem,
@@ -130,19 +102,20 @@ def pack(
             identity=identity,
         )
         try:
-            stage(contents, packing.staged)
+            stage(contents, assembly.staged)
             finished = (
-                packing.archive()
+                assembly.archive()
                 if limit is None
-                else _within(limit, packing, on_progress)
+                else archive_within(limit, assembly, on_progress=on_progress)
             )
             publish(finished, target)
         except FileExistsError:
             raise _exists(target) from None
-        except FileNotWritten:
+        except Error:
             raise
         except OSError as error:
-            raise FileNotWritten(target, error.strerror, then=TRY_AGAIN) from error
+            reason = error.strerror or error
+            raise FileNotWritten(target, reason, then=TRY_AGAIN) from error
     return target
 
 
@@ -171,124 +144,3 @@ def _exists(path: Path) -> InvalidArgument:
         f"{path} exists already, and evidence is never replaced. Choose another name, "
         "or move it away."
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Packing:
-    """What an archive is made of, and where.
-
-    Attributes:
-        contents: what is packed.
-        folder: where it is put together.
-        name: of the archive, without its ending.
-        statements: what its author states.
-        identity: what is to be taken out; None where it may stay.
-    """
-
-    contents: Contents
-    folder: Path
-    name: str
-    statements: Statements
-    identity: Identity | None
-
-    @property
-    def staged(self) -> Path:
-        """The recordings as they are to be packed, but for what names somebody."""
-        return self.folder / "staged"
-
-    def archive(self) -> Path:
-        """Return the archive of what is staged, still without its final name."""
-        whole = self.folder / "whole"
-        shutil.rmtree(whole, ignore_errors=True)
-        bag = whole / self.name
-        recordings = bag / PAYLOAD / RECORDINGS
-        copy_folder(self.staged, recordings)
-        if self.identity is not None:
-            make_anonymous(recordings, identity=self.identity)
-        run = read_run(
-            recordings,
-            name=self.name,
-            statements=self.statements,
-            packed_episodes=self.contents.packed_episodes,
-        )
-        _describe(run, bag / PAYLOAD)
-        make_bag(bag, _bag_info(run))
-        if self.identity is not None:
-            found = remaining_identity(whole, self.identity)
-            if found:
-                raise IdentityLeft(found)
-        archive = self.folder / f"archive{_ENDING}"
-        archive.unlink(missing_ok=True)
-        write_zip(bag, archive)
-        return archive
-
-    def least_size(self) -> int:
-        """Return what the archive will certainly have: what is in it uncompressed."""
-        return sum(size for name, size in _sizes(self.staged) if name.endswith(STORED))
-
-
-def _describe(run: PackedRun, payload: Path) -> None:
-    """Write what says what the recordings are; the crate last, which names the rest."""
-    write_statistics(payload / RECORDINGS, payload / STATISTICS)
-    _write(payload / ENVIRONMENT, json_text.dumps(environment(run), indent=2) + "\n")
-    _write(payload / README, readme(run))
-    _write(payload / CITATION, citation(run))
-    _write(payload / CRATE, json_text.dumps(crate(run, payload), indent=2) + "\n")
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _bag_info(run: PackedRun) -> dict[str, str]:
-    return {
-        FORMAT_KEY: str(FORMAT_VERSION),
-        "Bagging-Date": run.date,
-        "External-Description": run.title,
-        "Bag-Software-Agent": "mjrec <https://pypi.org/project/mjrec/>",
-    }
-
-
-def _within(
-    limit: int, packing: _Packing, on_progress: Callable[[Progress], object]
-) -> Path:
-    """Return an archive of at most `limit` bytes, with smaller videos if need be."""
-    size = packing.least_size()
-    if size <= limit:
-        archive = packing.archive()
-        size = archive.stat().st_size
-        if size <= limit:
-            return archive
-    videos = redrawable(packing.contents.videos)
-    drawn = sum(video.video.stat().st_size for video in videos)
-    for scale in SCALES if size - drawn <= limit else ():
-        # No video shrinks more than its pictures do: there is no use in trying.
-        if size - drawn + drawn * scale**2 > limit and scale is not SCALES[-1]:
-            continue
-        draw_smaller(videos, packing.staged, scale, on_progress=on_progress)
-        least = packing.least_size()
-        if least > limit:
-            continue
-        archive = packing.archive()
-        if archive.stat().st_size <= limit:
-            return archive
-    raise _too_large(limit, packing, can_draw=bool(videos))
-
-
-def _too_large(limit: int, packing: _Packing, *, can_draw: bool) -> ArchiveTooLarge:
-    sizes = sorted(_sizes(packing.staged), key=lambda item: (-item[1], item[0]))
-    return ArchiveTooLarge(
-        sum(size for _, size in sizes),
-        limit,
-        sizes[:_LARGEST],
-        reason=(
-            "Smaller videos do not help."
-            if can_draw
-            else "No video in it can be drawn again smaller: there are no recorded "
-            "states of them, and what is encoded is never encoded again."
-        ),
-    )
-
-
-def _sizes(folder: Path) -> Sequence[tuple[str, int]]:
-    return [(path.name, path.stat().st_size) for path in folder.iterdir()]

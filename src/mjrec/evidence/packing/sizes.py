@@ -9,7 +9,9 @@ from ...errors import InvalidArgument
 
 __all__ = ["byte_count", "shown_size"]
 
-_SIZE = re.compile(r"(?P<number>\d{1,15}(\.\d{1,6})?)\s*(?P<unit>[KMGT]?)(?P<bin>i?)B?")
+_SIZE = re.compile(
+    r"(?P<number>\d{1,15}(\.\d{1,6})?)\s*(?P<unit>[KMGT]?)(?P<bin>i?)B?", re.IGNORECASE
+)
 _UNITS = ("", "K", "M", "G", "T")
 
 
@@ -53,4 +55,4 @@ def _parsed(size: object) -> int | None:
     if match is None or (match["bin"] and not match["unit"]):
         return None
     base = 1024 if match["bin"] else 1000
-    return int(float(match["number"]) * base ** _UNITS.index(match["unit"]))
+    return int(float(match["number"]) * base ** _UNITS.index(match["unit"].upper()))

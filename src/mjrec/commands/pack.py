@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec pack`: a monitor directory as one file that a stranger can verify."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import zipfile
+from pathlib import Path
+from typing import Annotated
+
+import rich.console
+import tyro
+
+from ..errors import InvalidArgument
+from ..evidence.packing import pack as pack_directory
+from ..evidence.packing.sizes import shown_size
+from ..monitors.render_progress import RenderProgress
+from .help_text import flowing_help
+
+__all__ = ["pack"]
+
+_NUMBERS = re.compile(r"\d{1,15}(,\d{1,15})*", re.ASCII)
+
+
+@flowing_help
+def pack(
+    directory: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")],
+    /,
+    *,
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    title: str | None = None,
+    author: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    license: str | None = None,
+    episodes: str | None = None,
+    anonymous: bool = False,
+    max_size: str | None = None,
+) -> int:
+    """Pack a monitor directory into one file that a stranger can verify.
+
+    It is a zip file: a BagIt bag around an RO-Crate, with the recordings, their
+    statistics as CSV, what they were made with, a README and a CITATION.cff. The same
+    recordings give the same bytes. Whoever gets it checks it with mjrec verify.
+
+    Args:
+        directory: the monitor directory.
+        out: the archive, which must not exist; its name ends in .zip.
+        title: of the run; what was recorded, if left out.
+        author: "Name", "Name <address>" or "Name <ORCID>". May be given several times.
+        license: the SPDX identifier of the licence, such as CC-BY-4.0, or its URL.
+        episodes: the numbers of those whose videos and recorded states are packed,
+            such as 0,8,27; all, if left out. The archive says that a choice was made.
+        anonymous: take out everything that names a user, a machine or an author.
+        max_size: the most bytes of the archive, such as 50M. If it would be larger, the
+            videos are drawn again smaller, from the recorded states.
+    """
+    console = rich.console.Console(stderr=True)
+    with RenderProgress(console, title="drawing smaller videos ") as progress:
+        archive = pack_directory(
+            directory,
+            out,
+            title=title,
+            authors=author,
+            license=license,
+            episodes=None if episodes is None else _numbers(episodes),
+            anonymous=anonymous,
+            max_size=max_size,
+            on_progress=progress.show,
+        )
+    _show(archive)
+    return 0
+
+
+def _numbers(text: str) -> list[int]:
+    """Return the numbers in a list such as "0,8,27".
+
+    Raises:
+        InvalidArgument: it is none.
+    """
+    plain = text.replace(" ", "")
+    if not _NUMBERS.fullmatch(plain):
+        raise InvalidArgument(
+            "--episodes is a list of numbers with commas between them, such as 0,8,27, "
+            f"got {text!r}."
+        )
+    return [int(number) for number in plain.split(",")]
+
+
+def _show(archive: Path) -> None:
+    size = archive.stat().st_size
+    with archive.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    with zipfile.ZipFile(archive) as packed:
+        count = len(packed.infolist())
+    # Names must survive copying, so no line is folded.
+    rich.console.Console().print(
+        f"{archive}\n"
+        f"  {count} files, {shown_size(size)} ({size} bytes)\n"
+        f"  sha256 {digest}\n"
+        f"To verify it: mjrec verify {archive.name}",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
