@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Packed runs to verify, and to forge: unpacked, edited, and made to fit again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import h5py
+import numpy as np
+
+import mjrec
+from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.trajectory_hdf5 import write_hdf5
+
+__all__ = [
+    "edit_json",
+    "edit_trajectory",
+    "make_bag_fit",
+    "record_pendulum",
+    "the",
+    "unpacked",
+    "zipped",
+]
+
+
+def record_pendulum(
+    directory: Path, episodes: int = 3, *, longest: int = 8, **options: Any
+) -> None:
+    """Record short episodes with small pictures."""
+    env = gymnasium.make(
+        "InvertedPendulum-v5",
+        render_mode="rgb_array",
+        width=32,
+        height=32,
+        max_episode_steps=longest,
+    )
+    with mjrec.Monitor(env, directory, workers=1, **options) as env:
+        env.action_space.seed(5)
+        for episode in range(episodes):
+            env.reset(seed=episode)
+            done = False
+            while not done:
+                _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+                done = terminated or truncated
+
+
+def unpacked(archive: Path, into: Path) -> Path:
+    """Unpack a packed run of ours, and return its folder."""
+    with zipfile.ZipFile(archive) as file:
+        file.extractall(into)
+    [folder] = into.iterdir()
+    return folder
+
+
+def zipped(bag: Path, archive: Path) -> Path:
+    """Pack a folder, as it is."""
+    with zipfile.ZipFile(archive, "w") as file:
+        for path in _files(bag):
+            file.write(path, f"{bag.name}/{path.relative_to(bag).as_posix()}")
+    return archive
+
+
+def make_bag_fit(bag: Path) -> None:
+    """Let the manifests of a bag say what is there, whatever that is."""
+    _write_manifest(bag, "manifest-sha512.txt", _files(bag / "data"))
+    tags = (
+        path
+        for path in _files(bag)
+        if path.parent == bag and not path.name.startswith("tagmanifest")
+    )
+    _write_manifest(bag, "tagmanifest-sha512.txt", tags)
+
+
+def the(folder: Path, pattern: str) -> Path:
+    """Return the one file below a folder that a pattern stands for."""
+    [path] = folder.rglob(pattern)
+    return path
+
+
+def edit_json(path: Path, edit: Callable[[Any], object]) -> None:
+    """Change what a file of JSON holds."""
+    content = json.loads(path.read_text())
+    edit(content)
+    path.write_text(json.dumps(content))
+
+
+def edit_trajectory(
+    path: Path,
+    edit: Callable[[h5py.File], object] = lambda _: None,
+    **facts: Any,
+) -> None:
+    """Change a finished trajectory: its datasets, its facts; its checksum fits."""
+    if facts:
+        with open_trajectory(path) as reader:
+            header = reader.header
+            object.__setattr__(header, "facts", {**header.facts, **facts})
+            write_hdf5(reader, path)
+    with h5py.File(path, "r+") as file:
+        edit(file)
+
+
+def set_reward(path: Path, step: int, reward: float) -> None:
+    """Change one recorded reward, and the return that the trajectory says."""
+    with open_trajectory(path) as reader:
+        rewards = reader.rewards.copy()
+    rewards[step] = reward
+    edit_trajectory(
+        path,
+        lambda file: file["rewards"].__setitem__(slice(None), rewards),
+        reward=float(np.add.accumulate(rewards)[-1]),
+    )
+
+
+def _write_manifest(bag: Path, name: str, paths: Iterable[Path]) -> None:
+    lines = (
+        f"{hashlib.sha512(path.read_bytes()).hexdigest()}  "
+        f"{path.relative_to(bag).as_posix()}\n"
+        for path in paths
+    )
+    (bag / name).write_text("".join(lines))
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (path for path in sorted(folder.rglob("*")) if path.is_file())
