@@ -52,6 +52,13 @@ for directory in map(pathlib.Path, sys.argv[1:]):
         print(where, what)
 """
 
+_PACK = """
+import sys, mjrec
+authors = ["Margherita Brunelli <m.brunelli@uni-pavia.example>"]
+source, target, how = sys.argv[1:]
+mjrec.pack(source, target, authors=authors, anonymous=how == "anonymous")
+"""
+
 
 class Somebody:
     """A person with an account, a machine, a repository and a model.
@@ -87,18 +94,18 @@ class Somebody:
     def _write_model(self) -> None:
         assets = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
         xml = (assets / "inverted_pendulum.xml").read_text()
-        texture = '<texture name="t" type="2d" file="logo.png"/>'
+        texture = '<texture name="t" type="2d" file="mbrunelli_logo.png"/>'
         xml = xml.replace(
             "<worldbody>",
             f'<asset>{texture}<material name="m" texture="t"/></asset><worldbody>'
             f"<!-- as measured in {self.home} -->",
         )
-        path = self.work / "models" / "pendulum.xml"
+        path = self.work / "models" / "mbrunelli.xml"
         path.write_text(f"<!-- written by Margherita Brunelli -->\n{xml}")
         texts = PngImagePlugin.PngInfo()
         texts.add_text("Author", "M. Brunelli", zip=True)
         Image.new("RGB", (4, 4), (90, 0, 0)).save(
-            path.with_name("logo.png"), pnginfo=texts
+            path.with_name("mbrunelli_logo.png"), pnginfo=texts
         )
 
     def _git(self, *arguments: str) -> str:
@@ -156,9 +163,29 @@ def anonymous(
     return stage
 
 
+@pytest.fixture(scope="module")
+def packed(
+    somebody: Somebody, recorded: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    """A directory of archives that name nobody, and one of archives that do."""
+    directories = {how: tmp_path_factory.mktemp(how) for how in ("anonymous", "named")}
+    for how, directory in directories.items():
+        for kind in ("pendulum", "diary"):
+            source, target = str(recorded / kind), str(directory / f"{kind}.zip")
+            somebody.run("-c", _PACK, source, target, how)
+    return directories
+
+
 def test_nothing_of_the_identity_is_left(somebody: Somebody, anonymous: Path) -> None:
     """No login, host, home, repository, address or author, in no form in no file."""
     assert find(anonymous, [*WORDS, somebody.commit]) == []
+
+
+def test_nothing_of_the_identity_is_packed(
+    somebody: Somebody, packed: dict[str, Path]
+) -> None:
+    """Nor is it in what describes the recordings."""
+    assert find(packed["anonymous"], [*WORDS, somebody.commit]) == []
 
 
 @pytest.mark.parametrize(
@@ -169,16 +196,23 @@ def test_nothing_of_the_identity_is_left(somebody: Somebody, anonymous: Path) ->
         r"\.jsonl$",
         r"\.h5 > /@facts",
         r"diary\.video\d+\.json$",
-        r"zip > source/pendulum\.xml$",
-        r"zip > source/logo\.png \(zTXt\)",
+        r"monitor\.csv \(name\)$",
+        r"model.*zip > source/mbrunelli\.xml \(name\)",
+        r"model.*zip > source/mbrunelli\.xml$",
+        r"model.*zip > source/mbrunelli_logo\.png \(zTXt\)",
         r"mjb\.gz \(unpacked\)",
         r"\.mp4 \(name\)",
         r"stats\.json \(name\)",
+        r"environment\.json$",
+        r"ro-crate-metadata\.json$",
+        r"CITATION\.cff$",
+        r"README\.md$",
+        r"statistics\.csv$",
     ],
 )
-def test_the_search_finds_it_where_it_was(recorded: Path, where: str) -> None:
-    """In what was recorded, the same search finds it in each kind of place."""
-    assert any(re.search(where, place) for place, _ in find(recorded, WORDS))
+def test_the_search_finds_it_where_it_was(packed: dict[str, Path], where: str) -> None:
+    """In what was packed with names, the same search finds them in each place."""
+    assert any(re.search(where, place) for place, _ in find(packed["named"], WORDS))
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "utf-16-be"])
@@ -205,7 +239,7 @@ def test_the_gate_finds_it_in_each_kind_of_place(
         ".csv",
         ".mp4",
         "unpacked",
-        "pendulum.xml",
+        "mbrunelli.xml",
     ):
         assert any(where.endswith(ending) for where in left), ending
     assert any("@facts" in where for where in left)
@@ -249,7 +283,7 @@ def test_placeholders_stand_for_what_was_there(anonymous: Path) -> None:
     [trajectory, _] = _trajectories(anonymous)
     assert trajectory.facts["options"] == {"goal": "<path>/goal.npy"}
     kwargs = trajectory.facts["environment"]["kwargs"]
-    assert kwargs["xml_file"] == "<path>/models/pendulum.xml"
+    assert kwargs["xml_file"] == "<path>/models/<user>.xml"
     assert trajectory.facts["model"]["seal"] is None
     details = _read(next((anonymous / "pendulum").glob("*.manifest.json")))["mjrec"]
     assert "no key in <path>/wandb.key" in details["faults"][0]["reason"]

@@ -26,11 +26,15 @@ def _zip(members: Mapping[str, bytes]) -> bytes:
     return image.getvalue()
 
 
+def _anonymous_members(members: Mapping[str, bytes]) -> dict[str, bytes]:
+    new = anonymous_sources(_zip(members), MATCHER)
+    with zipfile.ZipFile(io.BytesIO(new)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
 def _anonymous(content: bytes) -> bytes:
     """Return what becomes of one file."""
-    new = anonymous_sources(_zip({"source/file": content}), MATCHER)
-    with zipfile.ZipFile(io.BytesIO(new)) as archive:
-        return archive.read("source/file")
+    return _anonymous_members({"source/file": content})["source/file"]
 
 
 def test_comments_are_removed() -> None:
@@ -83,3 +87,50 @@ def test_damage_is_said(content: bytes) -> None:
     """A zip that cannot be read, and XML that is none."""
     with pytest.raises(ValueError, match=r"damaged|no XML"):
         anonymous_sources(content, MATCHER)
+
+
+def test_files_get_other_names_and_references_follow() -> None:
+    """The main file's, an included one's, and those of directories and named meshes."""
+    main = (
+        b'<mujoco><compiler meshdir="../mbrunelli/stl"/>'
+        b"<include file='by_mbrunelli.xml'/>"
+        b'<asset><mesh name="arm" file="mbrunelli.stl"/></asset></mujoco>'
+    )
+    members = _anonymous_members(
+        {
+            "contents.json": b'{"format": 1, "main": "xml/mbrunelli.xml"}',
+            "source/xml/mbrunelli.xml": main,
+            "source/xml/by_mbrunelli.xml": b"<mujoco/>",
+            "source/mbrunelli/stl/mbrunelli.stl": b"",
+        }
+    )
+    assert members == {
+        "contents.json": b'{"format": 1, "main": "xml/user.xml"}',
+        "source/xml/user.xml": main.replace(b"mbrunelli", b"user"),
+        "source/xml/by_user.xml": b"<mujoco/>",
+        "source/user/stl/user.stl": b"",
+    }
+
+
+@pytest.mark.parametrize(
+    "xml",
+    [
+        b'<mujoco><asset><mesh file="mbrunelli.stl"/></asset></mujoco>',
+        b'<mujoco><asset><mesh name="a" file="mbrunelli.stl"/><mesh name="b" '
+        b'file="user.stl"/></asset></mujoco>',
+    ],
+)
+def test_files_keep_names_that_are_names_of_the_model(xml: bytes) -> None:
+    """A mesh without a name is called by its file; and no two files become one."""
+    members = {
+        "source/a.xml": xml,
+        "source/mbrunelli.stl": b"",
+        "source/user.stl": b"",
+    }
+    assert _anonymous_members(members) == members
+
+
+def test_bodies_keep_their_names() -> None:
+    """A model whose bodies are called otherwise is another model."""
+    xml = b'<mujoco model="mbrunelli"><body name="mbrunelli"/></mujoco>'
+    assert _anonymous(xml) == xml

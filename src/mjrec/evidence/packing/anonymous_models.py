@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models without what their authors say of themselves beside them.
 
-Comments and metadata are removed; no element and no attribute of a model changes, so
-that it compiles to the same. What it is called itself, or calls its bodies and files,
-stays: a model without that is another model.
+Comments and metadata are removed, and files get other names (`model_file_names`); no
+other element or attribute of a model changes, so that it compiles to the same. What it
+is called itself, or calls its bodies, stays: a model without that is another model.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
 from ...formats.json_fields import unreadable
 from .identity_matching import IdentityMatcher
+from .model_file_names import is_xml, with_other_names
 
 __all__ = ["anonymous_sources", "compiled_model"]
 
@@ -58,16 +59,26 @@ def anonymous_sources(content: bytes, matcher: IdentityMatcher) -> bytes:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = {info: archive.read(info) for info in archive.infolist()}
-        changed = {info: _file(old, matcher) for info, old in members.items()}
+            infos = archive.infolist()
+            members = {info.filename: archive.read(info) for info in infos}
+        files = {name: _file(old, matcher) for name, old in members.items()}
     except _DAMAGE as error:
         raise ValueError(f"it is damaged ({error})") from error
+    changed = with_other_names(files, matcher.replaced_in_name) or files
     if changed == members:
         return content
+    return _zip(infos, changed)
+
+
+def _zip(infos: Sequence[zipfile.ZipInfo], members: Mapping[str, bytes]) -> bytes:
     image = io.BytesIO()
     with zipfile.ZipFile(image, "w") as archive:
-        for info, data in changed.items():
-            archive.writestr(info, data)
+        for info, (name, data) in zip(infos, members.items(), strict=True):
+            member = zipfile.ZipInfo(name, info.date_time)
+            member.compress_type = info.compress_type
+            member.create_system = info.create_system
+            member.external_attr = info.external_attr
+            archive.writestr(member, data)
     return image.getvalue()
 
 
@@ -85,10 +96,9 @@ def compiled_model(path: Path) -> bytes:
 
 
 def _file(content: bytes, matcher: IdentityMatcher) -> bytes:
-    # By what they are: MuJoCo takes any name for MJCF.
     if content.startswith(_PNG):
         return b"".join(_png_parts(content))
-    if content.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+    if is_xml(content):
         return _xml(content, matcher)
     if b"\0" not in content[:_STL_HEADER] and matcher.found_in_bytes(content):
         return _without_remarks(content, matcher)
