@@ -45,8 +45,10 @@ _ROBOTICS = "gymnasium_robotics"
 
 # How an environment is shown, on which no state depends.
 _VIEW = frozenset(
-    ("render_mode", "camera_name", "camera_id", "default_camera_config", "width")
-    + ("height", "max_geom", "visual_options")
+    (
+        *("render_mode", "camera_name", "camera_id", "default_camera_config"),
+        *("width", "height", "max_geom", "visual_options"),
+    )
 )
 # gymnasium.make's own arguments, which are no environment's.
 _MAKE = frozenset(("id", "vector_kwargs", "disable_env_checker", "max_episode_steps"))
@@ -241,8 +243,8 @@ def _arguments(recorded: RecordedEnvironment) -> dict[str, Any]:
     for name, value in kept.items():
         if name in _MAKE or not plain_argument(name, value):
             raise NotMadeAgain(
-                f"its argument {name!r:.80} ({value!r:.80}) is more than a plain value, "
-                "or names a file"
+                f"its argument {name!r:.80} ({value!r:.80}) is more than a plain "
+                "value, or names a file"
             )
     return kept
 
@@ -455,8 +457,8 @@ class _DmControlAgain:
             raise NotMadeAgain(f"{name} is no task of the installed dm_control's suite")
         if name.domain == "lqr" and "random" not in arguments.get("task_kwargs", {}):
             raise NotMadeAgain(
-                f"{name} draws its model at random when it is made, and from which seed "
-                "is not recorded"
+                f"{name} draws its model at random when it is made, and from which "
+                "seed is not recorded"
             )
         with _failures(str(name)):
             env = suite.load(name.domain, name.task, **arguments)

@@ -22,6 +22,7 @@ __all__ = [
     "changed_model",
     "changed_names",
     "differing_from",
+    "keeps_paths",
     "model_digest",
     "model_from_sources",
 ]
@@ -50,6 +51,12 @@ def model_digest(model: mujoco.MjModel) -> str:
     return hashlib.sha256(buffer.data).hexdigest()
 
 
+def keeps_paths(model: mujoco.MjModel) -> bool:
+    """Tell whether a model holds the places of files, on which its hash depends."""
+    names = (name for name in array_names() if name.endswith("_pathadr"))
+    return any((getattr(model, name) >= 0).any() for name in names)
+
+
 def changed_model(
     model: mujoco.MjModel, changes: Mapping[str, NDArray[Any]]
 ) -> mujoco.MjModel:
@@ -75,7 +82,7 @@ def changed_names(model: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
 def differing_from(
     model: mujoco.MjModel, fields: Mapping[str, NDArray[Any]]
 ) -> list[str]:
-    """Return the names of those fields that a model has another value in, or not at all.
+    """Return the names of those fields of which a model has another value, or none.
 
     What is of the view and not of the model is left out.
     """

@@ -116,8 +116,8 @@ def judged(differences: Differences, fit: Fit) -> tuple[Verdict, str, dict[str, 
         return Verdict.PASS, f"bit for bit, {rows}", figures
     if not fit.is_exact and differences.maximum <= fit.tolerance:
         reason = (
-            f"{rows} within {fit.tolerance:g} of |x - y| / (1 + |x|), the largest error "
-            f"is {differences.maximum:.2g}; {fit.why}"
+            f"{rows} within {fit.tolerance:g} of |x - y| / (1 + |x|), the largest "
+            f"error is {differences.maximum:.2g}; {fit.why}"
         )
         return Verdict.PASS, reason, figures
     place = differences.first if fit.is_exact else differences.worst

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...environments.made_again import EnvironmentAgain, EpisodeStart
+from ...environments.made_again import EnvironmentAgain
 from ...errors import InvalidArgument
 from ...formats.trajectory_reader import TrajectoryReader
 from ...recorder.step_arrays import StepArray, step_array

@@ -21,6 +21,7 @@ from ...recorder.versions import versions
 from ...simulation.compiled_models import (
     changed_model,
     differing_from,
+    keeps_paths,
     model_digest,
 )
 from ..verification import Check, Level, Verdict
@@ -153,23 +154,30 @@ class EpisodePhysics:
                 f"the beginning of this episode: {comparison}"
             )
             return self._check(_MODEL, Verdict.FAIL, reason)
+        if self._has_recorded_hash(sources, present):
+            return self._check(_MODEL, Verdict.PASS, "bit for bit")
+        why = self._fit.why or (
+            "its sha256 is of a model that holds where its files were"
+            if keeps_paths(sources)
+            else ""
+        )
+        if why:
+            return self._check(_MODEL, Verdict.PASS, f"field by field; {why}")
+        reason = "the archive's sources compile to another model than its sha256 says"
+        return self._check(_MODEL, Verdict.FAIL, reason)
+
+    def _has_recorded_hash(self, sources: Any, present: Any) -> bool:
         if not self._is_of_this_mujoco():
-            return self._check(_MODEL, Verdict.PASS, "field by field")
-        if not self._fit.is_exact:
-            return self._check(_MODEL, Verdict.PASS, f"field by field; {self._fit.why}")
-        if model_digest(sources) != self._sha256():
-            reason = (
-                "the archive's sources compile to another model than its sha256 says"
-            )
-            return self._check(_MODEL, Verdict.FAIL, reason)
-        return self._check(_MODEL, Verdict.PASS, "bit for bit")
+            return False
+        models = [sources] if self._changes else [sources, present]
+        return self._sha256() in map(model_digest, models)
 
     def _of_registry_alone(self, present: Any, missing: str) -> Check:
         """Compare where the archive has nothing but a compiled model."""
         if not (self._is_of_this_mujoco() and self._fit.is_exact):
             reason = (
-                f"{missing}, and the hash of a compiled model says nothing here: "
-                f"{self._fit.why}"
+                f"{missing}, and the hash of the compiled model says nothing here: "
+                f"{self._fit.why or 'it is of another MuJoCo'}"
             )
             return self._check(_MODEL, Verdict.NOT_CHECKABLE, reason)
         sha256 = self._sha256()
@@ -197,24 +205,28 @@ class EpisodePhysics:
             reason = f"{_listed(differing)}: recorded otherwise than the reset sets it"
             return self._check(_MODEL, Verdict.FAIL, reason)
         reason = (
-            f"{missing}, and the episode in which the model was first seen is not here; "
-            f"what the reset changes in it ({_listed(self._changes)}) is as recorded"
+            f"{missing}, and the episode in which the model was first seen is not "
+            f"here; what the reset changes ({_listed(self._changes)}) is as recorded"
         )
         return self._check(_MODEL, Verdict.NOT_CHECKABLE, reason)
 
     def _of_sources(self, sources: Any) -> Check:
         changed = [name for name in self._changes if not is_of_pictures(name)]
         suffix = f"; the recording changes {_listed(changed)} in it" if changed else ""
-        if not (self._is_of_this_mujoco() and self._fit.is_exact):
-            reason = (
-                "the hash of a compiled model says nothing here: "
-                f"{self._fit.why or 'it is of another MuJoCo'}{suffix}"
-            )
+        if self._is_of_this_mujoco() and model_digest(sources) == self._sha256():
+            return self._check(_SOURCES, Verdict.PASS, f"bit for bit{suffix}")
+        why = self._fit.why or (
+            "it holds where its files were"
+            if keeps_paths(sources)
+            else "it is of another MuJoCo"
+            if not self._is_of_this_mujoco()
+            else ""
+        )
+        if why:
+            reason = f"the hash of the compiled model says nothing here: {why}{suffix}"
             return self._check(_SOURCES, Verdict.NOT_CHECKABLE, reason)
-        if model_digest(sources) != self._sha256():
-            reason = "they compile to another model than the recorded sha256 says"
-            return self._check(_SOURCES, Verdict.FAIL, reason)
-        return self._check(_SOURCES, Verdict.PASS, f"bit for bit{suffix}")
+        reason = "they compile to another model than the recorded sha256 says"
+        return self._check(_SOURCES, Verdict.FAIL, reason)
 
     def _nearly_as_recorded(self, present: Any) -> tuple[str, ...]:
         """Return the names of changed fields that are nearly what was recorded."""
@@ -362,10 +374,8 @@ class EpisodePhysics:
         freely = (
             ""
             if replay.synchronised_from is None
-            else (
-                f"; from step {replay.synchronised_from} on each step begins at the recorded "
-                "state"
-            )
+            else f"; from step {replay.synchronised_from} on each step begins at the "
+            "recorded state"
         )
         compared = (
             (_START, replay.first_state, self._derived, f"; {self._began()}"),
@@ -451,11 +461,10 @@ class EpisodePhysics:
         if framework == "mjcf":
             return "nothing in its reset is random"
         seed = facts.get("seed")
-        is_number = type(seed) is int
-        if framework == "gymnasium" and is_number:
-            return f"reset with the recorded seed {seed}"
-        if not is_number or facts.get("random_state") is None:
+        if type(seed) is not int:
             return "reset from the recorded random state"
+        if framework == "gymnasium" or facts.get("random_state") is None:
+            return f"reset with the recorded seed {seed}"
         given = "is" if _is_state_of(seed, facts["random_state"]) else "is not"
         return (
             f"reset from the recorded random state, which {given} that of seed {seed}"

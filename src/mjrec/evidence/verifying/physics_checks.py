@@ -22,7 +22,6 @@ from typing import Any
 
 from ...environments.made_again import (
     EnvironmentAgain,
-    EpisodeStart,
     NotMadeAgain,
     RecordedEnvironment,
     make_again,
@@ -68,8 +67,8 @@ def _checks_of(path: Path, workshop: _Workshop) -> Iterator[Check]:
             claim="the episode's states are recorded",
             subject=subject,
             verdict=Verdict.NOT_CHECKABLE,
-            reason=f"{path.name} was never finished; `mjrec recover` and `mjrec render` "
-            "finish what a killed process has left",
+            reason=f"{path.name} was never finished; `mjrec recover` finishes what a "
+            "killed process has left",
         )
         return
     try:

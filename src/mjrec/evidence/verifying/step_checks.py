@@ -104,7 +104,7 @@ def follow_steps(
                 return result
         is_end = stop == reader.row_count - 1
         numbers = _allowed(raw, result.substeps, uneven=uneven, is_end=is_end)
-        known = ~np.isnan(rows).any(axis=1)
+        known: NDArray[np.bool_] = np.asarray(~np.isnan(rows).any(axis=1))
         # MuJoCo would warn of what is no number, and start anew.
         filled = np.where(known[:, np.newaxis], rows, 0.0)
         found = changing.follow(filled, numbers, start)

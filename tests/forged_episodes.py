@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded episodes, and what a forger makes of them: files that fit in themselves."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import shutil
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+
+import mjrec
+from mjrec.environments.mjcf_environments import MjcfEnvironment
+from mjrec.evidence.verification import Check, Level, Verdict
+from mjrec.evidence.verifying.physics_checks import check_physics
+from mjrec.evidence.verifying.task import Task
+from mjrec.formats.trajectory import TrajectoryContent
+from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.trajectory_hdf5 import write_hdf5
+from mjrec.formats.trajectory_reader import TrajectoryReader
+
+__all__ = [
+    "copied",
+    "episode",
+    "fact",
+    "failed",
+    "forge",
+    "physics_of",
+    "record_gymnasium",
+    "record_mjcf",
+    "record_suite",
+    "swap_model",
+    "verdicts",
+]
+
+_OPTIONS: dict[str, Any] = {
+    "video_callable": False,
+    "trajectory_callable": lambda _: True,
+    "observations": True,
+}
+
+
+def record_gymnasium(
+    directory: Path,
+    env: gymnasium.Env[Any, Any],
+    *,
+    episodes: int = 2,
+    steps: int = 20,
+    seeds: Callable[[int], int | None] = lambda episode: 5 + episode,
+    kind: type = np.float32,
+    size: float = 0.7,
+) -> Path:
+    """Record random actions."""
+    monitor: Any = mjrec.Monitor(env, directory, **_OPTIONS, allow_early_reset=True)
+    monitor.action_space.seed(3)
+    for number in range(episodes):
+        monitor.reset(seed=seeds(number))
+        for _ in range(steps):
+            action = monitor.action_space.sample().astype(kind) * kind(size)
+            _, _, terminated, truncated, _ = monitor.step(action)
+            if terminated or truncated:
+                break
+    monitor.close()
+    return directory
+
+
+def record_suite(
+    directory: Path, domain: str, task: str, *, episodes: int = 2, steps: int = 20
+) -> Path:
+    """Record random actions in a task of dm_control's suite."""
+    from dm_control import suite
+
+    env = suite.load(domain, task)
+    name = f"dm_control/{domain}-{task}"
+    monitor: Any = mjrec.Monitor(env, directory, **_OPTIONS, env_id=name)
+    generator = np.random.default_rng(3)
+    for _ in range(episodes):
+        monitor.reset()
+        for _ in range(steps):
+            monitor.step(generator.uniform(-1, 1, monitor.action_spec().shape))
+    monitor.close()
+    return directory
+
+
+def record_mjcf(directory: Path, path: Path, xml: str) -> Path:
+    """Record the environment of an MJCF file."""
+    path.write_text(xml)
+    env = gymnasium.wrappers.TimeLimit(MjcfEnvironment(path), 15)
+    return record_gymnasium(directory, env, episodes=1)
+
+
+def episode(directory: Path, number: int = 0) -> Path:
+    """Return the file of an episode."""
+    [path] = directory.glob(f"*.episode{number:06d}.h5")
+    return path
+
+
+def forge(path: Path, **arrays: Any) -> None:
+    """Write an episode anew, with other arrays; `facts` are added to its own.
+
+    Args:
+        path: of its file.
+        arrays: fields of `TrajectoryContent`, or functions that change a copy of one
+            in place.
+    """
+    with open_trajectory(path) as reader:
+        content = reader.content()
+    header = content.header
+    facts = {**header.facts, **arrays.pop("facts", {})}
+    changed: dict[str, Any] = {}
+    for name, value in arrays.items():
+        changed[name] = value
+        if callable(value):
+            changed[name] = np.array(getattr(content, name))
+            value(changed[name])
+    header = dataclasses.replace(header, facts=facts)
+    path.unlink()
+    write_hdf5(
+        _Forged(path, dataclasses.replace(content, header=header, **changed)), path
+    )
+
+
+def fact(path: Path, name: str) -> Any:
+    """Return a fact of an episode."""
+    with open_trajectory(path) as reader:
+        return reader.header.facts[name]
+
+
+def swap_model(directory: Path, number: int, old: str, new: str) -> None:
+    """Put another model under a name of its own, and make the facts fit."""
+    path = episode(directory, number)
+    stored = fact(path, "model")
+    source = directory / stored["xml"]
+    packed = io.BytesIO()
+    with zipfile.ZipFile(source) as before, zipfile.ZipFile(packed, "w") as after:
+        for member in before.infolist():
+            content = before.read(member)
+            if member.filename.startswith("source/"):
+                assert old.encode() in content
+                content = content.replace(old.encode(), new.encode())
+                model = mujoco.MjModel.from_xml_string(content.decode())
+            after.writestr(member, content)
+    compiled = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, compiled)
+    digest = hashlib.sha256(compiled.data).hexdigest()
+    name = f"openaigym.model.{digest[:16]}.zip"
+    (directory / name).write_bytes(packed.getvalue())
+    model_facts = {**stored, "sha256": digest, "bytes": len(compiled), "xml": name}
+    forge(path, facts={"model": model_facts})
+
+
+def physics_of(directory: Path, *, trust: frozenset[str] = frozenset()) -> list[Check]:
+    """Return what the level `physics` says; the directory is as it was before."""
+    before = _contents(directory)
+    task = Task(recordings=directory, level=Level.PHYSICS, trust=trust)
+    checks = list(check_physics(task, lambda done, total: None))
+    assert _contents(directory) == before
+    return checks
+
+
+def verdicts(checks: list[Check]) -> Counter[str]:
+    """Count verdicts."""
+    return Counter(check.verdict.value for check in checks)
+
+
+def failed(checks: list[Check]) -> list[str]:
+    """Return what failed, by what it was checked of."""
+    claims = (
+        ("the model", "model"),
+        ("each recorded state", "steps"),
+        ("the environment begins", "start"),
+        ("the recorded actions", "states"),
+        ("the environment gives the recorded rewards", "rewards"),
+        ("the environment ends", "ends"),
+        ("the environment gives the recorded observations", "observations"),
+        ("the episode's states", "file"),
+    )
+    short: Mapping[str, str] = dict(claims)
+    return [
+        next(name for claim, name in short.items() if check.claim.startswith(claim))
+        for check in checks
+        if check.verdict is Verdict.FAIL
+    ]
+
+
+def copied(directory: Path, to: Path) -> Path:
+    """Return a copy of a directory."""
+    return Path(shutil.copytree(directory, to))
+
+
+class _Forged(TrajectoryReader):
+    """A trajectory in memory."""
+
+    def __init__(self, path: Path, content: TrajectoryContent) -> None:
+        self.path = path
+        self.header = content.header
+        self.row_count = len(content.states)
+        self.rewards = content.rewards
+        self.terminated = content.terminated
+        self.truncated = content.truncated
+        self.frame_steps = content.frame_steps
+        self.change_count = len(content.model_changes)
+        self.dropped = content.dropped
+        self._content = content
+
+    def close(self) -> None: ...
+
+    def _states(self, start: int, stop: int) -> Any:
+        return self._content.states[start:stop]
+
+    def _actions(self, start: int, stop: int) -> Any:
+        assert self._content.actions is not None
+        return self._content.actions[start:stop]
+
+    def _observations(self, start: int, stop: int) -> Any:
+        assert self._content.observations is not None
+        return self._content.observations[start:stop]
+
+    def _snapshots(self, start: int, stop: int) -> Any:
+        return self._content.snapshots[start:stop]
+
+    def _model_change(self, index: int) -> Any:
+        return self._content.model_changes[index]
+
+
+def _contents(directory: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in directory.iterdir()}
