@@ -32,11 +32,12 @@ from ...formats.monitor_directory import (
     Infix,
     episode_of,
     infix_of,
+    is_manifest,
     iter_monitor_files,
     trajectory_prefix,
 )
 from ...formats.regular_files import regular_path
-from ...recovery.remains import has_work, is_open, remains_of
+from ...recovery.remains import Remains, has_work, is_open, remains_of
 from ...rendering.pending import look_at, recordings
 from ...rendering.recorded_facts import open_for_rendering
 from ...results import iter_episodes
@@ -48,6 +49,10 @@ __all__ = ["PACKED_EPISODES", "Contents", "VideoFiles", "look_for_contents"]
 PACKED_EPISODES = "packed_episodes"
 
 _RENDER = "To render what is pending: mjrec render {}"
+_STRAY = (
+    "There is no manifest of their monitor, which would say what they are. Put it "
+    "back, or move them away."
+)
 _RECOVER = "Their process was killed; to put that in order: mjrec recover {}"
 
 
@@ -139,14 +144,13 @@ def _check_nobody_writes(directory: Path) -> None:
 
 
 def _check_all_is_done(directory: Path) -> None:
-    killed = [
-        str(remains.infix)
-        for remains in remains_of(directory)
-        if not is_open(remains)
-        and (has_work(remains) or _lacks_manifest(remains.paths))
-    ]
+    closed = [remains for remains in remains_of(directory) if not is_open(remains)]
+    killed = [str(remains.infix) for remains in closed if has_work(remains)]
     if killed:
         raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))
+    strays = [name for remains in closed for name in _strays(remains)]
+    if strays:
+        raise UnfinishedRecordings(directory, strays, advice=_STRAY)
     pending = [
         key.told_name
         for key in recordings(directory)
@@ -156,9 +160,10 @@ def _check_all_is_done(directory: Path) -> None:
         raise UnfinishedRecordings(directory, pending, advice=_RENDER.format(directory))
 
 
-def _lacks_manifest(paths: Iterable[Path]) -> bool:
-    names = [path.name for path in paths if not path.name.startswith(".")]
-    return bool(names) and not any(name.endswith(".manifest.json") for name in names)
+def _strays(remains: Remains) -> list[str]:
+    """Return the names of files of a monitor that has no manifest."""
+    names = [path.name for path in remains.paths if not path.name.startswith(".")]
+    return [] if any(map(is_manifest, names)) else names
 
 
 def _chosen(directory: Path, episodes: Iterable[int]) -> frozenset[int]:

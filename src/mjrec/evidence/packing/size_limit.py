@@ -7,7 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ...errors import ArchiveTooLarge
+from ...machine import usable_cpus
 from ...rendering.progress import Progress
+from ...rendering.workers import DrawingWorkers
 from .assembly import Assembly
 from .smaller_videos import SCALES, draw_smaller, redrawable
 
@@ -31,14 +33,21 @@ def archive_within(
     videos = redrawable(assembly.contents.videos)
     drawn = sum(video.video.stat().st_size for video in videos)
     rest = size - drawn
-    for scale in SCALES if videos and rest < limit else ():
-        # No video shrinks more than its pictures do: there is no use in trying.
-        if rest + drawn * scale**2 > limit and scale is not SCALES[-1]:
-            continue
-        draw_smaller(videos, assembly.staged, scale, on_progress=on_progress)
-        archive, size = assembly.archive_within(limit)
-        if archive is not None:
-            return archive
+    with DrawingWorkers(usable_cpus()) as workers:
+        for scale in SCALES if videos and rest < limit else ():
+            # No video shrinks more than its pictures do: there is no use in trying.
+            if rest + drawn * scale**2 > limit and scale is not SCALES[-1]:
+                continue
+            draw_smaller(
+                videos,
+                assembly.staged,
+                scale,
+                workers=workers,
+                on_progress=on_progress,
+            )
+            archive, size = assembly.archive_within(limit)
+            if archive is not None:
+                return archive
     raise ArchiveTooLarge(
         size,
         limit,

@@ -19,7 +19,6 @@ from ...atomic_files import write_text
 from ...errors import PackError
 from ...formats.json_fields import read_object, unreadable
 from ...formats.video_metadata import metadata_path
-from ...machine import usable_cpus
 from ...rendering.progress import Progress
 from ...rendering.videos import render_video
 from ...rendering.views import View
@@ -88,6 +87,7 @@ def draw_smaller(
     folder: Path,
     scale: Fraction,
     *,
+    workers: DrawingWorkers,
     on_progress: Callable[[Progress], object],
 ) -> None:
     """Put smaller videos in the place of those in `folder`, with all about them.
@@ -96,6 +96,7 @@ def draw_smaller(
         videos: which; they stay as they are.
         folder: where the smaller ones get their names.
         scale: of width and height; both become even.
+        workers: who draw.
         on_progress: called after every frame.
 
     Raises:
@@ -113,11 +114,10 @@ def draw_smaller(
         on_progress(now)
 
     on_progress(now)
-    with DrawingWorkers(usable_cpus()) as workers:
-        for number, video in enumerate(wanted, 1):
-            _draw(video, folder, scale, workers=workers, on_frame=count_frame)
-            now = replace(now, videos_done=number)
-            on_progress(now)
+    for number, video in enumerate(wanted, 1):
+        _draw(video, folder, scale, workers=workers, on_frame=count_frame)
+        now = replace(now, videos_done=number)
+        on_progress(now)
 
 
 def _draw(
