@@ -22,7 +22,15 @@ from rich.console import Console
 
 import mjrec
 
-from . import disk, encoding, memory, rendering, stepping, time_to_video
+from . import (
+    disk,
+    encoding,
+    memory,
+    rendering,
+    stepping,
+    time_to_video,
+    verifying,
+)
 from .machine import Machine, examine
 from .results import Result
 from .tables import table_of
@@ -34,6 +42,7 @@ MEASUREMENTS: Mapping[str, ModuleType] = {
     "rendering": rendering,
     "disk": disk,
     "encoding": encoding,
+    "verifying": verifying,
 }
 
 
