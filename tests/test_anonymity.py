@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,9 @@ from identity_search import find
 from PIL import Image, PngImagePlugin
 
 import mjrec
-from mjrec.evidence.packing.anonymity import remaining_identity
+from mjrec.evidence.packing.anonymity import make_anonymous, remaining_identity
 from mjrec.evidence.packing.identity import Identity
+from mjrec.evidence.verification import Verdict
 from mjrec.json_text import loads
 
 WORDS = (
@@ -220,7 +222,7 @@ def test_the_search_and_the_gate_find_it_in_every_encoding(
     tmp_path: Path, encoding: str
 ) -> None:
     """Both find a name amid bytes that are no text."""
-    content = bytes(range(256)) + "by MBrunelli".encode(encoding) + b"\xff\xfe\x00"
+    content = bytes(range(256)) + "MBrunelli".encode(encoding) + b"\xff\xfe"
     (tmp_path / "file").write_bytes(content)
     identity = Identity(users=("mbrunelli",))
     assert find(tmp_path, ["mbrunelli"]) == [("file", "mbrunelli")]
@@ -312,6 +314,76 @@ def test_pictures_are_the_same(anonymous: Path) -> None:
     again = [hashlib.sha256(frame).hexdigest() for frame in mjrec.render(trajectory)]
     lines = hashes.read_text().splitlines()
     assert again == [line.split()[-1] for line in lines if not line.startswith("#")]
+
+
+def test_what_was_packed_can_be_verified(packed: dict[str, Path]) -> None:
+    """Whatever one file says of another still holds."""
+    for archive in packed["anonymous"].iterdir():
+        verification = mjrec.verify(archive)
+        assert verification.failures == ()
+        assert verification.count(Verdict.PASS) > 5
+
+
+def test_the_same_recordings_become_the_same_files(
+    somebody: Somebody, recorded: Path, tmp_path: Path, packed: dict[str, Path]
+) -> None:
+    """However often, and whatever else was in the files' directory."""
+    again = tmp_path / "pendulum.zip"
+    somebody.run("-c", _PACK, str(recorded / "pendulum"), str(again), "anonymous")
+    first = packed["anonymous"] / "pendulum.zip"
+    assert again.read_bytes() == first.read_bytes()
+
+
+def test_two_uids_do_not_become_one(tmp_path: Path) -> None:
+    """Of two that differ in what is taken out, one gets a number."""
+    for uid in ("mbrunelli", "lovelace", "user"):
+        (tmp_path / f"openaigym.episodes.0.{uid}.jsonl").write_text(
+            f'{{"by": "{uid}"}}\n'
+        )
+    make_anonymous(tmp_path, identity=Identity(users=("lovelace", "mbrunelli")))
+    names = sorted(path.name for path in tmp_path.iterdir())
+    uids = ("user", "user-2", "user-3")
+    assert names == sorted(f"openaigym.episodes.0.{uid}.jsonl" for uid in uids)
+
+
+def test_texts_in_csv_and_in_torn_journals_are_nobodys(tmp_path: Path) -> None:
+    """The header of the one is JSON; of the other, what is no JSON is left out."""
+    csv = tmp_path / "openaigym.results.0.7.monitor.csv"
+    csv.write_text('#{"t_start": 1.5, "env_id": "/home/ada/a.xml"}\nr,l,t\n1.0,2,0.5\n')
+    journal = tmp_path / "openaigym.episodes.0.7.jsonl"
+    journal.write_text('{"reward": 1e999, "seed": null}\n{"options": "/home/ada')
+    make_anonymous(tmp_path, identity=Identity(homes=("/home/ada",)))
+    assert csv.read_text() == (
+        '#{"t_start": 1.5, "env_id": "<home>/a.xml"}\nr,l,t\n1.0,2,0.5\n'
+    )
+    assert journal.read_text() == '{"reward": 1e999, "seed": null}\n'
+
+
+def test_what_nobody_can_read_is_removed(tmp_path: Path) -> None:
+    """A log that is damaged may say anything."""
+    log = tmp_path / "openaigym.trajectory.0.7.episode000000.log.damaged"
+    log.write_bytes(b"?")
+    make_anonymous(tmp_path, identity=Identity())
+    assert not log.exists()
+
+
+def test_what_cannot_be_unpacked_is_an_error_of_the_gate(tmp_path: Path) -> None:
+    """Nobody knows what is in it."""
+    (tmp_path / "file").write_bytes(b"\x1f\x8b torn")
+    with pytest.raises(mjrec.UnreadableFile, match="cannot be unpacked"):
+        remaining_identity(tmp_path, Identity())
+
+
+def test_bodies_that_name_somebody_are_found_by_the_gate(tmp_path: Path) -> None:
+    """What cannot be taken out of a model is said, with the place."""
+    model = tmp_path / "openaigym.model.0123456789abcdef.zip"
+    with zipfile.ZipFile(model, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("source/a.xml", '<mujoco><body name="mbrunelli"/></mujoco>')
+    identity = Identity(users=("mbrunelli",))
+    make_anonymous(tmp_path, identity=identity)
+    assert remaining_identity(tmp_path, identity) == [
+        (f"{model.name}: source/a.xml", "mbrunelli")
+    ]
 
 
 def _trajectories(directory: Path) -> list[mjrec.Trajectory]:

@@ -112,21 +112,16 @@ def test_files_get_other_names_and_references_follow() -> None:
     }
 
 
-@pytest.mark.parametrize(
-    "xml",
-    [
-        b'<mujoco><asset><mesh file="mbrunelli.stl"/></asset></mujoco>',
-        b'<mujoco><asset><mesh name="a" file="mbrunelli.stl"/><mesh name="b" '
-        b'file="user.stl"/></asset></mujoco>',
-    ],
-)
-def test_files_keep_names_that_are_names_of_the_model(xml: bytes) -> None:
-    """A mesh without a name is called by its file; and no two files become one."""
-    members = {
-        "source/a.xml": xml,
-        "source/mbrunelli.stl": b"",
-        "source/user.stl": b"",
-    }
+def test_files_keep_names_that_are_names_of_the_model() -> None:
+    """A mesh that has no name of its own is called by its file."""
+    xml = b'<mujoco><asset><mesh file="mbrunelli.stl"/></asset></mujoco>'
+    members = {"source/a.xml": xml, "source/mbrunelli.stl": b""}
+    assert _anonymous_members(members) == members
+
+
+def test_files_that_would_become_one_keep_their_names() -> None:
+    """There is another one of the new name already."""
+    members = {"source/mbrunelli.stl": b"1", "source/user.stl": b"2"}
     assert _anonymous_members(members) == members
 
 
