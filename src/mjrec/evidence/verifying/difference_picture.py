@@ -23,8 +23,8 @@ def difference_picture(drawn: Planes, shipped: Planes) -> Frame:
     """Return the drawn picture, the shipped one, and their difference, amplified.
 
     Where nothing differs, the third is grey; where the shipped one is brighter, so is
-    the third, 8 times as much. Both are as a video holds them, with their colours at half
-    the size: without that every coloured edge would be in the difference.
+    the third, 8 times as much. Both have their colours at half the size, as videos do:
+    else every coloured edge would be in the difference.
     """
     one, other = frame_of(drawn), frame_of(shipped)
     height = len(one)

@@ -51,13 +51,18 @@ class Limits:
         return max(noise, (1 - found.ssim) / (1 - self.ssim), found.block / self.block)
 
 
-# The same pictures through x264 at crf 18: in fourteen scenes of dm_control's suite and
-# Gymnasium, 64x64 to 480x480, and ffmpeg 4.2, 7.0 and 9.0, the worst frames had 42 dB,
-# 0.985 and 12 levels.
-OTHER_ENCODER: Final = Limits(psnr=38.0, ssim=0.97, block=20.0)
-# Another rasteriser besides: Mesa's softpipe, which smooths no edges, against llvmpipe
-# gave 35 dB, 0.972 and 22 levels at the worst; llvmpipe held to SSE2 hardly differs.
-OTHER_RENDERER: Final = Limits(psnr=33.0, ssim=0.95, block=32.0)
+# The same pictures through x264 at crf 18: in 23 scenes of dm_control's suite and of
+# Gymnasium, from 32x32 to 640x480, the worst frames had 35.7 dB, 0.987 and 11.5 levels;
+# which ffmpeg it was, 4.2, 7.0 or 9.0, made no difference to speak of. The PSNR is low
+# in small pictures of chequered floors. A square of two by two pixels that is painted
+# over has 21 levels or more.
+OTHER_ENCODER: Final = Limits(psnr=34.0, ssim=0.975, block=20.0)
+# Another rasteriser besides, in the same scenes: Mesa's softpipe, which smooths no
+# edges, against llvmpipe gave 29.3 dB (32x32; 35.5 from 120x160 on), 0.903 and 34
+# levels at the worst; llvmpipe held to SSE2 is within a level of itself. A graphics
+# card was not to be had. Five by five pixels that are painted over are beyond it, and
+# a frame that is one step off where limbs move fast (80 levels), not where they creep.
+OTHER_RENDERER: Final = Limits(psnr=28.0, ssim=0.88, block=44.0)
 
 
 class Likeness:

@@ -62,6 +62,7 @@ _VIDEO: Final = ".mp4"
 _METADATA: Final = ".meta.json"
 _TEXT: Final = "video/vnd.openai.ansivid"
 _MOST_NAMED: Final = 5
+_FRAMES_OF_A_WORKER: Final = 32
 
 
 def check_pixels(task: Task, count: Count) -> Iterator[Check]:
@@ -81,7 +82,9 @@ def check_pixels(task: Task, count: Count) -> Iterator[Check]:
     read = [_read(path) for path in videos]
     totals = [_frames_to_draw(video, task) for video in read]
     ends = itertools.accumulate(totals)
-    with DrawingWorkers(usable_cpus()) as workers:
+    # To start one takes as long as drawing some pictures.
+    most = max(1, sum(totals) // _FRAMES_OF_A_WORKER)
+    with DrawingWorkers(min(most, usable_cpus())) as workers:
         studio = _Studio(task=task, workers=workers)
         for video, total, end in zip(read, totals, ends, strict=True):
             done = itertools.count(end - total + 1)

@@ -1,0 +1,495 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Verifying the pixels of a run: honest ones pass, and each forgery is caught.
+
+What a forger can do is done here to a copy of an honest recording: every hash that
+anybody could make fit is made to fit.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import mjrec
+from conftest import Corridor, run_episodes
+from mjrec.evidence.verification import Check, Verdict
+from mjrec.evidence.verifying.pixel_checks import check_pixels
+from mjrec.evidence.verifying.task import Task
+from mjrec.formats.video_writer import VideoWriter
+
+STEPS = 6
+DECODES, DRAWN, ENCODED, ALIKE = range(4)
+CLAIMS = (
+    "the video decodes to the recorded number of frames and to their hash",
+    "the pictures drawn from the recorded snapshots have the shipped hashes",
+    "encoding the drawn pictures again gives the shipped file",
+    "the shipped frames show the pictures drawn",
+)
+PASS, FAIL, OPEN = Verdict.PASS, Verdict.FAIL, Verdict.NOT_CHECKABLE
+
+
+def record(directory: Path, *, episodes: int = 1, **options: Any) -> Path:
+    """Record episodes of a small HalfCheetah, and render their videos."""
+    made = gymnasium.make("HalfCheetah-v5", max_episode_steps=STEPS)
+    settings = {"height": 48, "width": 64, "episodes": "all", "uid": "u", **options}
+    if settings.pop("episodes") == "all":
+        settings["video_callable"] = lambda episode: True
+    with mjrec.Monitor(made, directory, **settings) as env:
+        for episode in range(episodes):
+            env.reset(seed=episode)
+            for _ in range(STEPS):
+                env.step(np.full(6, 0.9 - episode, np.float32))
+    return directory
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of two episodes, which nobody changes."""
+    return record(tmp_path_factory.mktemp("honest") / "run", episodes=2)
+
+
+@pytest.fixture
+def run(honest: Path, tmp_path: Path) -> Path:
+    """A copy of it, for forgers."""
+    return Path(shutil.copytree(honest, tmp_path / "run"))
+
+
+@pytest.fixture
+def alone(run: Path) -> Path:
+    """A copy with the first episode's video only, which takes less time."""
+    for path in [*run.glob("*.video000001.*"), *run.glob("*.episode000001.*")]:
+        path.unlink()
+    return run
+
+
+def checks_of(directory: Path, **options: Any) -> list[Check]:
+    task = Task(recordings=directory, **options)
+    return list(check_pixels(task, lambda done, total: None))
+
+
+def found(directory: Path, **options: Any) -> dict[tuple[int, int], Check]:
+    """Return the checks by the episode's number and the claim's."""
+    return {
+        (_episode(check), CLAIMS.index(check.claim)): check
+        for check in checks_of(directory, **options)
+    }
+
+
+def _episode(check: Check) -> int:
+    return int(re.findall(r"video(\d{6})", check.subject)[0])
+
+
+def verdicts(directory: Path, episode: int = 0, **options: Any) -> list[Verdict]:
+    """Return what became of each claim about an episode's video."""
+    checks = found(directory, **options)
+    return [check.verdict for (number, _), check in checks.items() if number == episode]
+
+
+def video(directory: Path, episode: int = 0) -> Path:
+    [path] = directory.glob(f"*.video{episode:06d}.mp4")
+    return path
+
+
+def metadata(path: Path) -> dict[str, Any]:
+    said: dict[str, Any] = json.loads(path.with_suffix(".meta.json").read_text())
+    return said
+
+
+def say(path: Path, **changes: Any) -> None:
+    """Change what the metadata of a video says."""
+    said = {**metadata(path), **changes}
+    path.with_suffix(".meta.json").write_text(json.dumps(said))
+
+
+def drawn(directory: Path, episode: int = 0) -> list[Any]:
+    [path] = directory.glob(f"*.episode{episode:06d}.h5")
+    return list(mjrec.render(path))
+
+
+def forge(path: Path, frames: list[Any], *, hashes: bool = True, **kw: Any) -> None:
+    """Put other frames into a video, and make all fit that anybody can."""
+    said, kept = metadata(path), path.with_suffix(".framehash").read_bytes()
+    options = {"fps": int(said["fps"]), "frame_hashes": True, **kw}
+    with VideoWriter(path, **options) as writer:
+        for frame in frames:
+            writer.write(frame)
+    if not hashes:
+        path.with_suffix(".framehash").write_bytes(kept)
+    assert writer.result is not None
+    last = len(frames) - 1
+    say(
+        path,
+        file_sha256=writer.result.file_sha256,
+        decoded_sha256=writer.result.decoded_sha256,
+        frame_count=len(frames),
+        frame_steps=[[0, last]],
+        length=last,
+    )
+
+
+def test_an_honest_run_passes(honest: Path) -> None:
+    """Bit for bit and byte for byte, on the machine that recorded it."""
+    checks = found(honest)
+    assert len(checks) == 8
+    assert {check.verdict for check in checks.values()} == {PASS}
+    assert checks[1, DRAWN].reason == "7 frames, bit for bit"
+    assert checks[1, ENCODED].reason == "7 frames, byte for byte"
+    assert checks[1, ALIKE].figures["psnr"] > 36
+
+
+def test_progress_is_told(honest: Path) -> None:
+    """Frame by frame, to the end."""
+    told: list[tuple[int, int]] = []
+    list(check_pixels(Task(recordings=honest), lambda *done: told.append(done)))
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert {total for _, total in told} == {14}
+    assert told[-1] == (14, 14)
+
+
+def test_nothing_is_written_into_the_recordings(honest: Path, tmp_path: Path) -> None:
+    """Whatever is made again is made elsewhere."""
+
+    def state() -> list[tuple[str, int, bytes]]:
+        paths = sorted(honest.iterdir())
+        return [(p.name, p.stat().st_mtime_ns, p.read_bytes()) for p in paths]
+
+    before = state()
+    (tmp_path / "pictures").mkdir()
+    checks_of(honest, pictures=tmp_path / "pictures")
+    assert state() == before
+
+
+def one_pixel(frames: list[Any]) -> list[Any]:
+    """Return frames with one pixel of one of them a little brighter."""
+    changed = [frame.copy() for frame in frames]
+    changed[3][20, 30] ^= 64
+    return changed
+
+
+def test_one_pixel_changed_with_every_hash_made_to_fit(run: Path) -> None:
+    """The drawn picture has another hash, and is encoded to another file."""
+    forge(video(run), one_pixel(drawn(run)))
+    checks = found(run)
+    assert [checks[0, claim].verdict for claim in range(3)] == [PASS, FAIL, FAIL]
+    assert "1 of 7 drawn have other hashes: 3" in checks[0, DRAWN].reason
+    assert verdicts(run, 1) == [PASS] * 4
+
+
+def test_one_pixel_changed_in_the_video_alone(alone: Path) -> None:
+    """The frames' hashes are true, and the file is not what they are encoded to."""
+    forge(video(alone), one_pixel(drawn(alone)), hashes=False)
+    assert verdicts(alone)[:3] == [PASS, PASS, FAIL]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda f: f[:2] + f[3:], lambda f: [*f[:2], f[2], *f[2:]], lambda f: f[:-1]],
+    ids=["dropped", "doubled", "last dropped"],
+)
+def test_a_frame_dropped_or_doubled(alone: Path, change: Callable[..., Any]) -> None:
+    """The trajectory has another number of pictures."""
+    forge(video(alone), change(drawn(alone)))
+    checks = found(alone)
+    assert checks[0, DECODES].verdict is PASS
+    assert checks[0, DRAWN].verdict is FAIL
+    assert "its trajectory has 7 pictures" in checks[0, DRAWN].reason
+
+
+def test_a_frame_in_the_place_of_another(alone: Path) -> None:
+    """One is dropped and another doubled, so that their number stays."""
+    frames = drawn(alone)
+    forge(video(alone), [*frames[:2], frames[1], *frames[3:]])
+    checks = found(alone)
+    assert "other hashes: 2;" in checks[0, DRAWN].reason
+    assert checks[0, ENCODED].verdict is FAIL
+
+
+def test_videos_swapped_between_episodes(run: Path) -> None:
+    """Both show another episode than their names say."""
+    for ending in (".mp4", ".framehash", ".meta.json"):
+        one, other = (video(run, n).with_suffix(ending) for n in (0, 1))
+        content = one.read_bytes()
+        one.write_bytes(other.read_bytes())
+        other.write_bytes(content)
+    for episode in (0, 1):
+        assert verdicts(run, episode) == [PASS, FAIL, FAIL, FAIL]
+
+
+def test_a_video_relabelled_as_another_episodes(run: Path) -> None:
+    """The best episode's video as that of the first, its own metadata kept."""
+    for ending in (".mp4", ".framehash"):
+        content = video(run, 1).with_suffix(ending).read_bytes()
+        video(run, 0).with_suffix(ending).write_bytes(content)
+    said = metadata(video(run, 1))
+    say(video(run, 0), decoded_sha256=said["decoded_sha256"])
+    assert verdicts(run, 0) == [PASS, FAIL, FAIL, FAIL]
+    assert verdicts(run, 1) == [PASS] * 4
+
+
+def test_who_names_another_driver_is_left_with_little_room(alone: Path) -> None:
+    """What the driver is said to have been changes no verdict about a sprite."""
+    frames = [frame.copy() for frame in drawn(alone)]
+    frames[4][8:16, 8:16] = (255, 0, 0)
+    forge(video(alone), frames)
+    say(video(alone), gl_renderer="NVIDIA H200/PCIe/SSE2")
+    checks = found(alone)
+    assert checks[0, DRAWN].verdict is OPEN
+    assert "NVIDIA H200" in checks[0, DRAWN].reason
+    assert checks[0, ENCODED].verdict is OPEN
+    assert checks[0, ALIKE].verdict is FAIL
+    assert checks[0, ALIKE].figures["worst_frame"] == 4
+
+
+def test_an_honest_video_that_another_driver_drew(
+    alone: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Mesa's other rasteriser draws otherwise, and near enough; the room is stated."""
+    monkeypatch.setenv("GALLIUM_DRIVER", "softpipe")
+    checks = found(alone)
+    assert [checks[0, claim].verdict for claim in range(4)] == [PASS, OPEN, OPEN, PASS]
+    assert "softpipe" in checks[0, DRAWN].reason
+    assert "not noticed would be" in checks[0, ALIKE].reason
+    assert checks[0, ALIKE].figures["unnoticed_square"] < 4
+
+
+def test_another_pose_is_noticed_with_another_driver(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other episode's pictures are beyond what a driver may differ."""
+    forge(video(run), drawn(run, 1))
+    monkeypatch.setenv("GALLIUM_DRIVER", "softpipe")
+    assert verdicts(run) == [PASS, OPEN, OPEN, FAIL]
+
+
+def test_an_honest_video_of_another_encoder(run: Path) -> None:
+    """Other bytes of the same pictures pass by their likeness, with the reason."""
+    arguments = metadata(video(run))["encoder_version"]
+    forge(video(run), drawn(run), crf=17)
+    say(video(run), ffmpeg_sha256="0" * 64, encoder_version=arguments)
+    checks = found(run)
+    assert [checks[0, claim].verdict for claim in range(4)] == [PASS, PASS, OPEN, PASS]
+    assert "another ffmpeg encoded it" in checks[0, ENCODED].reason
+    # Who was that very ffmpeg has to make the very bytes.
+    say(video(run), ffmpeg_sha256=metadata(video(run, 1))["ffmpeg_sha256"])
+    assert verdicts(run) == [PASS, PASS, FAIL, PASS]
+
+
+def test_a_command_line_of_the_archive_is_not_run(alone: Path, tmp_path: Path) -> None:
+    """It is compared, and where it is another one, that is said."""
+    marker = tmp_path / "ran"
+    said = metadata(video(alone))["encoder_version"]
+    said["cmdline"] = [*said["cmdline"][:-1], "-y", f"file:{marker}"]
+    say(video(alone), encoder_version=said)
+    checks = found(alone)
+    assert checks[0, ENCODED].verdict is OPEN
+    assert "is not run" in checks[0, ENCODED].reason
+    assert not marker.exists()
+
+
+def test_a_sample_is_drawn_from_its_seed(alone: Path) -> None:
+    """So many frames of each video, the same each time; the rest is said."""
+    checks = found(alone, sample=2, seed=5)
+    assert [checks[0, claim].verdict for claim in range(4)] == [PASS, PASS, OPEN, PASS]
+    assert checks[0, DRAWN].reason == "2 of 7 frames, bit for bit"
+    assert "leave --sample out" in checks[0, ENCODED].reason
+    assert found(alone, sample=2, seed=5) == checks
+    assert found(alone, sample=2, seed=6) != checks
+
+
+def test_a_sample_of_all_frames_is_no_sample(alone: Path) -> None:
+    """Also where more are asked for than there are."""
+    assert verdicts(alone, sample=100) == [PASS] * 4
+
+
+def test_the_frame_that_differs_most_is_shown(alone: Path, tmp_path: Path) -> None:
+    """As drawn, as shipped, and how they differ."""
+    frames = [frame.copy() for frame in drawn(alone)]
+    frames[4][8:24, 8:24] = (255, 0, 0)
+    forge(video(alone), frames)
+    checks = found(alone, pictures=tmp_path)
+    shown = tmp_path / checks[0, ALIKE].figures["picture"]
+    assert shown.read_bytes().startswith(b"\x89PNG")
+    assert checks[0, ALIKE].figures["worst_frame"] == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "videos"),
+    [
+        ({"camera": ["track", -1]}, 2),
+        ({"camera": ["track", -1], "tiled": True}, 1),
+        ({"annotate": True}, 1),
+        ({"quality": "draft", "height": 33, "width": 47}, 1),
+        ({"max_fps": 7}, 1),
+    ],
+    ids=["two cameras", "tiled", "annotated", "draft and odd", "strided"],
+)
+def test_every_kind_of_video_is_drawn_again(
+    tmp_path: Path, options: dict[str, Any], videos: int
+) -> None:
+    """With its cameras, captions, quality, size and rate."""
+    checks = checks_of(record(tmp_path / "run", **options))
+    assert len(checks) == 4 * videos
+    assert {check.verdict for check in checks} == {PASS}
+
+
+def test_a_video_rendered_again_beside_the_original(alone: Path) -> None:
+    """It shows what its metadata says, of the recorded pictures."""
+    from mjrec.rendering.again import Variant, render_again
+    from mjrec.rendering.views import View
+
+    variant = Variant(view=View(camera=-1, height=24, width=32), max_fps=10)
+    [outcome] = render_again(sorted(alone.glob("*.h5"))[:1], variant, workers=1)
+    checks = [check for check in checks_of(alone) if check.subject == outcome.name]
+    assert [check.verdict for check in checks] == [PASS] * 4
+
+
+def test_a_live_video_is_decoded_and_the_rest_is_said(tmp_path: Path) -> None:
+    """With the reason why it was drawn live."""
+    run = record(tmp_path / "run", render="live")
+    checks = found(run)
+    assert [checks[0, claim].verdict for claim in range(4)] == [PASS] + [OPEN] * 3
+    assert "drawn live" in checks[0, DRAWN].reason
+
+
+def test_a_video_without_a_simulation(tmp_path: Path) -> None:
+    """There is no trajectory to draw from."""
+    with mjrec.Monitor(Corridor(), tmp_path / "run") as env:
+        run_episodes(env, 1)
+    assert verdicts(tmp_path / "run") == [PASS, OPEN, OPEN, OPEN]
+
+
+def test_a_text_recording_has_no_pixels(tmp_path: Path) -> None:
+    """It is said, and nothing fails."""
+    with mjrec.Monitor(Corridor(render_mode="ansi"), tmp_path / "run") as env:
+        run_episodes(env, 1)
+    [check] = checks_of(tmp_path / "run")
+    assert (check.verdict, "recording of text" in check.reason) == (OPEN, True)
+
+
+@pytest.mark.parametrize("said", [{"broken": True, "empty": True}, {}])
+def test_metadata_without_a_video(alone: Path, said: dict[str, Any]) -> None:
+    """A video that broke is said to have; one that is gone is missed."""
+    say(video(alone), **said)
+    video(alone).unlink()
+    [check] = [check for (number, _), check in found(alone).items() if number == 0]
+    assert check.verdict is (OPEN if said else FAIL)
+
+
+def test_a_model_that_is_missing_or_a_strangers(
+    alone: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Without its sources nothing is drawn, and that is said."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "stranger"))
+    assert verdicts(alone) == [PASS] * 4
+    for path in alone.glob("*.zip"):
+        path.unlink()
+    checks = found(alone)
+    assert [checks[0, claim].verdict for claim in range(4)] == [PASS] + [OPEN] * 3
+    assert "is not loaded" in checks[0, DRAWN].reason
+
+
+@pytest.mark.parametrize("damage", ["snapshots", "cut"])
+def test_a_damaged_trajectory_is_no_excuse(alone: Path, damage: str) -> None:
+    """Who damages what the pictures follow from has not made the checks vanish."""
+    [path] = alone.glob("*.episode000000.h5")
+    content = path.read_bytes()
+    if damage == "cut":
+        path.write_bytes(content[: len(content) // 2])
+    else:
+        import h5py
+
+        with h5py.File(path, "r+") as file:
+            values = file["snapshots"][...]
+            del file["snapshots"]
+            file["snapshots"] = values[:-1]
+    assert found(alone)[0, DRAWN].verdict is FAIL
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-700])
+
+
+def _garbage(path: Path) -> None:
+    path.write_bytes(b"\x00\x01" * 4000)
+
+
+def _list_of_files(path: Path) -> None:
+    path.write_text("ffconcat version 1.0\nfile /etc/passwd\n")
+
+
+def _empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _link(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("/dev/zero")
+
+
+@pytest.mark.parametrize("damage", [_cut, _garbage, _list_of_files, _empty, _link])
+def test_what_is_no_video_is_a_failure(
+    run: Path, damage: Callable[[Path], None]
+) -> None:
+    """Told, not raised; and the other video is checked."""
+    damage(video(run))
+    assert verdicts(run)[0] is FAIL
+    assert verdicts(run, 1) == [PASS] * 4
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"width": 48, "height": 64},
+        {"width": 10**9},
+        {"width": "64"},
+        {"frame_count": 8},
+        {"frame_count": 10**15},
+        {"fps": "1e20000000"},
+        {"fps": "19"},
+        {"decoded_sha256": "0" * 64},
+        {"decoded_sha256": None},
+        {"frame_steps": [[0, 5], [7, 7]]},
+        {"quality": "draft"},
+        {"encoder_version": []},
+        {"stride": 0},
+        {"camera": {"type": []}, "gl_vendor": [1]},
+    ],
+    ids=lambda said: "-".join(f"{k}={str(v)[:9]}" for k, v in said.items()),
+)
+def test_metadata_that_says_something_else_is_a_failure(
+    alone: Path, said: dict[str, Any]
+) -> None:
+    """Whatever it says, it is a check that fails and no error."""
+    say(video(alone), **said)
+    assert FAIL in verdicts(alone)
+
+
+@pytest.mark.parametrize("change", ["missing", "short", "foreign", "long"])
+def test_frame_hashes_that_are_none(alone: Path, change: str) -> None:
+    """A file that lacks lines, has more, or is something else."""
+    path = video(alone).with_suffix(".framehash")
+    lines = path.read_text().splitlines(keepends=True)
+    if change == "missing":
+        path.unlink()
+    else:
+        changed = {"short": lines[:-1], "foreign": ["x\n"], "long": [*lines, lines[-1]]}
+        path.write_text("".join(changed[change]))
+    assert found(alone)[0, DRAWN].verdict is FAIL
+
+
+def test_where_nothing_can_be_drawn(
+    honest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What needs no drawing is checked, and the rest says why not."""
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json")
+    for episode in (0, 1):
+        assert verdicts(honest, episode) == [PASS, OPEN, OPEN, OPEN]
