@@ -15,6 +15,7 @@ import pytest
 
 import mjrec
 from mjrec.evidence.verification import Check, Level, Verdict
+from mjrec.evidence.verifying.recorded_monitors import recorded_monitors
 from mjrec.evidence.verifying.statistics_checks import check_statistics, sum_of
 from mjrec.evidence.verifying.statistics_table import check_table
 from mjrec.evidence.verifying.task import Task
@@ -318,6 +319,28 @@ def test_damaged_file_is_a_failure_and_no_error(pattern: str, recordings: Path) 
     assert failures(recordings)
 
 
+@pytest.mark.parametrize("value", [None, [[1]], {"x": [{}]}, 1e999, "x", True])
+def test_values_that_cannot_be_are_no_error(value: Any, recordings: Path) -> None:
+    """Whatever stands in a file where something else should be."""
+
+    def spoil(details: Any) -> None:
+        for key in details:
+            details[key] = value
+
+    for pattern in ("*.manifest.json", "*000000.meta.json"):
+        path = the(recordings, pattern)
+        content = path.read_text()
+        edit_json(path, spoil)
+        assert failures(recordings)
+        path.write_text(content)
+    edit_manifest(recordings, spoil)
+    edit_trajectory(
+        the(recordings, "*episode000001.h5"),
+        **dict.fromkeys(("episode_id", "infix", "seed", "video", "length"), value),
+    )
+    assert failures(recordings)
+
+
 def test_damaged_trajectory_is_a_failure_and_no_error(recordings: Path) -> None:
     """And names the episode."""
     path = the(recordings, "*episode000001.h5")
@@ -355,8 +378,6 @@ def test_edited_table_is_found(
         writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    from mjrec.evidence.verifying.recorded_monitors import recorded_monitors
-
     checks = check_table(path, recorded_monitors(honest))
     [failure] = [check for check in checks if check.verdict is Verdict.FAIL]
     assert failure.subject.startswith("episode 1 of")

@@ -40,7 +40,7 @@ _GIB = 1 << 30
 # address space only, and OpenGL's drivers map a lot. See `docs/decisions.md`.
 LIMITS: Final[Mapping[str, int]] = {
     "RLIMIT_DATA": 8 * _GIB,
-    "RLIMIT_AS": 64 * _GIB,
+    "RLIMIT_AS": 128 * _GIB,
     "RLIMIT_FSIZE": 8 * _GIB,
     "RLIMIT_NOFILE": 1024,
     "RLIMIT_CORE": 0,
@@ -52,6 +52,7 @@ LIMITS: Final[Mapping[str, int]] = {
 _PATIENCE_S = 900.0
 _SECONDS_TO_DIE = 5.0
 _LONGEST_LINE = 1 << 24
+_MOST_OF_STDERR = 20_000
 _END_OF_STDERR = 500
 
 # How it may be told of progress: the level, how much is done, and of how much.
@@ -173,11 +174,15 @@ class _Conversation:
             how = f"was killed by {_signal_name(-status)}"
         else:
             how = f"ended with status {status}"
-        self._stderr.seek(0, os.SEEK_END)
-        begin = max(0, self._stderr.tell() - _END_OF_STDERR)
-        said = os.pread(self._stderr.fileno(), _END_OF_STDERR, begin)
-        words = " ".join(said.decode(errors="replace").split()) or "(nothing)"
-        return f"their process {how}. The end of what it said: {words}"
+        return f"their process {how}. The end of what it said: {self._last_words()}"
+
+    def _last_words(self) -> str:
+        descriptor = self._stderr.fileno()
+        begin = max(0, os.fstat(descriptor).st_size - _MOST_OF_STDERR)
+        said = os.pread(descriptor, _MOST_OF_STDERR, begin).decode(errors="replace")
+        # What Python says of a crash ends with the names of dozens of modules.
+        words = " ".join(said.partition("\nExtension modules:")[0].split())
+        return words[-_END_OF_STDERR:] or "(nothing)"
 
 
 @contextlib.contextmanager
