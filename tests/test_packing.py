@@ -21,11 +21,11 @@ import bagit
 import gymnasium
 import pytest
 import yaml
+from packed_runs import record_pendulum, the, unpacked
 from recordings import frames_of, manifest_of, metadata_of, videos_in
 
 import mjrec
 from mjrec.evidence.layout import STATISTICS_COLUMNS
-from packed_runs import record_pendulum, the, unpacked
 
 STATED = {
     "title": "Pendulums: «five» of them",

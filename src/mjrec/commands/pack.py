@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import shlex
 import zipfile
 from pathlib import Path
 from typing import Annotated
@@ -97,7 +98,7 @@ def _show(archive: Path) -> None:
         f"{archive}\n"
         f"  {count} files, {shown_size(size)} ({size} bytes)\n"
         f"  sha256 {digest}\n"
-        f"To verify it: mjrec verify {archive.name}",
+        f"To verify it: mjrec verify {shlex.quote(str(archive))}",
         highlight=False,
         markup=False,
         soft_wrap=True,

@@ -53,7 +53,10 @@ _STRAY = (
     "There is no manifest of their monitor, which would say what they are. Put it "
     "back, or move them away."
 )
-_RECOVER = "Their process was killed; to put that in order: mjrec recover {}"
+_RECOVER = (
+    "Their process was killed, or results are missing; to put that in order: mjrec "
+    "recover {}"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +81,7 @@ class Contents:
 
     Attributes:
         directory: the monitor directory.
-        files: those that are packed as they are, sorted by name.
+        files: those that are packed as they are, by the names that they get.
         manifests: by name, those that are packed with other content.
         videos: the finished videos among the files.
         surroundings: what the manifests say of where their recordings were made.
@@ -86,7 +89,7 @@ class Contents:
     """
 
     directory: Path
-    files: tuple[Path, ...]
+    files: Mapping[str, Path]
     manifests: Mapping[str, Manifest]
     videos: tuple[VideoFiles, ...]
     surroundings: tuple[Mapping[str, Any], ...]
@@ -109,12 +112,12 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
             cannot hold everywhere.
         UnreadableFile: a file is damaged, or a link that leads out of the directory.
     """
+    _check_nobody_writes(directory)
     if not any(iter_monitor_files(directory)):
         raise InvalidArgument(
             f"{directory} holds no recordings that could be packed. `mjrec record ENV "
             f"--out {directory}` makes some."
         )
-    _check_nobody_writes(directory)
     _check_all_is_done(directory)
     chosen = None if episodes is None else _chosen(directory, episodes)
     found = _Found(directory, chosen)
@@ -214,7 +217,7 @@ class _Found:
     def contents(self) -> Contents:
         return Contents(
             directory=self._directory,
-            files=tuple(self._files[name] for name in sorted(self._files)),
+            files=self._files,
             manifests=self._manifests,
             videos=tuple(self._videos),
             surroundings=tuple(self._surroundings),

@@ -52,8 +52,8 @@ def stage(contents: Contents, folder: Path) -> None:
         UnreadableFile: a file cannot be read, or is no regular file any more.
     """
     folder.mkdir()
-    for path in contents.files:
-        _link_or_copy(path, folder / path.name)
+    for name, path in contents.files.items():
+        _link_or_copy(path, folder / name)
     for name, manifest in contents.manifests.items():
         write_manifest(folder / name, manifest)
 

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec pack`: it says what it made, and how that is verified."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+from packed_runs import record_pendulum, the, unpacked
+from recordings import videos_in
+
+from mjrec.commands import main
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with two episodes, each with a video."""
+    directory = tmp_path_factory.mktemp("recorded")
+    record_pendulum(directory, 2, longest=3)
+    return directory
+
+
+def test_it_says_what_it_made(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where, how much, its hash, and the command that verifies it."""
+    path = tmp_path / "run.zip"
+    assert main(["pack", str(recorded), "-o", str(path)]) == 0
+    where, size, digest, advice = capsys.readouterr().out.splitlines()
+    assert where == str(path)
+    assert f"({path.stat().st_size} bytes)" in size
+    assert digest == f"  sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+    assert advice.endswith(f"mjrec verify {path}")
+    assert main(["verify", str(path), "--level", "files"]) == 0
+
+
+def test_everything_can_be_stated(recorded: Path, tmp_path: Path) -> None:
+    """Several authors, and a choice of episodes."""
+    path = tmp_path / "run.zip"
+    arguments = ["--title", "T", "--author", "A B", "--author", "C D"]
+    more = ["--license", "MIT", "--episodes", "1, 1", "--max-size", "5M"]
+    assert main(["pack", str(recorded), "--out", str(path), *arguments, *more]) == 0
+    folder = unpacked(path, tmp_path / "x")
+    crate = json.loads(the(folder, "ro-crate-metadata.json").read_text())
+    root = next(entity for entity in crate["@graph"] if entity["@id"] == "./")
+    assert root["name"] == "T"
+    assert len(root["author"]) == 2
+    assert root["license"]["@id"].endswith("/MIT")
+    assert videos_in(folder / "data/recordings") == [1]
+
+
+def test_anonymous_is_a_flag(recorded: Path, tmp_path: Path) -> None:
+    """Without authors."""
+    path = tmp_path / "run.zip"
+    assert main(["pack", str(recorded), "-o", str(path), "--anonymous"]) == 0
+    readme = the(unpacked(path, tmp_path / "x"), "README.md").read_text()
+    assert "withheld" in readme
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--episodes", "one"], "--episodes is a list"),
+        (["--episodes", "7"], "There are: 0, 1."),
+        (["--max-size", "1k"], "The largest files"),
+    ],
+)
+def test_errors_are_one_message(
+    arguments: list[str],
+    part: str,
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """And nothing is made."""
+    path = tmp_path / "run.zip"
+    assert main(["pack", str(recorded), "-o", str(path), *arguments]) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert part in said.err
+    assert list(tmp_path.iterdir()) == []
