@@ -367,6 +367,15 @@ def test_what_nobody_can_read_is_removed(tmp_path: Path) -> None:
     assert not log.exists()
 
 
+def test_films_are_searched_across_the_pieces_that_are_read(tmp_path: Path) -> None:
+    """They are too large to be read at once, and a name may lie where one ends."""
+    begin = b"\0\0\0\x18ftyp"
+    filling = b"\xff" * ((1 << 24) - len(begin) - 4)
+    (tmp_path / "film").write_bytes(begin + filling + b"mbrunelli")
+    identity = Identity(users=("mbrunelli",))
+    assert remaining_identity(tmp_path, identity) == [("film", "mbrunelli")]
+
+
 def test_what_cannot_be_unpacked_is_an_error_of_the_gate(tmp_path: Path) -> None:
     """Nobody knows what is in it."""
     (tmp_path / "file").write_bytes(b"\x1f\x8b torn")

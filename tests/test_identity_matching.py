@@ -69,10 +69,17 @@ def test_names_of_files_stay_portable() -> None:
 def test_few_letters_amid_numbers_are_chance() -> None:
     """Four letters in compressed bytes are nobody's name; a line of text is one."""
     matcher = IdentityMatcher(IDENTITY)
-    assert matcher.found_in_bytes(b"\x00\xffAlan\xfe\x01", by_chance=True) == []
-    assert matcher.found_in_bytes(b"\x00\xffAlan\xfe\x01") == ["Alan"]
-    said = b"\xffmade by Alan himself\xff"
-    assert matcher.found_in_bytes(said, by_chance=True) == ["Alan"]
+    assert matcher.found_in_bytes(b"\x00\xffAlan:/vm:\xfe\x01") == []
+    assert matcher.found_in_bytes(b"Alan", by_chance=True) == []
+    assert matcher.found_in_bytes(b"Alan") == ["Alan"]
+    assert matcher.found_in_bytes(b"\xffmade by Alan himself\xff") == ["Alan"]
+    assert matcher.found_in_bytes(b"\xffmbrunelli\xff") == ["mbrunelli"]
+
+
+def test_letters_are_found_that_json_escapes() -> None:
+    """As they are in every JSON file here, and in the facts of a trajectory."""
+    matcher = IdentityMatcher(Identity(users=("joséphine",)))
+    assert matcher.found_in_bytes(b'{"by": "Jos\\u00e9phine"}') == ["Joséphine"]
 
 
 def test_names_of_other_alphabets_are_found_amid_bytes() -> None:

@@ -32,6 +32,8 @@ _FILM = re.compile(rb"....ftyp|RIFF....AVI ", re.DOTALL)
 # An archive in an archive in an archive ...
 _DEEPEST = 8
 _ROWS_AT_ONCE = 1 << 14
+_PIECE = 1 << 24
+_LONGEST_NAME = 1 << 12
 
 # Where something is, and what is there: a name, or bytes; and whether these may hold
 # any few letters by chance.
@@ -80,8 +82,7 @@ def _found_in_file(
     path: Path, where: str, matcher: IdentityMatcher
 ) -> Iterator[tuple[str, str]]:
     try:
-        content = path.read_bytes()
-        for place, something, by_chance in _places(where, content, 0):
+        for place, something, by_chance in _places_in_file(path, where):
             if isinstance(something, str):
                 whats = matcher.found_in_name(something)
             else:
@@ -89,6 +90,19 @@ def _found_in_file(
             yield from ((place, what) for what in whats)
     except _DAMAGE as error:
         raise UnreadableFile(path, f"it cannot be unpacked ({error})") from error
+
+
+def _places_in_file(path: Path, where: str) -> Iterator[_Place]:
+    with path.open("rb") as file:
+        piece = file.read(_PIECE)
+        if not _FILM.match(piece):
+            yield from _places(where, piece + file.read(), 0)
+            return
+        # Films are large, and nothing in them is packed that could name anybody.
+        while piece:
+            following = file.read(_PIECE)
+            yield where, piece + following[:_LONGEST_NAME], True
+            piece = following
 
 
 def _places(where: str, content: bytes, depth: int) -> Iterator[_Place]:
@@ -105,7 +119,7 @@ def _places(where: str, content: bytes, depth: int) -> Iterator[_Place]:
         yield where, content, True
         yield from _places(f"{where}, unpacked", gzip.decompress(content), depth + 1)
     else:
-        yield where, content, _FILM.match(content) is not None
+        yield where, content, False
 
 
 def _places_in_zip(where: str, content: bytes, depth: int) -> Iterator[_Place]:
