@@ -109,19 +109,20 @@ def forge(path: Path, **arrays: Any) -> None:
     Args:
         path: of its file.
         arrays: fields of `TrajectoryContent`, or functions that change a copy of one
-            in place.
+            in place; and `action`, of the header.
     """
     with open_trajectory(path) as reader:
         content = reader.content()
     header = content.header
     facts = {**header.facts, **arrays.pop("facts", {})}
+    action = arrays.pop("action", header.action)
     changed: dict[str, Any] = {}
     for name, value in arrays.items():
         changed[name] = value
         if callable(value):
             changed[name] = np.array(getattr(content, name))
             value(changed[name])
-    header = dataclasses.replace(header, facts=facts)
+    header = dataclasses.replace(header, facts=facts, action=action)
     path.unlink()
     write_hdf5(
         _Forged(path, dataclasses.replace(content, header=header, **changed)), path
