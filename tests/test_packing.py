@@ -207,7 +207,7 @@ def test_the_crate_has_what_its_specification_wants(bag: Path) -> None:
     people = [entities[author["@id"]]["name"] for author in root["author"]]
     assert people == ["Ada Lovelace", "Guido van Rossum"]
     assert "https://orcid.org/0000-0002-1825-0097" in entities
-    [action] = [entities[mention["@id"]] for mention in root["mentions"]]
+    action = entities[root["mentions"]["@id"]]
     assert action["@type"] == "CreateAction"
     tools = [entities[tool["@id"]] for tool in action["instrument"]]
     assert {tool["@type"] for tool in tools} == {"SoftwareApplication"}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import urllib.parse
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ _PROFILE = "https://w3id.org/ro/wfrun/process/0.5"
 _SCHEMA = "http://schema.org"
 _NO_LICENSE = "No licence was stated: all rights stay with the authors."
 
-# The beginnings of names are those of the kinds of monitor files, longest first.
+# By the endings of names, the longer ones first.
 _FORMATS = (
     (".meta.json", "application/json"),
     (".json", "application/json"),
@@ -188,18 +188,21 @@ def _of_session(session: Session, recordings: Path) -> Iterator[Entity]:
         "@id": _action_id(session),
         "@type": "CreateAction",
         "name": f"Recording of {session.env_id} (monitor {session.infix})",
+        "description": f"{_count(session.episodes, 'complete episode')} of "
+        f"{_count(session.steps, 'step')} in all; episodes with a video were chosen by "
+        f"the rule {session.rule or '(not recorded)'}",
         "instrument": _references(entity["@id"] for entity in software),
         "object": _references(inputs),
         "result": _references(
             _id(name) for name in session.files if name not in session.models
         ),
-        "actionStatus": {"@id": f"{_SCHEMA}/CompletedActionStatus"},
+        "actionStatus": f"{_SCHEMA}/CompletedActionStatus",
     }
     for key, time in (("startTime", session.start), ("endTime", session.end)):
         if iso_time(time) is not None:
             action[key] = iso_time(time)
     if session.was_killed:
-        action["actionStatus"] = {"@id": f"{_SCHEMA}/FailedActionStatus"}
+        action["actionStatus"] = f"{_SCHEMA}/FailedActionStatus"
         action["error"] = "Its process was killed; what it had written was recovered."
     yield action
 
@@ -210,7 +213,7 @@ def _software(versions: Mapping[str, str]) -> Iterator[Entity]:
     for name in names or ["gym"]:
         version = versions.get(name, "unknown")
         software: Entity = {
-            "@id": f"#{urllib.parse.quote(f'{name}-{version}')}",
+            "@id": _release(name, version),
             "@type": "SoftwareApplication",
             "name": name,
             "softwareVersion": version,
@@ -218,6 +221,14 @@ def _software(versions: Mapping[str, str]) -> Iterator[Entity]:
         if name in _HOMES:
             software["url"] = _HOMES[name]
         yield software
+
+
+def _release(name: str, version: str) -> str:
+    """Return the URL of one version of Python or of a package."""
+    quoted = urllib.parse.quote(version, safe="")
+    if name == "python":
+        return f"https://docs.python.org/release/{quoted}/"
+    return f"https://pypi.org/project/{urllib.parse.quote(name, safe='')}/{quoted}/"
 
 
 def _policy(session: Session) -> Iterator[Entity]:
@@ -268,8 +279,10 @@ def _uuid(*texts: str) -> uuid.UUID:
     return uuid.uuid5(uuid.NAMESPACE_URL, "\0".join(["mjrec", *texts]))
 
 
-def _references(ids: Iterable[str]) -> Sequence[Entity]:
-    return [{"@id": one} for one in ids]
+def _references(ids: Iterable[str]) -> Entity | list[Entity]:
+    """Return what leads to entities; to one alone without a list, as JSON-LD has it."""
+    references = [{"@id": one} for one in ids]
+    return references[0] if len(references) == 1 else references
 
 
 def _count(number: int, noun: str) -> str:
