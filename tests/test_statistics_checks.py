@@ -10,15 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
-
-import mjrec
-from mjrec.evidence.verification import Check, Level, Verdict
-from mjrec.evidence.verifying.recorded_monitors import recorded_monitors
-from mjrec.evidence.verifying.statistics_checks import check_statistics, sum_of
-from mjrec.evidence.verifying.statistics_table import check_table
-from mjrec.evidence.verifying.task import Task
 from packed_runs import (
     edit_json,
     edit_trajectory,
@@ -26,6 +20,14 @@ from packed_runs import (
     set_reward,
     the,
 )
+
+import mjrec
+from mjrec.evidence.verification import Check, Level, Verdict
+from mjrec.evidence.verifying.recorded_monitors import recorded_monitors
+from mjrec.evidence.verifying.statistics_checks import check_statistics, sum_of
+from mjrec.evidence.verifying.statistics_table import check_table
+from mjrec.evidence.verifying.task import Task
+from mjrec.schedules import record_all
 
 
 @pytest.fixture(scope="module")
@@ -291,6 +293,39 @@ def test_videos_begun_at_steps_are_not_checkable(tmp_path: Path) -> None:
     record_pendulum(tmp_path, 3, step_trigger=lambda n: n == 3, video_length=2)
     assert failures(tmp_path) == []
     assert any("step_trigger" in reason for reason in unknown(tmp_path))
+
+
+def test_video_rendered_later_of_an_episode_nobody_chose_is_told(
+    recordings: Path,
+) -> None:
+    """It is honest, and somebody has picked it."""
+    for ending in ("mp4", "meta.json", "framehash"):
+        path = the(recordings, f"*.video000001.{ending}")
+        name = path.name.replace("000001", "000002.64x48")
+        shutil.copy(path, path.with_name(name))
+    assert any("of episodes 2, which no schedule" in why for why in unknown(recordings))
+
+
+def test_episode_that_was_begun_at_the_end_passes(tmp_path: Path) -> None:
+    """Its number was decided about, and there was no step of it."""
+    env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array", width=32)
+    with mjrec.Monitor(
+        env, tmp_path, video_callable=record_all, workers=1, allow_early_reset=True
+    ) as env:
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.reset()
+    assert failures(tmp_path) == []
+
+
+def test_recovered_recordings_pass(tmp_path: Path) -> None:
+    """What a killed process did not say is not checkable."""
+    record_pendulum(tmp_path, 2)
+    the(tmp_path, "*.manifest.json").unlink()
+    assert failures(tmp_path)
+    mjrec.recover(tmp_path)
+    assert failures(tmp_path) == []
+    assert any("was killed" in reason for reason in unknown(tmp_path))
 
 
 def test_episodes_that_were_taken_out_are_told(recordings: Path) -> None:

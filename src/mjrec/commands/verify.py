@@ -184,7 +184,7 @@ def _verdict(verification: Verification) -> str:
 
 
 def _fields(verification: Verification) -> dict[str, Any]:
-    """Return what `--json` prints; `docs/evidence.md` says what each field is."""
+    """Return what `--json` prints; `docs/verifying.md` says what each field is."""
     return {
         "path": str(verification.path),
         "level": verification.level.value,

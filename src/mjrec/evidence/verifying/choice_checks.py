@@ -47,6 +47,8 @@ _RULE = re.compile(r"(best|worst|failures):\d{1,18}|failures|median", re.ASCII)
 _MOST_ASKED = 10_000_000
 _MOST_NUMBERS = 20
 
+_LEFT_OUT = "they were left out when it was packed (--episodes)"
+
 
 def check_choice(monitor: RecordedMonitor) -> Iterator[Check]:
     """Yield what is found about which episodes of a monitor have a video."""
@@ -88,7 +90,6 @@ def _check_rule(monitor: RecordedMonitor, name: str, recorded: Sequence[int]) ->
         return _check(
             recording, Verdict.FAIL, "its manifest does not say which episodes it began"
         )
-    # A number whose reset never came may not have been asked about.
     expected = [number for number in asked if schedule(number)]
     if list(recorded) == expected:
         return _check(
@@ -99,6 +100,12 @@ def _check_rule(monitor: RecordedMonitor, name: str, recorded: Sequence[int]) ->
             schedule=name,
             episodes=len(asked),
             chosen=len(expected),
+        )
+    if monitor.details.get("recovered") is True and set(recorded) < set(expected):
+        return _unknown(
+            recording,
+            f"{name} chooses {_listed(expected)}, and what its killed process left "
+            f"speaks of {_listed(recorded)}",
         )
     return _check(
         recording,
@@ -238,24 +245,35 @@ def _check_videos(
     wanted = set(recorded or ())
     by_episode = {video.episode_id: video for video in monitor.videos if video.is_main}
     left_out = _left_out(monitor, wanted)
+    # Episodes by the reason why they have none.
+    lacking: dict[str, list[int]] = {}
     for number in sorted(wanted):
         subject = f"episode {number} of {monitor.infix}"
         if number in left_out:
-            found.cannot_tell(
-                f"videos of recording {monitor.infix} were left out when it was packed "
-                f"(--episodes): {_listed(sorted(left_out))}"
-            )
+            lacking.setdefault(_LEFT_OUT, []).append(number)
         elif number in by_episode or _is_inside_clip(monitor.videos, number):
             found.look(subject)
         elif reason := _reason_for_none(monitor, number):
-            found.cannot_tell(f"there is no video of {subject}: {reason}")
+            lacking.setdefault(reason, []).append(number)
         else:
             found.look(
                 subject, "it was to have a video, and there is none, nor a reason"
             )
+    for reason, numbers in lacking.items():
+        found.cannot_tell(f"there is no video of episodes {_listed(numbers)}: {reason}")
     for number, video in sorted(by_episode.items()):
         if recorded is not None and number not in wanted:
             found.look(video.name, "no schedule chose its episode")
+    later = {
+        video.episode_id
+        for video in monitor.videos
+        if not video.is_main and not video.is_clip and video.is_there
+    }
+    if later - wanted:
+        found.cannot_tell(
+            f"of episodes {_listed(sorted(later - wanted))}, which no schedule chose, "
+            "there are videos that were rendered later, of somebody's choice"
+        )
     by_steps = sum(not video.is_main and video.is_clip for video in monitor.videos)
     if by_steps:
         found.cannot_tell(

@@ -37,7 +37,8 @@ _TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 
 _GIB = 1 << 30
 # Of each process that takes part. What is mapped and never touched counts for the
-# address space only, and OpenGL's drivers map a lot. See `docs/decisions.md`.
+# address space only, and OpenGL's drivers map a lot. Drawing 1280x720 pictures with
+# llvmpipe takes 0.35 GiB of the one and 0.9 GiB of the other (measured).
 LIMITS: Final[Mapping[str, int]] = {
     "RLIMIT_DATA": 8 * _GIB,
     "RLIMIT_AS": 128 * _GIB,
