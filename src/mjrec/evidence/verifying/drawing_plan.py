@@ -59,6 +59,8 @@ class DrawingPlan:
         cameras: all of them, where they are in one picture.
         captions: what is written on them, by frame; None where nothing is.
         mujoco: the version that recorded it, or None.
+        machine: the fingerprint of the machine that recorded it; None where nobody
+            says.
     """
 
     trajectory: Path
@@ -67,6 +69,7 @@ class DrawingPlan:
     cameras: Sequence[PlainCamera | None] | None
     captions: Sequence[Caption] | None
     mujoco: str | None
+    machine: Mapping[str, Any] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +110,7 @@ def plan_drawing(video: ShippedVideo) -> DrawingPlan:
         cameras=seen.cameras,
         captions=captions,
         mujoco=_mujoco(facts),
+        machine=_machine(facts),
     )
 
 
@@ -271,6 +275,11 @@ def _mujoco(facts: Mapping[str, Any]) -> str | None:
     versions = facts.get("versions")
     version = versions.get("mujoco") if isinstance(versions, Mapping) else None
     return version if isinstance(version, str) else None
+
+
+def _machine(facts: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    machine = facts.get("machine")
+    return machine if isinstance(machine, Mapping) else None
 
 
 def _brief(runs: Sequence[Sequence[int]]) -> str:

@@ -64,6 +64,7 @@ class ShippedVideo:
         ffmpeg_sha256: of the binary that encoded it; None where nobody knows.
         encoder_arguments: what that was told, after the program's name.
         gl: who drew it: vendor, renderer and version; None for what nobody says.
+        machine: the fingerprint of the machine that drew it; None where nobody says.
         is_smaller: whether it was made smaller when it was packed.
     """
 
@@ -84,6 +85,7 @@ class ShippedVideo:
     ffmpeg_sha256: str | None
     encoder_arguments: Sequence[str]
     gl: tuple[str | None, ...]
+    machine: Mapping[str, Any] | None
     is_smaller: bool
 
     @property
@@ -130,6 +132,7 @@ def read_shipped_video(path: Path) -> ShippedVideo:
             ffmpeg_sha256=field(said, "ffmpeg_sha256", optional(_sha256), default=None),
             encoder_arguments=field(encoder, "cmdline", list_of(text))[1:],
             gl=tuple(field(said, k, optional(text), default=None) for k in GL_STRINGS),
+            machine=field(said, "machine", optional(mapping), default=None),
             is_smaller="packed_smaller" in said,
         )
 
