@@ -14,12 +14,11 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 
 from ...errors import UnreadableFile
+from ...formats.hdf5_contents import contents_of_hdf5
 from ...formats.trajectory_hdf5 import SIGNATURE
 from .identity import Identity
 from .identity_matching import IdentityMatcher
@@ -31,7 +30,6 @@ _ZIP = b"PK\3\4"
 _FILM = re.compile(rb"....ftyp|RIFF....AVI ", re.DOTALL)
 # An archive in an archive in an archive ...
 _DEEPEST = 8
-_ROWS_AT_ONCE = 1 << 14
 _PIECE = 1 << 24
 _LONGEST_NAME = 1 << 12
 
@@ -133,39 +131,9 @@ def _places_in_zip(where: str, content: bytes, depth: int) -> Iterator[_Place]:
 
 
 def _places_in_hdf5(where: str, content: bytes) -> Iterator[_Place]:
-    found: list[tuple[str, Any]] = []
-    with h5py.File(io.BytesIO(content), "r") as file:
-        file.visititems(lambda name, item: found.append((name, item)))
-        for name, item in [("", file), *found]:
-            inside = f"{where}: /{name}"
-            yield inside, name, False
-            for key in item.attrs:
-                yield inside, key, False
-                yield from _places_in_array(f"{inside}@{key}", item.attrs[key])
-            if isinstance(item, h5py.Dataset):
-                yield from _places_in_dataset(inside, item)
-
-
-def _places_in_dataset(where: str, dataset: Any) -> Iterator[_Place]:
-    for field in dataset.dtype.names or ():
-        yield where, field, False
-    if dataset.shape in (None, ()):
-        yield from _places_in_array(
-            where, None if dataset.shape is None else dataset[()]
-        )
-        return
-    for start in range(0, dataset.shape[0], _ROWS_AT_ONCE):
-        rows = dataset[start : start + _ROWS_AT_ONCE]
-        yield from _places_in_array(where, rows)
-
-
-def _places_in_array(where: str, value: Any) -> Iterator[_Place]:
-    array = np.asarray(value)
-    if array.dtype.kind in "OUS":
-        for item in array.reshape(-1).tolist():
-            text = (
-                item if isinstance(item, bytes) else str(item).encode(errors="replace")
-            )
-            yield where, text, False
-    else:
-        yield where, np.ascontiguousarray(array).tobytes(), True
+    for place, something in contents_of_hdf5(content):
+        inside = f"{where}: {place}"
+        if isinstance(something, str | bytes):
+            yield inside, something, False
+        else:
+            yield inside, np.ascontiguousarray(something).tobytes(), True
