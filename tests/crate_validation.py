@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Validates an RO-Crate with roc-validator, without a network.
+
+Run by a Python of its own, which has `roc-validator` and `rocrate`. The one thing that
+the validator fetches is the JSON-LD context of RO-Crate; `rocrate` ships that of a
+later version, which has all the terms of 1.1.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib import resources
+from typing import Any
+
+
+def main(folder: str) -> int:
+    """Print what is wrong with the crate in a folder, and return how much it is."""
+    context = json.loads(
+        resources.files("rocrate").joinpath("data/ro-crate.jsonld").read_text()
+    )
+
+    class Fetched:
+        status_code = 200
+        text = json.dumps(context)
+        content = text.encode()
+        headers = {"Content-Type": "application/ld+json"}  # noqa: RUF012  as requests
+
+        def json(self) -> Any:
+            return context
+
+        def raise_for_status(self) -> None: ...
+
+    from rocrate_validator.utils.http import HttpRequester
+
+    for method in ("get", "head"):
+        setattr(HttpRequester, method, lambda *_, **__: Fetched())
+
+    from rocrate_validator.models import Severity
+    from rocrate_validator.services import ValidationSettings, validate
+
+    result = validate(
+        ValidationSettings(
+            rocrate_uri=folder,
+            profile_identifier="process-run-crate",
+            requirement_severity=Severity.REQUIRED,
+        )
+    )
+    issues = result.get_issues()
+    for issue in issues:
+        sys.stdout.write(f"{issue.check.identifier}: {issue.message}\n")
+    return len(issues)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))
