@@ -11,10 +11,6 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
-from mujoco import rollout
-
-import mjrec
 from forged_episodes import (
     episode,
     fact,
@@ -24,12 +20,17 @@ from forged_episodes import (
     record_gymnasium,
     verdicts,
 )
+from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
+from mujoco import rollout
+
+import mjrec
 from mjrec.environments.made_again import make_again, recorded_environment
 from mjrec.evidence.verification import Verdict
 from mjrec.evidence.verifying.environment_replay import action_kinds
 from mjrec.evidence.verifying.step_checks import follow_steps
 from mjrec.formats.trajectory import Array
 from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.simulation.state_steps import StateSteps
 
 TELEPORTING, NAMED, OBLIVIOUS = "Teleporting-v0", "Named-v0", "Oblivious-v0"
 
@@ -228,3 +229,26 @@ def test_steps_made_again_one_by_one_are_those_of_a_rollout(tmp_path: Path) -> N
     ends = np.hstack([columns[name][1:] for name in ("time", "qpos", "qvel")])
     assert followed.differences.first is None
     assert found[:, -1].tobytes() == ends.tobytes()
+
+
+def test_errors_do_not_add_up_on_another_machine(tmp_path: Path) -> None:
+    """What differs more and more when it runs freely is compared step by step."""
+    env = gymnasium.make("HalfCheetah-v5")
+    directory = record_gymnasium(tmp_path / "run", env, episodes=1, steps=40)
+    with open_trajectory(episode(directory)) as reader:
+        made = make_again(recorded_environment(reader.header.facts))
+        steps = StateSteps(made.simulation()[0], reader.header.state)
+        rows = reader.states(0, reader.row_count)
+    made.close()
+    other = rows.copy()
+    # As from a computer whose sines are others, once.
+    other[2, 1:19] += 1e-10
+    for number in range(3, len(rows)):
+        pair = np.stack([other[number - 1], rows[number]])
+        other[number] = steps.follow(pair, [5])[0]
+    assert np.abs(other - rows)[:, 1:19].max() > 1e-8
+    forge(episode(directory), states=other, facts={"machine": {}})
+    checks = physics_of(directory)
+    assert {"steps", "states"}.isdisjoint(failed(checks))
+    states = next(c for c in checks if c.claim.startswith("the recorded actions"))
+    assert "from step 2 on each step begins at the recorded state" in states.reason

@@ -122,7 +122,6 @@ class LiveStates:
         self._model = model
         self._data = data
         self._columns = _columns(model, components)
-        self._inputs = _input_columns(model)
         self._is_settled = is_settled
         self._own = np.empty(len(self._columns))
 
@@ -131,27 +130,12 @@ class LiveStates:
         mujoco.mj_getState(self._model, self._data, self._own, STATE_SPEC)
         out[self._columns] = self._own
 
-    def bring_to(
-        self,
-        row: NDArray[np.float64],
-        before: NDArray[np.float64] | None = None,
-        substeps: int = 0,
-    ) -> None:
-        """Make the simulation what it was at a recorded state.
+    def bring_to(self, row: NDArray[np.float64]) -> None:
+        """Put the simulation into a recorded state, near which it is already.
 
-        What is computed on the way to a state, and stays behind when it is reached, is
-        there as the environment's own step left it.
-
-        Args:
-            row: the state.
-            before: the recorded state before it; None for the first of an episode.
-            substeps: the physics steps between the two.
+        What the environment's last step left behind besides the state stays: bodies
+        where they were one substep before.
         """
-        if before is not None:
-            start = before[self._columns]
-            start[self._inputs] = row[self._columns][self._inputs]
-            mujoco.mj_setState(self._model, self._data, start, STATE_SPEC)
-            mujoco.mj_step(self._model, self._data, nstep=substeps)
         own = np.ascontiguousarray(row[self._columns])
         mujoco.mj_setState(self._model, self._data, own, STATE_SPEC)
         if self._is_settled:

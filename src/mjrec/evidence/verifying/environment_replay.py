@@ -4,8 +4,8 @@
 On the machine and MuJoCo of the recording the environment is reset and stepped and
 must be where the recording says, bit for bit. Elsewhere errors grow until nothing is
 alike, so from the first difference on the environment is put into each recorded state
-before it is stepped; what it computes on the way to that state is there too, because
-the step before is made again first.
+before it is stepped. What it computes on the way to that state is there too: it has
+just been on that way itself, but for one step's error.
 
 Floats are recorded as float64, whatever the policy gave. A reward that is computed
 from a float32 action may have other last bits; so where all recorded actions are
@@ -29,7 +29,7 @@ from ...simulation.compiled_models import differing_from
 from ...simulation.state_steps import LiveStates
 from .differences import Differences, compared_columns
 from .recorded_models import is_of_pictures
-from .step_checks import BLOCK_ROWS, substeps_between
+from .step_checks import BLOCK_ROWS
 
 __all__ = ["Replay", "action_kinds", "replay_episode"]
 
@@ -128,7 +128,6 @@ class _Run:
         state = reader.header.state
         self._model = model
         self._live = LiveStates(model, data, state, is_settled=environment.is_settled)
-        self._clock = next(part.offset for part in state if part.name == "time")
         names, self._compared = compared_columns(state, with_warm_start=is_exact)
         self._result = Replay(
             Differences(names), Differences(names), Differences(["the reward"])
@@ -177,15 +176,15 @@ class _Run:
         rows = reader.states(start, stop + 1)
         actions = reader.actions(start, stop)
         assert actions is not None
-        numbers = substeps_between(rows[:, self._clock], self._model.opt.timestep)
+        gaps: NDArray[np.bool_] = np.asarray(np.isnan(rows).any(axis=1))
         found = np.full_like(rows[1:], np.nan)
         rewards = np.zeros(stop - start)
         observations: list[NDArray[np.uint8]] = []
         made = 0
         for index, action in enumerate(self._given(actions)):
             number = start + index
-            if result.synchronised_from is not None and number > 0:
-                self._synchronise(rows, numbers, index, number)
+            if result.synchronised_from is not None and not gaps[index]:
+                self._live.bring_to(rows[index])
             try:
                 step = self._environment.step(action)
             # An environment's own code may raise anything at what a file holds.
@@ -220,27 +219,6 @@ class _Run:
         result.steps = start + made
         return not result.trouble and not result.ending
 
-    def _synchronise(
-        self,
-        rows: NDArray[np.float64],
-        numbers: NDArray[np.float64],
-        index: int,
-        number: int,
-    ) -> None:
-        """Put the environment into the recorded state before a step is made."""
-        if np.isnan(rows[index]).any():
-            return
-        if index > 0:
-            before, substeps = rows[index - 1], numbers[index - 1]
-        else:
-            before = self._reader.states(number - 1, number)[0]
-            pair = np.stack([before, rows[0]])[:, self._clock]
-            substeps = substeps_between(pair, self._model.opt.timestep)[0]
-        if np.isnan(before).any() or not 1 <= substeps <= 10_000:
-            self._live.bring_to(rows[index])
-        else:
-            self._live.bring_to(rows[index], before, int(substeps))
-
     def _desynchronise(
         self, number: int, row: NDArray[np.float64], found: NDArray[np.float64]
     ) -> None:
@@ -250,8 +228,6 @@ class _Run:
             return
         if row.tobytes() != found.tobytes() and not np.isnan(row).any():
             result.synchronised_from = number
-            if number == 0:
-                self._live.bring_to(row)
 
     def _given(self, actions: NDArray[Any]) -> Iterator[Any]:
         """Yield actions as the environment was given them."""

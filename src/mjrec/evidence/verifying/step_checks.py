@@ -27,7 +27,7 @@ from ...simulation.state_steps import StateSteps
 from .differences import Differences, compared_columns
 from .recorded_models import is_of_pictures
 
-__all__ = ["BLOCK_ROWS", "FollowedSteps", "follow_steps", "substeps_between"]
+__all__ = ["BLOCK_ROWS", "FollowedSteps", "follow_steps"]
 
 # Of a row in a hundred numbers this is a hundred kilobytes.
 BLOCK_ROWS: Final = 256
@@ -59,7 +59,7 @@ class FollowedSteps:
     trouble: str = ""
 
 
-def substeps_between(
+def _substeps_between(
     times: NDArray[np.float64], timestep: float
 ) -> NDArray[np.float64]:
     """Return how many physics steps lie between states, as whole floats or NaN."""
@@ -96,7 +96,7 @@ def follow_steps(
     for start in range(0, reader.row_count - 1, BLOCK_ROWS):
         stop = min(start + BLOCK_ROWS, reader.row_count - 1)
         rows = reader.states(start, stop + 1)
-        raw = substeps_between(rows[:, clock], steps.timestep)
+        raw = _substeps_between(rows[:, clock], steps.timestep)
         if not result.substeps:
             result.substeps = _usual(raw)
             if not 1 <= result.substeps <= _MOST_SUBSTEPS:
