@@ -75,8 +75,8 @@ def _check_counts(monitor: RecordedMonitor) -> Iterator[Check]:
     for name, reason in monitor.reasons.items():
         found.look(name, f"it cannot be read: {reason}")
     if monitor.manifest is None:
-        missing = "it has no manifest that can be read, so it was never closed"
-        found.look(monitor.infix, f"{missing}: mjrec recover")
+        missing = "it has no manifest: it is still recorded, or was killed"
+        found.look(monitor.infix, f"{missing} (mjrec recover)")
     if monitor.stats is not None:
         found.look(monitor.infix)
     yield from found.checks()
