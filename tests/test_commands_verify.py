@@ -6,10 +6,10 @@ import shutil
 from pathlib import Path
 
 import pytest
+from packed_runs import record_pendulum, the
 
 import mjrec
 from mjrec.commands import main
-from packed_runs import record_pendulum, the
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from packed_runs import edit_json, make_bag_fit, record_pendulum, the, unpacked, zipped
 
 import mjrec
 from mjrec.evidence.verification import Check, Level, Verdict
 from mjrec.evidence.verifying.bag_checks import check_bag
 from mjrec.evidence.verifying.file_checks import check_files
 from mjrec.evidence.verifying.task import Task
-from packed_runs import edit_json, make_bag_fit, record_pendulum, the, unpacked, zipped
 
 
 @pytest.fixture(scope="module")

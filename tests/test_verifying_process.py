@@ -15,13 +15,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from packed_runs import edit_trajectory, record_pendulum, the
 from processes import children
 
 import mjrec
 from mjrec.evidence.verification import Check, Level, Verdict
 from mjrec.evidence.verifying.level_process import LIMITS, checks_of
 from mjrec.evidence.verifying.task import Task
-from packed_runs import edit_trajectory, record_pendulum, the
 
 
 @pytest.fixture(scope="module")
