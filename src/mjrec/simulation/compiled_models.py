@@ -22,10 +22,14 @@ __all__ = [
     "changed_model",
     "changed_names",
     "differing_from",
+    "has_jumping_contacts",
     "keeps_paths",
     "model_digest",
     "model_from_sources",
+    "turns_by_rk4",
 ]
+
+_SMOOTH = ("PLANE", "SPHERE", "CAPSULE")
 
 
 def model_from_sources(directory: Path, name: str, size: Any) -> mujoco.MjModel:
@@ -55,6 +59,24 @@ def keeps_paths(model: mujoco.MjModel) -> bool:
     """Tell whether a model holds the places of files, on which its hash depends."""
     names = (name for name in array_names() if name.endswith("_pathadr"))
     return any((getattr(model, name) >= 0).any() for name in names)
+
+
+def has_jumping_contacts(model: mujoco.MjModel) -> bool:
+    """Tell whether anything can touch whose contacts do not move smoothly.
+
+    Those of spheres, capsules and planes do; others are found by iterating, or choose
+    among corners.
+    """
+    smooth = [int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in _SMOOTH]
+    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    return bool((~np.isin(model.geom_type, smooth) & touching).any())
+
+
+def turns_by_rk4(model: mujoco.MjModel) -> bool:
+    """Tell whether quaternions are integrated by the method of Runge and Kutta."""
+    kinds = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+    by_rk4 = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    return bool(by_rk4 and np.isin(model.jnt_type, [int(k) for k in kinds]).any())
 
 
 def changed_model(

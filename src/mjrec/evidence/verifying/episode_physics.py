@@ -28,6 +28,7 @@ from ..verification import Check, Level, Verdict
 from .differences import Differences, judged
 from .environment_replay import Replay, action_kinds, replay_episode
 from .recorded_models import (
+    ModelComparison,
     RecordedModels,
     compare_models,
     first_changes,
@@ -99,6 +100,9 @@ class EpisodePhysics:
         )
         # Before the environment is stepped, which may change its model.
         of_model, model = self._model(present)
+        if model is not None:
+            self._fit = self._fit.of_model(model)
+            self._derived = self._derived.of_model(model)
         replay: Replay | str = refusal
         if environment is not None and not refusal:
             replay = self._replayed(environment, observation)
@@ -174,41 +178,50 @@ class EpisodePhysics:
 
     def _of_registry_alone(self, present: Any, missing: str) -> Check:
         """Compare where the archive has nothing but a compiled model."""
+        differing = set(differing_from(present, self._changes))
+        if not self._fit.is_exact:
+            differing -= set(self._nearly_as_recorded(present))
+        if differing:
+            reason = f"{_listed(differing)}: recorded otherwise than the reset sets it"
+            return self._check(_MODEL, Verdict.FAIL, reason)
+        comparison = self._with_stored(present)
+        if comparison is not None and comparison.is_same:
+            return self._check(_MODEL, Verdict.PASS, "bit for bit")
         if not (self._is_of_this_mujoco() and self._fit.is_exact):
             reason = (
                 f"{missing}, and the hash of the compiled model says nothing here: "
                 f"{self._fit.why or 'it is of another MuJoCo'}"
             )
             return self._check(_MODEL, Verdict.NOT_CHECKABLE, reason)
-        sha256 = self._sha256()
-        if not self._changes:
-            if model_digest(present) == sha256:
-                self._models.note(sha256, present)
-                return self._check(_MODEL, Verdict.PASS, "bit for bit")
+        if comparison is not None:
             reason = (
-                "the recorded sha256 is not that of the model that the installed "
-                "environment has at the beginning of this episode"
+                "the recorded model is another one than the installed environment has "
+                f"at the beginning of this episode: {comparison}"
             )
-            return self._check(_MODEL, Verdict.FAIL, reason)
-        stored = self._models.known(sha256)
-        if stored is not None:
-            comparison = compare_models(stored, self._changes, present)
-            if comparison.is_same:
-                return self._check(_MODEL, Verdict.PASS, "bit for bit")
-            reason = (
-                "with the recorded changes it is another one than the installed "
-                f"environment has at the beginning of this episode: {comparison}"
-            )
-            return self._check(_MODEL, Verdict.FAIL, reason)
-        differing = differing_from(present, self._changes)
-        if differing:
-            reason = f"{_listed(differing)}: recorded otherwise than the reset sets it"
             return self._check(_MODEL, Verdict.FAIL, reason)
         reason = (
             f"{missing}, and the episode in which the model was first seen is not "
             f"here; what the reset changes ({_listed(self._changes)}) is as recorded"
         )
         return self._check(_MODEL, Verdict.NOT_CHECKABLE, reason)
+
+    def _with_stored(self, present: Any) -> ModelComparison | None:
+        """Compare with the model that the recorded hash is of; None if it is not known.
+
+        An episode that changes nothing in it has it.
+        """
+        sha256 = self._sha256()
+        if not self._is_of_this_mujoco():
+            return None
+        if not self._changes:
+            if model_digest(present) != sha256:
+                return ModelComparison(trouble="its sha256 is another")
+            self._models.note(sha256, present)
+            return ModelComparison()
+        stored = self._models.known(sha256)
+        if stored is None:
+            return None
+        return compare_models(stored, self._changes, present)
 
     def _of_sources(self, sources: Any) -> Check:
         changed = [name for name in self._changes if not is_of_pictures(name)]
