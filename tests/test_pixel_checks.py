@@ -255,7 +255,8 @@ def test_the_same_software_on_another_cpu_may_differ_by_roundings(alone: Path) -
     say(video(alone), machine={"architecture": "x86_64", "cpu_flags": "0" * 64})
     assert verdicts(alone) == [PASS, OPEN, OPEN, PASS]
     painted = [frame.copy() for frame in changed]
-    painted[4][8:11, 8:11] = (255, 0, 0)
+    # Fainter than what another driver might differ.
+    painted[4][8:16, 8:16] = np.minimum(painted[4][8:16, 8:16], 215) + np.uint8(40)
     forge(video(alone), painted)
     assert verdicts(alone) == [PASS, OPEN, OPEN, FAIL]
 
@@ -442,8 +443,9 @@ def _empty(path: Path) -> None:
 
 
 def _link(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("/dev/zero")
+    outside = path.parent.parent / "outside.mp4"
+    path.rename(outside)
+    path.symlink_to(outside)
 
 
 @pytest.mark.parametrize("damage", [_cut, _garbage, _list_of_files, _empty, _link])
