@@ -56,6 +56,15 @@ def write(path: Path, *entries: JournalEntry) -> None:
     writer.close()
 
 
+def test_success_is_written_and_older_lines_say_nothing_of_it(path: Path) -> None:
+    """What the environment did not say is told apart from what nobody wrote down."""
+    write(path, dataclasses.replace(ENTRY, success=None))
+    write(path, dataclasses.replace(NEXT, success=True))
+    write(path, dataclasses.replace(NEXT, episode_id=5))
+    assert [e.success for e in read_journal(path)] == [None, True, journal.UNKNOWN]
+    assert b"success" not in path.read_bytes().splitlines()[2]
+
+
 def test_entries_come_back_as_they_were(path: Path) -> None:
     """What is read is what was written, in order."""
     write(path, ENTRY, NEXT)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import random
 import re
@@ -39,6 +40,7 @@ from mjrec.formats.trajectory_file import (
     open_trajectory,
 )
 from mjrec.formats.trajectory_log import TrajectoryLogWriter
+from mjrec.formats.trajectory_reader import added_up
 
 HEADER = TrajectoryHeader(
     facts={
@@ -563,3 +565,10 @@ def test_random_damage_is_noticed(log: Path) -> None:
             continue
         # Single numbers among the model's fields are stored as they are.
         assert_same(dataclasses.replace(again, model_changes=()), content)
+
+
+def test_rewards_are_added_up_one_after_the_other() -> None:
+    """As a monitor does at each step, on every version of Python."""
+    assert added_up([1e16, 1.0, -1e16]) == 0.0
+    assert math.copysign(1, added_up([-0.0])) == 1
+    assert added_up([]) == 0.0

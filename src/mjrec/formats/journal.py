@@ -6,7 +6,8 @@ process loses none of the episodes that it completed. A line::
 
     {"episode_id": 27, "length": 200, "reward": 12.5, "type": "t",
      "start_time": 1790000000.0, "end_time": 1790000004.0,
-     "seed": 7, "options": null, "terminated": false, "truncated": true}
+     "seed": 7, "options": null, "terminated": false, "truncated": true,
+     "success": null}
 
 The first line says besides what is recorded, as a manifest does::
 
@@ -48,6 +49,7 @@ from .regular_files import open_regular
 
 __all__ = [
     "MOST_EPISODES",
+    "UNKNOWN",
     "JournalEntry",
     "JournalReader",
     "JournalWriter",
@@ -64,6 +66,8 @@ _LONGEST_LINE = 1 << 24
 _MOST_DAMAGED_LINES = 1000
 _MOST_DAMAGED_BYTES = 1 << 26
 MOST_EPISODES = 10**15
+
+UNKNOWN = "unknown"
 
 # The seed and the options are for people to read; more of them is cut off.
 _LONGEST_REPR = 1000
@@ -86,6 +90,8 @@ class JournalEntry:
         options: as given to `reset`.
         terminated: the task ended the episode.
         truncated: a limit from outside the task ended it.
+        success: what the environment said of it; None where it said nothing, `UNKNOWN`
+            in journals of before it was written down.
     """
 
     episode_id: int
@@ -98,6 +104,7 @@ class JournalEntry:
     options: Any
     terminated: bool
     truncated: bool
+    success: bool | str | None = UNKNOWN
 
 
 class JournalWriter:
@@ -141,6 +148,8 @@ class JournalWriter:
             self._size = os.fstat(self._file.fileno()).st_size
         # Not `asdict`, which would copy the options deeply; they may not allow it.
         values = {f.name: getattr(entry, f.name) for f in dataclasses.fields(entry)}
+        if entry.success == UNKNOWN:
+            del values["success"]
         if self._env_info is not None:
             values["env_info"] = dict(self._env_info)
         self._write(self._file, _line(values))
@@ -362,7 +371,14 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
         options=values.get("options"),
         terminated=field(values, "terminated", boolean),
         truncated=field(values, "truncated", boolean),
+        success=_success(values),
     )
+
+
+def _success(values: Mapping[str, Any]) -> bool | None | str:
+    if "success" not in values:
+        return UNKNOWN
+    return field(values, "success", optional(boolean))
 
 
 def _count(value: Any) -> int:

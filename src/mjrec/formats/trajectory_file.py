@@ -15,7 +15,7 @@ from .monitor_directory import Infix, trajectory_prefix
 from .regular_files import open_regular
 from .trajectory_hdf5 import SIGNATURE, TrajectoryHdf5Reader, write_hdf5
 from .trajectory_log_reader import TrajectoryLogReader
-from .trajectory_reader import TrajectoryReader
+from .trajectory_reader import TrajectoryReader, added_up
 
 __all__ = [
     "TrajectoryReader",
@@ -119,8 +119,7 @@ def _how_it_ended(
         "complete": False,
         "reason": "killed",
         "length": reader.step_count,
-        # One after the other, as the monitor adds them up.
-        "reward": float(sum(reader.rewards.tolist())),
+        "reward": added_up(reader.rewards),
     }
     video = facts.get("video")
     is_deferred = isinstance(video, dict) and video.get("recording") == "deferred"

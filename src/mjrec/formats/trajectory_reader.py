@@ -11,12 +11,23 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InvalidArgument
 from .trajectory import ModelChange, TrajectoryContent, TrajectoryHeader
 
-__all__ = ["TrajectoryReader"]
+__all__ = ["TrajectoryReader", "added_up"]
+
+
+def added_up(rewards: ArrayLike) -> float:
+    """Return the sum of rewards, one added after the other, as a monitor does.
+
+    `sum` makes up for roundings from Python 3.12 on, and NumPy's adds in pairs.
+    """
+    values = np.asarray(rewards, np.float64)
+    # Zero comes first: it makes the sum of negative zeros a positive one.
+    with np.errstate(all="ignore"):
+        return 0.0 + float(np.add.accumulate(values)[-1]) if len(values) else 0.0
 
 
 class TrajectoryReader(abc.ABC):

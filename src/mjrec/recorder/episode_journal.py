@@ -50,6 +50,7 @@ class EpisodeJournal:
             options=episode.options,
             terminated=episode.terminated,
             truncated=episode.truncated,
+            success=episode.success,
         )
         try:
             self._writer.append(entry)

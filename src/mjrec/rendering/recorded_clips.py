@@ -25,6 +25,7 @@ from ..formats.monitor_directory import (
     iter_monitor_files,
     lock_name,
 )
+from ..formats.trajectory_reader import added_up
 from ..formats.video_metadata import is_done
 from .recorded_facts import model_file, open_for_rendering
 from .recorded_pictures import ChosenFrames, chosen_frames, recorded_rate
@@ -201,8 +202,7 @@ def read_clip(parts: Sequence[Path]) -> RecordedClip:
         facts=tuple(facts),
         frame_counts=tuple(frame_counts),
         step_count=len(rewards),
-        # One after the other, as the monitor adds them up.
-        reward=float(sum(rewards)),
+        reward=added_up(rewards),
     )
 
 

@@ -30,7 +30,7 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.second_names import give_second_names, take_second_names
-from ..formats.trajectory_reader import TrajectoryReader
+from ..formats.trajectory_reader import TrajectoryReader, added_up
 from ..formats.video_metadata import (
     StepRuns,
     file_facts,
@@ -502,7 +502,7 @@ def _remove(file: VideoFile) -> None:
 def _told(reader: TrajectoryReader) -> dict[str, Any]:
     """Return what the metadata says of the episode."""
     facts = reader.header.facts
-    so_far = {"length": reader.step_count, "reward": float(reader.rewards.sum())}
+    so_far = {"length": reader.step_count, "reward": added_up(reader.rewards)}
     over = {key: facts.get(key) for key in ("terminated", "truncated")}
     return {
         **known_facts(facts),

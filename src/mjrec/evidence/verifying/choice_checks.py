@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ...errors import InvalidArgument, UnreadableFile
-from ...formats.journal import JournalEntry
+from ...formats.journal import UNKNOWN, JournalEntry
 from ...formats.monitor_directory import Infix, video_prefix
 from ...formats.trajectory_file import open_trajectory
 from ...recorder.selection import Selection, selection_from
@@ -196,13 +196,11 @@ def _finished(entry: JournalEntry) -> FinishedEpisode:
 
 
 def _success(entry: JournalEntry) -> bool | None:
-    # Journals of before it was written down have none.
-    said = getattr(entry, "success", None)
-    return said if isinstance(said, bool) else None
+    return entry.success if isinstance(entry.success, bool) else None
 
 
 def _says_success(entries: Iterable[JournalEntry]) -> bool:
-    return all(_success(entry) is not None for entry in entries)
+    return all(entry.success != UNKNOWN for entry in entries)
 
 
 def _schedule(name: str) -> Schedule | None:
