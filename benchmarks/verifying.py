@@ -109,25 +109,36 @@ def step_bare(episodes: int, steps: int) -> dict[str, float]:
     return {"seconds": seconds, "busy": busy, "peak": _peak_memory()}
 
 
-def check_steps(directory: str) -> dict[str, float]:
-    """Return the seconds that it takes to make each state from the one before."""
+def check_steps(directory: str, warm_up: str) -> dict[str, float]:
+    """Return the seconds that it takes to make each state from the one before.
+
+    Args:
+        directory: of the recordings.
+        warm_up: of few of them, which are verified before.
+    """
+    _check_steps(warm_up)
+    return _timed(lambda: _check_steps(directory))
+
+
+def _check_steps(directory: str) -> list[Check]:
     models = RecordedModels(Path(directory))
-
-    def checks() -> list[Check]:
-        found: list[Check] = []
-        for path in sorted(Path(directory).glob("*.h5")):
-            with open_trajectory(path) as reader:
-                physics = EpisodePhysics(reader, path.name, models)
-                found += physics.checks(_not_made)
-        return found
-
-    return _timed(checks)
+    found: list[Check] = []
+    for path in sorted(Path(directory).glob("*.h5")):
+        with open_trajectory(path) as reader:
+            physics = EpisodePhysics(reader, path.name, models)
+            found += physics.checks(_not_made)
+    return found
 
 
-def check_all(directory: str) -> dict[str, float]:
-    """Return the seconds that it takes with the environment as well."""
+def check_all(directory: str, warm_up: str) -> dict[str, float]:
+    """Return the same with the environment as well."""
+    _check_all(warm_up)
+    return _timed(lambda: _check_all(directory))
+
+
+def _check_all(directory: str) -> list[Check]:
     task = Task(recordings=Path(directory), level=Level.PHYSICS)
-    return _timed(lambda: list(check_physics(task, lambda done, total: None)))
+    return list(check_physics(task, lambda done, total: None))
 
 
 def _not_made(facts: Mapping[str, Any]) -> Any:
@@ -168,7 +179,7 @@ def _variants(
     for name, function in ((_STEPS, check_steps), (_ALL, check_all)):
         for count, directory in ((many, all_of_them), (settings.few, few)):
             variants[name, count] = functools.partial(
-                call, function, directory=str(directory)
+                call, function, directory=str(directory), warm_up=str(few)
             )
     return variants
 
