@@ -922,6 +922,7 @@ class Recorder:
             "options": self._episode_start.get("options"),
             "recording": LIVE,
             "versions": dict(versions()),
+            "machine": dict(machine_fingerprint()),
             **({} if self._kept is None else {"selection": self._kept.facts()}),
         }
 

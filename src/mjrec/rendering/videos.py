@@ -21,6 +21,7 @@ from ..annotation import Caption, annotated, check_annotation, pillow_version
 from ..atomic_files import write_text
 from ..blank_frames import BlankFrames
 from ..errors import EncoderError, NoPictures, UnreadableFile
+from ..fingerprint import machine_fingerprint
 from ..formats.monitor_directory import (
     ClipPart,
     Infix,
@@ -521,6 +522,8 @@ def known_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
         **{key: facts.get(key) for key in keys},
         "recording": "deferred",
         "rendered_with": dict(versions()),
+        # Software rasterisers round as their CPU does.
+        "machine": dict(machine_fingerprint()),
     }
 
 
