@@ -375,7 +375,7 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
     )
 
 
-def _success(values: Mapping[str, Any]) -> bool | None | str:
+def _success(values: Mapping[str, Any]) -> bool | str | None:
     if "success" not in values:
         return UNKNOWN
     return field(values, "success", optional(boolean))
