@@ -154,7 +154,8 @@ def swap_model(directory: Path, number: int, old: str, new: str) -> None:
     digest = hashlib.sha256(compiled.data).hexdigest()
     name = f"openaigym.model.{digest[:16]}.zip"
     (directory / name).write_bytes(packed.getvalue())
-    model_facts = {**stored, "sha256": digest, "bytes": len(compiled), "xml": name}
+    size = {"sha256": digest, "bytes": len(compiled)}
+    model_facts = {**stored, **size, "xml": name, "mjb": None}
     forge(path, facts={"model": model_facts})
 
 

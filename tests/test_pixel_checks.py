@@ -7,7 +7,6 @@ anybody could make fit is made to fit.
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -17,13 +16,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from forged_videos import drawn, forge, metadata, say, video
 
 import mjrec
 from conftest import Corridor, run_episodes
 from mjrec.evidence.verification import Check, Verdict
 from mjrec.evidence.verifying.pixel_checks import check_pixels
 from mjrec.evidence.verifying.task import Task
-from mjrec.formats.video_writer import VideoWriter
 
 STEPS = 6
 DECODES, DRAWN, ENCODED, ALIKE = range(4)
@@ -91,48 +90,6 @@ def verdicts(directory: Path, episode: int = 0, **options: Any) -> list[Verdict]
     """Return what became of each claim about an episode's video."""
     checks = found(directory, **options)
     return [check.verdict for (number, _), check in checks.items() if number == episode]
-
-
-def video(directory: Path, episode: int = 0) -> Path:
-    [path] = directory.glob(f"*.video{episode:06d}.mp4")
-    return path
-
-
-def metadata(path: Path) -> dict[str, Any]:
-    said: dict[str, Any] = json.loads(path.with_suffix(".meta.json").read_text())
-    return said
-
-
-def say(path: Path, **changes: Any) -> None:
-    """Change what the metadata of a video says."""
-    said = {**metadata(path), **changes}
-    path.with_suffix(".meta.json").write_text(json.dumps(said))
-
-
-def drawn(directory: Path, episode: int = 0) -> list[Any]:
-    [path] = directory.glob(f"*.episode{episode:06d}.h5")
-    return list(mjrec.render(path))
-
-
-def forge(path: Path, frames: list[Any], *, hashes: bool = True, **kw: Any) -> None:
-    """Put other frames into a video, and make all fit that anybody can."""
-    said, kept = metadata(path), path.with_suffix(".framehash").read_bytes()
-    options = {"fps": int(said["fps"]), "frame_hashes": True, **kw}
-    with VideoWriter(path, **options) as writer:
-        for frame in frames:
-            writer.write(frame)
-    if not hashes:
-        path.with_suffix(".framehash").write_bytes(kept)
-    assert writer.result is not None
-    last = len(frames) - 1
-    say(
-        path,
-        file_sha256=writer.result.file_sha256,
-        decoded_sha256=writer.result.decoded_sha256,
-        frame_count=len(frames),
-        frame_steps=[[0, last]],
-        length=last,
-    )
 
 
 def test_an_honest_run_passes(honest: Path) -> None:
