@@ -15,7 +15,7 @@ import importlib.util
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
@@ -102,19 +102,13 @@ class EpisodeStart:
     options: Any
 
 
-@dataclass(frozen=True, kw_only=True)
-class StepAgain:
+class StepAgain(NamedTuple):
     """What a step gave."""
 
     observation: Any
     reward: float
     terminated: bool
     truncated: bool
-
-    @property
-    def is_last(self) -> bool:
-        """Whether the episode is over."""
-        return self.terminated or self.truncated
 
 
 class EnvironmentAgain(Protocol):
@@ -336,12 +330,7 @@ class _GymnasiumAgain:
 
     def step(self, action: Any) -> StepAgain:
         observation, reward, terminated, truncated, _ = self._env.step(action)
-        return StepAgain(
-            observation=observation,
-            reward=float(reward),
-            terminated=bool(terminated),
-            truncated=bool(truncated),
-        )
+        return StepAgain(observation, float(reward), bool(terminated), bool(truncated))
 
     def close(self) -> None:
         self._env.close()

@@ -19,6 +19,7 @@ from .model_fields import apply_fields, array_names, read_fields, struct_names
 from .model_store import load_model
 
 __all__ = [
+    "are_same_models",
     "changed_model",
     "changed_names",
     "differing_from",
@@ -47,12 +48,21 @@ def model_from_sources(directory: Path, name: str, size: Any) -> mujoco.MjModel:
     return load_model(directory, {"xml": name, "bytes": size})
 
 
+def are_same_models(model: mujoco.MjModel, other: mujoco.MjModel) -> bool:
+    """Tell, in a fraction of the time of a hash, whether two models are the same."""
+    return _saved(model).tobytes() == _saved(other).tobytes()
+
+
 def model_digest(model: mujoco.MjModel) -> str:
     """Return the sha256 of a model as `mj_saveModel` writes it, as recordings say."""
+    return hashlib.sha256(_saved(model).data).hexdigest()
+
+
+def _saved(model: mujoco.MjModel) -> NDArray[np.uint8]:
     whole = with_embedded_files(model)
     buffer = np.empty(mujoco.mj_sizeModel(whole), np.uint8)
     mujoco.mj_saveModel(whole, None, buffer)
-    return hashlib.sha256(buffer.data).hexdigest()
+    return buffer
 
 
 def keeps_paths(model: mujoco.MjModel) -> bool:

@@ -124,9 +124,14 @@ class LiveStates:
         self._columns = _columns(model, components)
         self._is_settled = is_settled
         self._own = np.empty(len(self._columns))
+        order = np.arange(len(self._columns))
+        self._is_own_order = np.array_equal(self._columns, order)
 
     def read(self, out: NDArray[np.float64]) -> None:
         """Write the state of this moment into a row."""
+        if self._is_own_order:
+            mujoco.mj_getState(self._model, self._data, out, STATE_SPEC)
+            return
         mujoco.mj_getState(self._model, self._data, self._own, STATE_SPEC)
         out[self._columns] = self._own
 

@@ -180,6 +180,8 @@ class _Run:
         found = np.full_like(rows[1:], np.nan)
         rewards = np.zeros(stop - start)
         observations: list[NDArray[np.uint8]] = []
+        ended = reader.terminated[start:stop] | reader.truncated[start:stop]
+        read = self._live.read
         made = 0
         for index, action in enumerate(self._given(actions)):
             number = start + index
@@ -196,21 +198,18 @@ class _Run:
                 break
             made += 1
             rewards[index] = step.reward
-            self._live.read(found[index])
-            self._desynchronise(number + 1, rows[index + 1], found[index])
-            self._changes.compare(number + 1, self._model, result.changed)
+            read(found[index])
+            if not self._is_exact:
+                self._desynchronise(number + 1, rows[index + 1], found[index])
+            if self._changes.any_left:
+                self._changes.compare(number + 1, self._model, result.changed)
             if self._observation is not None:
                 self._observation.set(step.observation)
                 observations.append(self._observation.bytes.copy())
-            result.ending = self._different_end(number, step)
-            if result.ending:
-                break
-            if step.is_last and number + 1 < reader.step_count:
-                result.ending = (
-                    f"the environment ends the episode after step {number + 1}, and "
-                    f"{reader.step_count} are recorded"
-                )
-                break
+            if step.terminated or step.truncated or ended[index]:
+                result.ending = self._different_end(number, step)
+                if result.ending:
+                    break
         self._add_states(result.states, start + 1, rows[1 : made + 1], found[:made])
         recorded = reader.rewards[start : start + made]
         steps = np.arange(start + 1, start + made + 1)
@@ -248,6 +247,11 @@ class _Run:
                     f"after step {number + 1} {name} is recorded as {recorded}, and is "
                     f"{found} when made again"
                 )
+        if number + 1 < reader.step_count and (step.terminated or step.truncated):
+            return (
+                f"the environment ends the episode after step {number + 1}, and "
+                f"{reader.step_count} are recorded"
+            )
         return ""
 
     def _add_states(
@@ -281,6 +285,11 @@ class _PhysicalChanges:
     def __init__(self, reader: TrajectoryReader) -> None:
         self._coming = iter(reader.iter_model_changes())
         self._next = self._advanced()
+
+    @property
+    def any_left(self) -> bool:
+        """Whether there is anything to come."""
+        return self._next is not None
 
     def compare(self, number: int, model: Any, differing: dict[str, int]) -> None:
         """Note what the environment's model has otherwise after a step."""

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from ...errors import Error, UnreadableFile
 from ...formats.trajectory_reader import TrajectoryReader
 from ...simulation.compiled_models import (
+    are_same_models,
     changed_model,
     changed_names,
-    model_digest,
     model_from_sources,
 )
 
@@ -148,7 +148,7 @@ def compare_models(
 
     The size of pictures does not count.
     """
-    if not changes and model_digest(stored) == model_digest(present):
+    if not changes and are_same_models(stored, present):
         return ModelComparison()
     try:
         names = changed_names(changed_model(stored, changes), present)
