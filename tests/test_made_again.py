@@ -230,5 +230,5 @@ def test_a_task_of_the_suite_ends_where_it_was_ended() -> None:
     )
     environment = make_again(recorded_environment(said))
     environment.begin(SEEDED)
-    assert not environment.step(np.zeros(1)).is_last
+    assert not environment.step(np.zeros(1)).truncated
     assert environment.step(np.zeros(1)).truncated

@@ -108,10 +108,18 @@ class Differences:
         )
 
 
-def judged(differences: Differences, fit: Fit) -> tuple[Verdict, str, dict[str, Any]]:
-    """Return what comes of differences: verdict, reason and figures."""
+def judged(
+    differences: Differences, fit: Fit, unit: str = "step"
+) -> tuple[Verdict, str, dict[str, Any]]:
+    """Return what comes of differences: verdict, reason and figures.
+
+    Args:
+        differences: of rows.
+        fit: how far apart they may be.
+        unit: what a row is called.
+    """
     figures = {**differences.figures(), "tolerance": fit.tolerance}
-    rows = _counted(differences.rows)
+    rows = _counted(differences.rows, unit)
     if differences.first is None:
         return Verdict.PASS, f"bit for bit, {rows}", figures
     if not fit.is_exact and differences.maximum <= fit.tolerance:
@@ -165,5 +173,5 @@ def _errors(
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
-def _counted(rows: int) -> str:
-    return "1 step" if rows == 1 else f"{rows} steps"
+def _counted(rows: int, unit: str) -> str:
+    return f"{rows} {unit}" + "s" * (rows != 1)

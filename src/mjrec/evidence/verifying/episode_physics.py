@@ -412,7 +412,8 @@ class EpisodePhysics:
         doubt: str,
         how: str,
     ) -> Check:
-        verdict, reason, figures = judged(differences, fit)
+        unit = {_START: "state", _OBSERVATIONS: "observation"}.get(claim, "step")
+        verdict, reason, figures = judged(differences, fit, unit)
         if verdict is Verdict.FAIL:
             return self._failed(claim, reason + suffix, doubt, how, figures)
         return self._check(claim, verdict, reason + suffix, figures)

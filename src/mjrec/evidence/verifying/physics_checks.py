@@ -39,8 +39,16 @@ from .task import Count, Task
 __all__ = ["check_physics"]
 
 
-def check_physics(task: Task, count: Count) -> Iterator[Check]:
-    """Yield what there is to say of the physics of each recorded episode."""
+def check_physics(
+    task: Task, count: Count, *, made_again: set[str] | None = None
+) -> Iterator[Check]:
+    """Yield what there is to say of the physics of each recorded episode.
+
+    Args:
+        task: what is asked for.
+        count: told how many episodes are done, and of how many.
+        made_again: gets the sha256 of each compiled model that was made again here.
+    """
     paths = [
         path for path in iter_monitor_files(task.recordings) if _is_trajectory(path)
     ]
@@ -49,6 +57,8 @@ def check_physics(task: Task, count: Count) -> Iterator[Check]:
         for number, path in enumerate(paths):
             count(number, len(paths))
             yield from _checks_of(path, workshop)
+            if made_again is not None:
+                made_again |= workshop.models.made_again
         count(len(paths), len(paths))
     finally:
         workshop.close()

@@ -90,9 +90,14 @@ class RecordedModels:
 
     Args:
         directory: of the recordings, only read.
+
+    Attributes:
+        made_again: the sha256 of compiled models that were made again here, byte for
+            byte, from what is installed: nobody has crafted what has one of these.
     """
 
     def __init__(self, directory: Path) -> None:
+        self.made_again: set[str] = set()
         self._directory = directory
         # Compiling one takes half a second, and a process; so does being refused.
         self._compiled: dict[tuple[str, int], Any] = {}
@@ -120,7 +125,8 @@ class RecordedModels:
         return found
 
     def note(self, sha256: str, model: Any) -> None:
-        """Keep a model of which it is known that it is the stored one of this hash."""
+        """Keep a model that was made here and is, once compiled, of this hash."""
+        self.made_again.add(sha256)
         if sha256 not in self._known:
             _make_room(self._known)
             self._known[sha256] = changed_model(model, {})
