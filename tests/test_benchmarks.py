@@ -12,7 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmarks import disk, encoding, memory, rendering, stepping, time_to_video
+from benchmarks import (
+    disk,
+    encoding,
+    memory,
+    rendering,
+    stepping,
+    time_to_video,
+    verifying,
+)
 from benchmarks.children import ChildFailed, call
 from benchmarks.results import Reference, Result, at_least, at_most
 from benchmarks.rounds import take_turns
@@ -173,6 +181,15 @@ def test_rendering_draws_the_same_states_in_three_ways() -> None:
         *("mujoco.Renderer", "mjrec.render(workers=1)", "worker alone"),
     ]
     assert promised(results) == {"mjrec.render(workers=1)": "≥ 0.9"}
+
+
+def test_verifying_is_compared_with_stepping() -> None:
+    """Its steps alone, and with the environment; and the memory of many episodes."""
+    settings = verifying.Settings(rounds=1, episodes=2, few=1, steps=20)
+    results = verifying.measure(settings, silently)
+    kept = promised(results)
+    assert kept["steps alone"] == "≤ 1.5"
+    assert kept["steps and environment"] == "≤ 2.5"
 
 
 def test_disk_gives_the_size_of_every_file() -> None:

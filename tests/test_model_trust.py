@@ -26,7 +26,13 @@ import mjrec
 from mjrec import UnreadableFile, UntrustedModel, load_trajectory
 from mjrec.commands import main
 from mjrec.simulation.model_store import load_model
-from mjrec.simulation.model_trust import is_sealed, seal_of
+from mjrec.simulation.model_trust import (
+    TRUST_VARIABLE,
+    is_sealed,
+    is_trusted,
+    seal_of,
+    trusting_models,
+)
 
 DIGEST = hashlib.sha256(b"a model").hexdigest()
 BY_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
@@ -470,3 +476,16 @@ def test_composers_sources_show_what_the_task_showed(
     become_another_user(monkeypatch, tmp_path)
     [path] = directory.glob("*.trajectory.*")
     np.testing.assert_array_equal(list(mjrec.render(path)), shown)
+
+
+def test_models_are_trusted_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By their hashes, in the block only; what was said before does not count there."""
+    monkeypatch.setenv(TRUST_VARIABLE, "1")
+    one, other = "a" * 64, "b" * 64
+    with trusting_models([one]):
+        assert is_trusted(one)
+        assert not is_trusted(other)
+        assert not is_trusted(None)
+    assert is_trusted(other)
+    with trusting_models([]):
+        assert not is_trusted(one)

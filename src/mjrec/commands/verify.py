@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -145,19 +145,38 @@ def _table(level: Level, checks: list[Check]) -> rich.table.Table:
         table.add_column(ratio=ratio, overflow="fold")
     # What failed comes first, and is never left out.
     order = [Verdict.FAIL, Verdict.NOT_CHECKABLE, Verdict.PASS]
-    shown = sorted(checks, key=lambda check: order.index(check.verdict))
-    failed = sum(check.verdict is Verdict.FAIL for check in checks)
+    groups = sorted(_alike(checks), key=lambda group: order.index(group[0].verdict))
+    failed = sum(group[0].verdict is Verdict.FAIL for group in groups)
     most = max(_MOST_SHOWN, failed)
-    for check in shown[:most]:
-        table.add_row(*map(_cell, _texts(check)), style=None)
-    if len(shown) > most:
-        table.add_row("", f"... and {len(shown) - most} more (--json has all)", "")
+    for group in groups[:most]:
+        table.add_row(*map(_cell, _texts(group)), style=None)
+    if len(groups) > most:
+        table.add_row("", f"... and {len(groups) - most} more (--json has all)", "")
     return table
 
 
-def _texts(check: Check) -> tuple[tuple[str, str], ...]:
-    what = f"{check.subject}: {check.claim}" if check.subject else check.claim
-    return (check.verdict.value, _STYLES[check.verdict]), (what, ""), (check.reason, "")
+def _alike(checks: list[Check]) -> Iterable[list[Check]]:
+    """Return the checks in groups of those that say the same of several subjects."""
+    groups: dict[Any, list[Check]] = {}
+    for number, check in enumerate(checks):
+        key: Any = (check.verdict, check.claim)
+        if check.verdict is Verdict.FAIL:
+            key = number
+        elif check.verdict is Verdict.NOT_CHECKABLE:
+            key = (*key, check.reason)
+        groups.setdefault(key, []).append(check)
+    return groups.values()
+
+
+def _texts(group: list[Check]) -> tuple[tuple[str, str], ...]:
+    first, last = group[0], group[-1]
+    what = f"{first.subject}: {first.claim}" if first.subject else first.claim
+    reason = first.reason
+    if len(group) > 1:
+        what = f"{len(group)} times, {first.subject} to {last.subject}: {first.claim}"
+        is_same = all(check.reason == reason for check in group)
+        reason = reason if is_same else f"{reason}; others likewise (--json has all)"
+    return (first.verdict.value, _STYLES[first.verdict]), (what, ""), (reason, "")
 
 
 def _cell(text: tuple[str, str]) -> str:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from dm_control.mujoco import wrapper
@@ -147,13 +148,39 @@ def _obstacle(physics: Any) -> str | None:
 
 
 def _authored(env: Any) -> AuthoredModel | None:
-    """Return the MJCF that composer has compiled; suite tasks keep none."""
-    root = getattr(getattr(env, "task", None), "root_entity", None)
+    """Return the MJCF that composer, or the suite, has compiled."""
+    task = getattr(env, "task", None)
+    root = getattr(task, "root_entity", None)
     if root is None:
-        return None
+        return _authored_of_suite(task)
     mjcf = root.mjcf_model
     text = mjcf.to_xml_string().encode()
     return AuthoredModel("model.xml", {"model.xml": text, **mjcf.get_assets()})
+
+
+def _authored_of_suite(task: Any) -> AuthoredModel | None:
+    """Return what a task's module says that its domain's models are made from.
+
+    A task keeps nothing of it, and may have changed it before it was compiled; whoever
+    stores it compiles it and looks whether it makes this model.
+    """
+    name = type(task).__module__
+    domain = sys.modules.get(name) if name.startswith("dm_control.suite.") else None
+    sources = getattr(domain, "get_model_and_assets", None)
+    try:
+        text, assets = sources()  # type: ignore[misc]  # None is a TypeError, too
+    except TypeError:
+        # Of some domains there are as many models as numbers: swimmers, stacks.
+        return None
+    return AuthoredModel("model.xml", {"model.xml": _bytes(text), **_all_bytes(assets)})
+
+
+def _all_bytes(files: Mapping[str, Any]) -> dict[str, bytes]:
+    return {name: _bytes(content) for name, content in files.items()}
+
+
+def _bytes(content: str | bytes) -> bytes:
+    return content.encode() if isinstance(content, str) else content
 
 
 def _environment(env: Any, env_id: str | None) -> dict[str, Any] | None:

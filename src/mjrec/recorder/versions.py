@@ -11,7 +11,10 @@ from types import MappingProxyType
 
 __all__ = ["versions"]
 
-_PACKAGES = ("mjrec", "mujoco", "gymnasium", "dm-control", "numpy", "imageio-ffmpeg")
+_PACKAGES = (
+    *("mjrec", "mujoco", "gymnasium", "gymnasium-robotics", "dm-control", "numpy"),
+    "imageio-ffmpeg",
+)
 
 
 @functools.cache

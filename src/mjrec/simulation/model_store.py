@@ -42,8 +42,8 @@ from .authored_model import (
 )
 from .model_trust import (
     TRUST_VARIABLE,
-    all_models_are_trusted,
     is_sealed,
+    is_trusted,
     seal_of,
 )
 from .source_compiler import compile_within
@@ -242,8 +242,8 @@ def load_model(
 
 
 def _is_trusted(facts: Mapping[str, Any]) -> bool:
-    sealed = is_sealed(facts.get("seal"), facts.get("sha256"))
-    return sealed or all_models_are_trusted()
+    digest = facts.get("sha256")
+    return is_sealed(facts.get("seal"), digest) or is_trusted(digest)
 
 
 def _compile(source: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:

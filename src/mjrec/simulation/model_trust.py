@@ -28,17 +28,18 @@ import pwd
 import secrets
 import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from ..atomic_files import temporary_path
 
 __all__ = [
     "TRUST_VARIABLE",
-    "all_models_are_trusted",
     "is_sealed",
+    "is_trusted",
     "seal_of",
     "trusting_all_models",
+    "trusting_models",
     "with_all_models_trusted",
 ]
 
@@ -46,6 +47,7 @@ logger = logging.getLogger(__name__)
 
 TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 
+_ONE_BY_ONE = "sha256:"
 _KEY_NAME = "model-key"
 _KEY_SIZE = 32
 # So that no seal is ever one of something else.
@@ -96,9 +98,19 @@ def is_sealed(seal: object, digest: object) -> bool:
     )
 
 
-def all_models_are_trusted() -> bool:
-    """Tell whether the environment variable says that all models are to be loaded."""
-    return os.environ.get(TRUST_VARIABLE, "") not in ("", "0")
+def is_trusted(digest: object) -> bool:
+    """Tell whether the environment variable says that a model is to be loaded.
+
+    `1` says it of all models, `sha256:<hex>,sha256:<hex>` of those with these hashes.
+
+    Args:
+        digest: the sha256 of the compiled model, as a file says; anything. Whoever
+            loads it looks whether that is true.
+    """
+    said = os.environ.get(TRUST_VARIABLE, "")
+    if not said.startswith(_ONE_BY_ONE):
+        return said not in ("", "0")
+    return isinstance(digest, str) and f"{_ONE_BY_ONE}{digest}" in said.split(",")
 
 
 def with_all_models_trusted(environ: Mapping[str, str]) -> dict[str, str]:
@@ -112,8 +124,28 @@ def trusting_all_models() -> Iterator[None]:
 
     For a program's own main thread: environment variables belong to the process.
     """
+    with _saying("1"):
+        yield
+
+
+@contextlib.contextmanager
+def trusting_models(digests: Iterable[str]) -> Iterator[None]:
+    """Let this process, and those that it starts in the block, load some models.
+
+    For whoever has made these models too, and knows that nothing crafted has these
+    hashes. What was trusted before is not, in the block.
+
+    Args:
+        digests: the sha256 of the compiled models, in hex.
+    """
+    with _saying(",".join(_ONE_BY_ONE + digest for digest in digests) or "0"):
+        yield
+
+
+@contextlib.contextmanager
+def _saying(value: str) -> Iterator[None]:
     before = os.environ.get(TRUST_VARIABLE)
-    os.environ[TRUST_VARIABLE] = "1"
+    os.environ[TRUST_VARIABLE] = value
     try:
         yield
     finally:

@@ -58,10 +58,12 @@ def main() -> int:
     say = functools.partial(_say, answers)
     bag = request["bag"]
     task = task_from_json(request["task"])
+    # What physics has made again, pixels may be drawn from.
+    made_again: set[str] = set()
     for level in task.level.included:
         say(level=level.value)
         try:
-            checker = _checker(level, None if bag is None else Path(bag))
+            checker = _checker(level, None if bag is None else Path(bag), made_again)
             for check in itertools.islice(checker(task, _Counter(say)), _MOST_CHECKS):
                 say(check=check_to_json(check))
         except MemoryError:
@@ -75,7 +77,7 @@ def main() -> int:
     return 0
 
 
-def _checker(level: Level, bag: Path | None) -> Checker:
+def _checker(level: Level, bag: Path | None, made_again: set[str]) -> Checker:
     # Physics and pixels need MuJoCo, and are loaded where they are asked for.
     match level:
         case Level.FILES:
@@ -84,15 +86,10 @@ def _checker(level: Level, bag: Path | None) -> Checker:
             return functools.partial(check_statistics, is_packed=bag is not None)
         case Level.PHYSICS:
             physics = importlib.import_module(".physics_checks", __package__)
-            return _as_checker(physics.check_physics)
+            return functools.partial(physics.check_physics, made_again=made_again)
         case Level.PIXELS:
             pixels = importlib.import_module(".pixel_checks", __package__)
-            return _as_checker(pixels.check_pixels)
-
-
-def _as_checker(function: Any) -> Checker:
-    checker: Checker = function
-    return checker
+            return functools.partial(pixels.check_pixels, made_again=made_again)
 
 
 class _Counter:

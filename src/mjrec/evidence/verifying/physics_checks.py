@@ -31,6 +31,7 @@ from ...environments.mjcf_again import MjcfAgain
 from ...errors import Error, UnreadableFile
 from ...formats.monitor_directory import episode_of, infix_of, iter_monitor_files
 from ...formats.trajectory_file import open_trajectory
+from ...simulation.mujoco_warnings import log_mujoco_warnings
 from ..verification import Check, Level, Verdict
 from .episode_physics import EpisodePhysics
 from .recorded_models import RecordedModels
@@ -52,6 +53,8 @@ def check_physics(
     paths = [
         path for path in iter_monitor_files(task.recordings) if _is_trajectory(path)
     ]
+    # Else MuJoCo writes a file into the reader's working directory.
+    log_mujoco_warnings()
     workshop = _Workshop(task)
     try:
         for number, path in enumerate(paths):

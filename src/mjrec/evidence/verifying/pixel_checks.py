@@ -20,7 +20,7 @@ import contextlib
 import hashlib
 import itertools
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -36,6 +36,7 @@ from ...frames import Frame
 from ...machine import usable_cpus
 from ...recorder.versions import versions
 from ...rendering.workers import DrawingWorkers
+from ...simulation.model_trust import trusting_models
 from ..verification import Check, Level, Verdict
 from .decoded_video import DecodedVideo
 from .difference_picture import difference_picture, png
@@ -67,7 +68,9 @@ _MOST_NAMED: Final = 5
 _FRAMES_OF_A_WORKER: Final = 32
 
 
-def check_pixels(task: Task, count: Count) -> Iterator[Check]:
+def check_pixels(
+    task: Task, count: Count, *, made_again: Collection[str] = ()
+) -> Iterator[Check]:
     """Check every video of a monitor directory, one after the other.
 
     With a sample, so many frames of each video are drawn, all equally likely to be
@@ -76,6 +79,8 @@ def check_pixels(task: Task, count: Count) -> Iterator[Check]:
     Args:
         task: what is asked for.
         count: told how many frames are done, and of how many.
+        made_again: the sha256 of compiled models that may be loaded, because they were
+            made again here.
     """
     paths = sorted(iter_monitor_files(task.recordings))
     metadata = [path for path in paths if path.name.endswith(_METADATA)]
@@ -86,7 +91,10 @@ def check_pixels(task: Task, count: Count) -> Iterator[Check]:
     ends = itertools.accumulate(totals)
     # To start one takes as long as drawing some pictures.
     most = max(1, sum(totals) // _FRAMES_OF_A_WORKER)
-    with DrawingWorkers(min(most, usable_cpus())) as workers:
+    with (
+        trusting_models(sorted(made_again)),
+        DrawingWorkers(min(most, usable_cpus())) as workers,
+    ):
         studio = _Studio(task=task, workers=workers)
         for video, total, end in zip(read, totals, ends, strict=True):
             done = itertools.count(end - total + 1)
