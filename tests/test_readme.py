@@ -68,14 +68,23 @@ def test_python_block_runs(name: str, checkout: Path) -> None:
     assert name != "again" or list(checkout.glob("recordings/again/*.mp4"))
 
 
+def needed_by(line: str) -> list[str]:
+    """Return the lines that make what a line is about, in order."""
+    command, subject = line.split()[1:3]
+    made_by = {"list": "--out", "render": "--out", "recover": "--out", "pack": "--out"}
+    option = {**made_by, "verify": "-o"}.get(command)
+    if option is None:
+        return []
+    [maker] = [x for x in shell_lines() if f"{option} {subject} " in x]
+    return [*needed_by(maker), maker]
+
+
 @pytest.mark.parametrize("line", [x for x in shell_lines() if x.startswith("mjrec")])
 def test_command_runs(line: str, checkout: Path) -> None:
     """As it stands, with the recordings that the ones before it made."""
     needs_extras(line)
-    if line.startswith(("mjrec list", "mjrec render", "mjrec recover")):
-        out = f"--out {line.split()[2]} "
-        [recording] = [x for x in shell_lines() if out in x]
-        run(sys.executable, "-m", *shlex.split(recording), cwd=checkout)
+    for earlier in needed_by(line):
+        run(sys.executable, "-m", *shlex.split(earlier), cwd=checkout)
     out = run(sys.executable, "-m", *shlex.split(line), cwd=checkout)
     assert out.strip()
 
