@@ -135,6 +135,20 @@ def test_the_rate_is_exact(tmp_path: Path, fps: Any) -> None:
     assert times == [number / Fraction(fps) for number in range(20)]
 
 
+@pytest.mark.parametrize("fps", [125, 119, 241, Fraction(1000, 7)])
+@pytest.mark.parametrize("frames", [1, 3, 9])
+def test_the_rate_of_few_frames_is_not_rounded(
+    tmp_path: Path, fps: Any, frames: int
+) -> None:
+    """Left alone, ffmpeg takes some rates for usual ones: 125 for 120."""
+    result = record(tmp_path / "a.mp4", map(numbered, range(frames)), fps=fps)
+    with av.open(str(result.path)) as container:
+        stream = container.streams.video[0]
+        packets = [p for p in container.demux(stream) if p.pts is not None]
+        shown = sorted((p.pts * p.time_base, p.duration * p.time_base) for p in packets)
+    assert shown == [(n / Fraction(fps), 1 / Fraction(fps)) for n in range(frames)]
+
+
 def test_a_rate_that_ffmpeg_would_round_is_not_given_to_it(tmp_path: Path) -> None:
     """The result's rate is the file's: near for a float, an error for a fraction."""
     result = record(tmp_path / "a.mp4", map(numbered, range(9)), fps=59.940059)

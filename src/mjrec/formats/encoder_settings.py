@@ -117,7 +117,9 @@ class EncoderSettings:
             *("-hide_banner", "-loglevel", "error", "-nostdin", "-y"),
             *("-f", "rawvideo", "-pixel_format", "rgb24"),
             *("-video_size", f"{width}x{height}"),
-            *("-framerate", f"{fps.numerator}/{fps.denominator}"),
+            # Not `-framerate`: in the file it would be replaced by a usual rate near
+            # it, for some rates always, for 125 where there are 3 to 9 frames.
+            *("-r", f"{fps.numerator}/{fps.denominator}"),
             *("-i", "pipe:0"),
             *self.encoding,
         ]
