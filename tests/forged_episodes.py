@@ -38,6 +38,7 @@ __all__ = [
     "record_mjcf",
     "record_suite",
     "swap_model",
+    "unchecked",
     "verdicts",
 ]
 
@@ -173,6 +174,11 @@ def verdicts(checks: list[Check]) -> Counter[str]:
     return Counter(check.verdict.value for check in checks)
 
 
+def unchecked(checks: list[Check]) -> list[Check]:
+    """Return what cannot be checked."""
+    return [check for check in checks if check.verdict is Verdict.NOT_CHECKABLE]
+
+
 def failed(checks: list[Check]) -> list[str]:
     """Return what failed, by what it was checked of."""
     claims = (
@@ -184,6 +190,7 @@ def failed(checks: list[Check]) -> list[str]:
         ("the environment ends", "ends"),
         ("the environment gives the recorded observations", "observations"),
         ("the episode's states", "file"),
+        ("the name", "name"),
     )
     short: Mapping[str, str] = dict(claims)
     return [

@@ -101,6 +101,34 @@ def edit_a_reward_everywhere(bag: Path) -> None:
     write_table(bag, rows)
 
 
+def edit_a_reward_and_delete_the_seed(bag: Path) -> None:
+    """So that nobody could begin the episode again."""
+    edit_a_reward_everywhere(bag)
+    forge_episode(episode(bag, 1), facts={"seed": None, "random_state": None})
+    say(video(recordings(bag), 1), seed=None)
+    journal = the(bag, "*.jsonl")
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    lines[1]["seed"] = None
+    journal.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    rows = read_table(bag)
+    rows[1]["seed"] = ""
+    write_table(bag, rows)
+
+
+def call_it_another_environment(bag: Path) -> None:
+    """In all files, but for what it was made as."""
+    name = "Humanoid-v5"
+    for number in range(EPISODES):
+        forge_episode(episode(bag, number), facts={"env_id": name})
+    for path in recordings(bag).glob("*.mp4"):
+        say(path, env_id=name)
+    manifest, journal = the(bag, "*.manifest.json"), the(bag, "*.jsonl")
+    edit_json(manifest, lambda said: said["env_info"].update(env_id=name))
+    described = the(bag, "environment.json")
+    for path in (journal, described):
+        path.write_text(path.read_text().replace("InvertedPendulum-v5", name))
+
+
 def edit_a_state(bag: Path) -> None:
     """By one unit in the last place."""
 
@@ -185,6 +213,21 @@ def name_another_schedule(bag: Path) -> None:
     )
 
 
+def add_a_note(bag: Path) -> None:
+    """Beside the recordings; the bag's manifest lists it, as it lists all."""
+    (bag / "data" / "notes.txt").write_text("Reviewed, and found to be in order.")
+
+
+def name_another_gpu(bag: Path) -> None:
+    """In the summary, for readers who look at nothing else."""
+    edit_json(
+        bag / "data" / "environment.json",
+        lambda said: said["recordings"]["0.u"]["pictures"][0].update(
+            gl_renderer="NVIDIA GeForce RTX 4090/PCIe/SSE2"
+        ),
+    )
+
+
 def forge_video(bag: Path, number: int, frames: list[Any]) -> None:
     """Put other frames into a video; length and metadata stay the episode's."""
     path = video(recordings(bag), number)
@@ -231,6 +274,8 @@ CASES = (
     Case(double_a_frame, PIXELS, "its trajectory has 4 pictures"),
     Case(drop_one_and_double_another, PIXELS, "have other hashes: 2"),
     Case(edit_a_reward_everywhere, PHYSICS, "step 3"),
+    Case(edit_a_reward_and_delete_the_seed, PHYSICS, "step 3"),
+    Case(call_it_another_environment, PHYSICS, "made as InvertedPendulum-v5"),
     Case(edit_a_state, PHYSICS, "qpos[1]"),
     Case(edit_an_action, PHYSICS, "step 3"),
     Case(edit_an_action_and_its_control, PHYSICS, "step 3"),
@@ -241,6 +286,8 @@ CASES = (
     Case(rename_a_file, STATS, "what is inside says 1, its name 9"),
     Case(add_a_scheduled_episode, STATS, "3"),
     Case(name_another_schedule, STATS, "at:0,3"),
+    Case(add_a_note, FILES, "notes.txt"),
+    Case(name_another_gpu, STATS, "RTX 4090"),
 )
 
 

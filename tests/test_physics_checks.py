@@ -22,6 +22,7 @@ from forged_episodes import (
     record_mjcf,
     record_suite,
     swap_model,
+    unchecked,
     verdicts,
 )
 
@@ -39,6 +40,7 @@ BALL = """<mujoco><option timestep="0.01"/><worldbody>
   <body pos="1 0 1"><joint name="hinge"/><geom size=".1" pos=".2 0 0"/></body>
 </worldbody><actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
 
+NO_SEED = {"seed": None, "random_state": None}
 OTHER_MACHINE = {"architecture": "abacus", "libc": "none", "cpu_flags": ""}
 
 
@@ -78,7 +80,7 @@ def test_an_honest_recording_passes(env_id: str, kind: type, tmp_path: Path) -> 
     """All of a Gymnasium environment passes, whatever float the actions were."""
     env = gymnasium.make(env_id, max_episode_steps=15)
     checks = physics_of(record_gymnasium(tmp_path / "run", env, kind=kind))
-    assert verdicts(checks) == {"pass": 14}
+    assert verdicts(checks) == {"pass": 15}
     assert all(check.reason.startswith("bit for bit") for check in checks[:5])
 
 
@@ -86,7 +88,7 @@ def test_an_episode_that_ends_by_itself_passes(hopper: Path) -> None:
     """A termination is one that the environment gives."""
     with first_episode(hopper) as reader:
         assert reader.terminated[-1]
-    assert verdicts(physics_of(hopper)) == {"pass": 7}
+    assert verdicts(physics_of(hopper)) == {"pass": 8}
 
 
 def test_episodes_that_were_not_seeded_pass(tmp_path: Path) -> None:
@@ -96,17 +98,86 @@ def test_episodes_that_were_not_seeded_pass(tmp_path: Path) -> None:
     record_gymnasium(directory, env, seeds=lambda number: None if number else 1)
     # Else the generator would be where it should be by itself.
     episode(directory, 0).unlink()
-    assert verdicts(physics_of(directory)) == {"pass": 7}
+    assert verdicts(physics_of(directory)) == {"pass": 8}
 
 
-def test_an_episode_that_was_never_seeded_is_not_replayed(tmp_path: Path) -> None:
-    """Without a seed and a random state the steps alone are checked."""
-    env = gymnasium.make("InvertedPendulum-v5")
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Reacher-v5", "Humanoid-v5"])
+def test_an_episode_that_was_never_seeded_goes_on_from_its_first_state(
+    env_id: str, tmp_path: Path
+) -> None:
+    """Without a seed and a random state nothing but its beginning is left open."""
+    env = gymnasium.make(env_id)
     directory = tmp_path / "run"
     record_gymnasium(directory, env, seeds=lambda number: None, episodes=1)
     checks = physics_of(directory)
-    assert verdicts(checks) == {"pass": 2, "not checkable": 1}
-    assert "neither a seed nor a random state" in checks[-1].reason
+    assert verdicts(checks) == {"pass": 7, "not checkable": 1}
+    assert all(check.reason.startswith("bit for bit") for check in checks[3:5])
+    [start] = unchecked(checks)
+    assert start.claim == "the environment begins in the recorded state"
+    assert "give reset(seed=...)" in start.reason
+
+
+def test_a_seed_that_is_taken_out_hides_no_reward(forged: Path) -> None:
+    """Nor does one elsewhere, where each step begins at a recorded state."""
+    forge(episode(forged), rewards=lambda r: r.__setitem__(3, 1e3), facts=NO_SEED)
+    assert failed(physics_of(forged)) == ["rewards"]
+    forge(episode(forged), facts={"machine": OTHER_MACHINE})
+    assert failed(physics_of(forged)) == ["rewards"]
+
+
+@needs_dm_control
+def test_a_random_state_that_is_taken_out_hides_no_reward(tmp_path: Path) -> None:
+    """Of the suite's tasks whose resets draw nothing that is not in the state."""
+    directory = record_suite(tmp_path / "run", "cheetah", "run", episodes=1)
+    forge(episode(directory), facts=NO_SEED)
+    assert verdicts(physics_of(directory)) == {"pass": 7, "not checkable": 1}
+    forge(episode(directory), rewards=lambda r: r.__setitem__(3, 1e3))
+    assert failed(physics_of(directory)) == ["rewards"]
+
+
+@needs_dm_control
+def test_a_target_that_was_drawn_is_not_guessed(tmp_path: Path) -> None:
+    """Where it stands in the model alone, nobody is accused."""
+    directory = record_suite(tmp_path / "run", "reacher", "easy")
+    for number in range(2):
+        forge(episode(directory, number), facts=NO_SEED)
+    checks = physics_of(directory)
+    assert failed(checks) == []
+    assert "neither a seed nor" in unchecked(checks)[-1].reason
+
+
+@pytest.mark.parametrize(
+    ("name", "verdict"),
+    [
+        ("Humanoid-v5", Verdict.FAIL),
+        ("dm_control/cheetah-run", Verdict.FAIL),
+        ("my pendulum", Verdict.NOT_CHECKABLE),
+        (None, Verdict.NOT_CHECKABLE),
+    ],
+)
+def test_results_bear_the_name_of_what_was_made(
+    name: Any, verdict: Verdict, forged: Path
+) -> None:
+    """Another environment's name is a lie, one of the author's own is none."""
+    forge(episode(forged), facts={"env_id": name})
+    [check] = [c for c in physics_of(forged) if c.claim.startswith("the name")]
+    assert check.verdict is verdict
+    assert "made as InvertedPendulum-v5" in check.reason
+
+
+def test_what_an_environment_was_made_with_is_said(tmp_path: Path) -> None:
+    """Also where all is as it should be; how it is shown is not said."""
+    env = gymnasium.make(
+        "HalfCheetah-v5", forward_reward_weight=100.0, render_mode="rgb_array"
+    )
+    checks = physics_of(record_gymnasium(tmp_path / "run", env, episodes=1))
+    assert verdicts(checks) == {"pass": 8}
+    saying = [c.claim for c in checks if "forward_reward_weight=100.0" in c.reason]
+    assert saying == [
+        "the environment gives the recorded rewards",
+        "the name that the results bear is that of the environment that was made",
+    ]
+    assert not any("render_mode" in check.reason for check in checks)
 
 
 @needs_dm_control
@@ -125,7 +196,7 @@ def test_a_recording_of_the_suite_passes(
 ) -> None:
     """All of a suite's task passes, also where resets change the model."""
     directory = record_suite(tmp_path / "run", domain, task)
-    assert verdicts(physics_of(directory)) == {"pass": 14}
+    assert verdicts(physics_of(directory)) == {"pass": 15}
 
 
 @needs_dm_control
@@ -133,15 +204,15 @@ def test_a_model_that_is_drawn_at_random_is_not_checkable(tmp_path: Path) -> Non
     """The seed of lqr's springs is not recorded, and nobody is accused."""
     directory = record_suite(tmp_path / "run", "lqr", "lqr_2_1", episodes=1)
     checks = physics_of(directory)
-    assert verdicts(checks) == {"not checkable": 3}
-    assert "draws its model at random" in checks[-1].reason
+    assert verdicts(checks) == {"not checkable": 3, "pass": 1}
+    assert "draws its model at random" in unchecked(checks)[-1].reason
 
 
 def test_an_mjcf_file_passes(tmp_path: Path) -> None:
     """Its environment is made again from the sources beside the recording."""
     directory = record_mjcf(tmp_path / "run", tmp_path / "ball.xml", BALL)
     checks = physics_of(directory)
-    assert verdicts(checks) == {"pass": 7}
+    assert verdicts(checks) == {"pass": 8}
     assert checks[1].figures["rows"] == 15
 
 
@@ -285,7 +356,7 @@ def test_another_machine_is_compared_within_a_tolerance(pendulum: Path) -> None:
     """Numbers that are the same bit for bit pass wherever they were recorded."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mjrec.evidence.verifying.tolerances.machine_fingerprint", dict)
-        assert verdicts(physics_of(pendulum)) == {"pass": 14}
+        assert verdicts(physics_of(pendulum)) == {"pass": 15}
 
 
 @pytest.mark.parametrize(("error", "found"), [(1e-12, []), (1e-7, ["steps", "states"])])
@@ -323,7 +394,7 @@ def test_steps_begin_at_recorded_states_on_another_machine(
 
     forge(episode(directory), states=nudge, facts={"machine": OTHER_MACHINE})
     checks = physics_of(directory)
-    assert verdicts(checks) == {"pass": 7}
+    assert verdicts(checks) == {"pass": 8}
     assert any("begins at the recorded state" in check.reason for check in checks)
 
 
@@ -409,7 +480,8 @@ def test_without_sources_and_environment_nothing_is_proved(forged: Path) -> None
 def test_a_forged_state_fails_without_its_environment(forged: Path) -> None:
     """That an environment cannot be made again is no excuse."""
     said = {"framework": "gymnasium", "id": "Nobody-v0", "kwargs": {}, "wrappers": []}
-    forge(episode(forged), states=edited(6, 1), facts={"environment": said})
+    facts = {"environment": said, "env_id": "Nobody-v0"}
+    forge(episode(forged), states=edited(6, 1), facts=facts)
     checks = physics_of(forged)
     assert failed(checks) == ["steps"]
 
@@ -429,7 +501,7 @@ def test_a_damaged_file_is_a_failure_of_its_own(forged: Path) -> None:
     path.write_bytes(path.read_bytes()[:900])
     checks = physics_of(forged)
     assert failed(checks) == ["file"]
-    assert verdicts(checks)["pass"] == 7
+    assert verdicts(checks)["pass"] == 8
 
 
 def first_episode(directory: Path) -> TrajectoryReader:

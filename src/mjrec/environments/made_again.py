@@ -22,6 +22,7 @@ import numpy as np
 from gymnasium.envs import registration
 
 from ..simulation.inside import simulation_in
+from .environment_arguments import VIEW_ARGUMENTS, shown_arguments
 from .names import DmControlName, parse_environment_name
 from .robotics_scenes import drawn_part
 from .working_directory import working_directory_importable
@@ -33,8 +34,11 @@ __all__ = [
     "NotMadeAgain",
     "RecordedEnvironment",
     "StepAgain",
+    "is_installed_name",
+    "made_with",
     "make_again",
     "recorded_environment",
+    "wrappers_refused",
 ]
 
 UNKNOWN = "unknown"
@@ -43,13 +47,6 @@ UNKNOWN = "unknown"
 _OWN = "gymnasium.envs.mujoco"
 _ROBOTICS = "gymnasium_robotics"
 
-# How an environment is shown, on which no state depends.
-_VIEW = frozenset(
-    (
-        *("render_mode", "camera_name", "camera_id", "default_camera_config"),
-        *("width", "height", "max_geom", "visual_options"),
-    )
-)
 # gymnasium.make's own arguments, which are no environment's.
 _MAKE = frozenset(("id", "vector_kwargs", "disable_env_checker", "max_episode_steps"))
 
@@ -136,6 +133,16 @@ class EnvironmentAgain(Protocol):
             NotMadeAgain: what it was begun with is not known, or not plain.
         """
 
+    def begin_anyhow(self) -> Any:
+        """Begin an episode, whichever, and return its first observation.
+
+        For an episode whose own beginning is not known. It may then be put into the
+        recorded state, if it has all in its state.
+
+        Raises:
+            NotMadeAgain: its reset fails.
+        """
+
     def step(self, action: Any) -> StepAgain:
         """Step the environment."""
 
@@ -185,16 +192,49 @@ def make_again(
         NotMadeAgain: the rule of trust forbids it, or it cannot be made here.
     """
     if recorded.wrappers:
-        raise NotMadeAgain(
-            f"wrappers stood between the monitor and the environment, and none is made "
-            f"again: {', '.join(recorded.wrappers):.300}"
-        )
+        raise wrappers_refused(recorded.wrappers)
     match recorded.framework:
         case "gymnasium":
             return _gymnasium(recorded, trust)
         case "dm_control":
             return _dm_control(recorded)
     raise NotMadeAgain("it is of an MJCF file, which is made again from its sources")
+
+
+def wrappers_refused(wrappers: tuple[str, ...]) -> NotMadeAgain:
+    """Return what there is to say of wrappers, none of which is made again."""
+    return NotMadeAgain(
+        "wrappers stood between the monitor and the environment, and none is made "
+        f"again: {', '.join(wrappers):.300}; what is recorded below them can be "
+        "checked: put Monitor around the environment itself, and wrappers around the "
+        "monitor"
+    )
+
+
+def made_with(recorded: RecordedEnvironment) -> str:
+    """Return how an environment was made, as a clause; "" as it is by default."""
+    if recorded.kwargs is None and recorded.framework == "dm_control":
+        return "made with the suite's own arguments, as the recording names no others"
+    said = shown_arguments(recorded.kwargs)
+    return f"made with {said}" if said else ""
+
+
+def is_installed_name(name: str) -> bool:
+    """Tell whether a name is that of an environment that can be made here by it."""
+    if name.startswith("dm_control/"):
+        return _is_of_suite(name)
+    return ":" not in name and _spec(name) is not None
+
+
+def _is_of_suite(name: str) -> bool:
+    try:
+        from dm_control import suite
+
+        parsed = _suite_name(name)
+    # Where dm_control does not work none of its names is one that is installed.
+    except Exception:
+        return False
+    return parsed.task in suite.TASKS_BY_DOMAIN.get(parsed.domain, ())
 
 
 def plain_argument(name: str, value: Any) -> bool:
@@ -233,7 +273,7 @@ def _arguments(recorded: RecordedEnvironment) -> dict[str, Any]:
             "it was made with arguments that a recording cannot hold, and so cannot "
             "be made again"
         )
-    kept = {name: given[name] for name in given if name not in _VIEW}
+    kept = {name: given[name] for name in given if name not in VIEW_ARGUMENTS}
     for name, value in kept.items():
         if name in _MAKE or not plain_argument(name, value):
             raise NotMadeAgain(
@@ -263,7 +303,11 @@ def _gymnasium(
             trusted or recorded.id, disable_env_checker=True, **arguments
         )
     entry_point = env.spec.entry_point if env.spec is not None else None
-    return _GymnasiumAgain(env, is_all_in_state=_is_below(entry_point, _OWN))
+    return _GymnasiumAgain(
+        env,
+        is_all_in_state=_is_below(entry_point, _OWN),
+        made_with=made_with(recorded),
+    )
 
 
 def _trusted_id(env_id: str, trust: frozenset[str]) -> str | None:
@@ -303,10 +347,16 @@ def _is_below(entry_point: Any, package: str) -> bool:
 
 class _GymnasiumAgain:
     is_settled = False
-    made_with = ""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], *, is_all_in_state: bool) -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        *,
+        is_all_in_state: bool,
+        made_with: str,
+    ) -> None:
         self.is_all_in_state = is_all_in_state
+        self.made_with = made_with
         self._env = env
         self._base: Any = env.unwrapped
         if simulation_in(env) is None:
@@ -327,6 +377,10 @@ class _GymnasiumAgain:
         options = _plain_options(start.options)
         with _failures("its reset"):
             return self._env.reset(seed=seed, options=options)[0]
+
+    def begin_anyhow(self) -> Any:
+        with _failures("its reset"):
+            return self._env.reset(seed=0)[0]
 
     def step(self, action: Any) -> StepAgain:
         observation, reward, terminated, truncated, _ = self._env.step(action)
@@ -357,8 +411,8 @@ def _set_generator(holder: Any, state: Any) -> None:
 
 def _unseeded() -> NotMadeAgain:
     return NotMadeAgain(
-        "neither a seed nor a random state was recorded for the reset; reset the "
-        "environment with a seed once before it is recorded"
+        "neither a seed nor a random state was recorded for the reset: give "
+        "reset(seed=...) where episodes are to be begun again"
     )
 
 
@@ -387,7 +441,7 @@ def _dm_control(recorded: RecordedEnvironment) -> EnvironmentAgain:
         name,
         arguments,
         limit if isinstance(limit, int) else None,
-        is_default=recorded.kwargs is None,
+        made_with=made_with(recorded),
     )
 
 
@@ -428,7 +482,7 @@ class _DmControlAgain:
         arguments: dict[str, Any],
         limit: int | None,
         *,
-        is_default: bool,
+        made_with: str,
     ) -> None:
         # dm_control is optional, and is loaded where one of its environments is asked
         # for; so is what knows it.
@@ -457,11 +511,7 @@ class _DmControlAgain:
         self._inner = env
         self._resetting: Callable[[], Any] = ContextsOnDemand(env).resetting
         self._is_terminated, self._is_truncated = is_terminated, is_truncated
-        self.made_with = (
-            "made with the suite's own arguments, as the recording names no others"
-            if is_default
-            else ""
-        )
+        self.made_with = made_with
 
     def simulation(self) -> tuple[Any, Any]:
         physics = self._inner.physics
@@ -480,8 +530,11 @@ class _DmControlAgain:
                 raise _unseeded()
         except (TypeError, ValueError, KeyError, OverflowError) as error:
             raise NotMadeAgain(f"its random state is none: {error!s:.200}") from error
-        with _failures("its reset"), self._resetting():
-            return self._env.reset().observation
+        return self._reset()
+
+    def begin_anyhow(self) -> Any:
+        self._generator().seed(0)
+        return self._reset()
 
     def step(self, action: Any) -> StepAgain:
         timestep = self._env.step(action)
@@ -494,6 +547,10 @@ class _DmControlAgain:
 
     def close(self) -> None:
         self._env.close()
+
+    def _reset(self) -> Any:
+        with _failures("its reset"), self._resetting():
+            return self._env.reset().observation
 
     def _generator(self) -> np.random.RandomState:
         state = getattr(self._inner.task, "random", None)

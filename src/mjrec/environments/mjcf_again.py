@@ -8,7 +8,12 @@ from typing import Any
 import numpy as np
 
 from ..simulation.mjcf_again import CompiledSimulation
-from .made_again import EpisodeStart, NotMadeAgain, RecordedEnvironment, StepAgain
+from .made_again import (
+    EpisodeStart,
+    RecordedEnvironment,
+    StepAgain,
+    wrappers_refused,
+)
 
 __all__ = ["MjcfAgain"]
 
@@ -30,10 +35,7 @@ class MjcfAgain:
 
     def __init__(self, recorded: RecordedEnvironment, model: Any) -> None:
         if recorded.wrappers:
-            raise NotMadeAgain(
-                "wrappers stood between the monitor and the environment, and none is "
-                f"made again: {', '.join(recorded.wrappers):.300}"
-            )
+            raise wrappers_refused(recorded.wrappers)
         limit = recorded.max_episode_steps
         self._limit = limit if isinstance(limit, int) else None
         self._simulation = CompiledSimulation(model)
@@ -45,6 +47,10 @@ class MjcfAgain:
 
     def begin(self, start: EpisodeStart) -> Any:
         """Go to the model's initial state; nothing in it is random."""
+        return self.begin_anyhow()
+
+    def begin_anyhow(self) -> Any:
+        """Do the same: there is no other beginning."""
         self._steps = 0
         self._simulation.reset()
         return self._simulation.state()

@@ -146,6 +146,20 @@ class LiveStates:
         if self._is_settled:
             mujoco.mj_step1(self._model, self._data)
 
+    def begin_at(self, row: NDArray[np.float64]) -> None:
+        """Put the simulation into a recorded state just after a reset, as resets do.
+
+        All that follows from that state is computed, as it is after a reset.
+        """
+        own = np.ascontiguousarray(row[self._columns])
+        mujoco.mj_setState(self._model, self._data, own, STATE_SPEC)
+        if self._is_settled:
+            mujoco.mj_step1(self._model, self._data)
+        else:
+            mujoco.mj_forward(self._model, self._data)
+            # The solver's warm start is another one now.
+            mujoco.mj_setState(self._model, self._data, own, STATE_SPEC)
+
 
 def _columns(
     model: mujoco.MjModel, components: Sequence[StateComponent]

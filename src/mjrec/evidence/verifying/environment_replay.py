@@ -7,6 +7,9 @@ alike, so from the first difference on the environment is put into each recorded
 before it is stepped. What it computes on the way to that state is there too: it has
 just been on that way itself, but for one step's error.
 
+Where an episode's beginning cannot be repeated the environment is put into the first
+recorded state, and goes on from there.
+
 Floats are recorded as float64, whatever the policy gave. A reward that is computed
 from a float32 action may have other last bits; so where all recorded actions are
 float32 numbers, that is tried first, and float64 where the rewards then differ.
@@ -90,6 +93,7 @@ def replay_episode(
     kind: np.dtype[Any],
     is_exact: bool,
     has_limit: bool,
+    begins_as_recorded: bool = False,
 ) -> Replay:
     """Run an episode again in an environment that was just reset for it.
 
@@ -102,12 +106,16 @@ def replay_episode(
             going on without the recorded states.
         has_limit: whether the environment has the episodes' limit, so that their being
             cut off can be compared.
+        begins_as_recorded: the environment was begun anyhow, and is put into the
+            first recorded state; its first state and observation are not compared.
 
     Raises:
-        InvalidArgument: the states are not of the environment's model.
+        InvalidArgument: the states are not of the environment's model, or the first
+            would be needed and is not recorded.
         UnreadableFile: the file is damaged.
     """
-    return _Run(reader, environment, kind, is_exact, has_limit).run(first_observation)
+    run = _Run(reader, environment, kind, is_exact, has_limit)
+    return run.run(first_observation, begins_as_recorded=begins_as_recorded)
 
 
 class _Run:
@@ -136,9 +144,13 @@ class _Run:
         self._parts = _action_parts(reader)
         self._observation: StepArray | None = None
 
-    def run(self, first_observation: Any) -> Replay:
+    def run(self, first_observation: Any, *, begins_as_recorded: bool) -> Replay:
         result = self._result
-        self._begin(first_observation)
+        self._look_at(first_observation)
+        if begins_as_recorded:
+            self._begin_as_recorded()
+        else:
+            self._begin(first_observation)
         for start in range(0, self._reader.step_count, BLOCK_ROWS):
             stop = min(start + BLOCK_ROWS, self._reader.step_count)
             if not self._block(start, stop):
@@ -147,28 +159,39 @@ class _Run:
             result.steps = self._reader.step_count
         return result
 
-    def _begin(self, observation: Any) -> None:
-        reader, result = self._reader, self._result
-        row = reader.states(0, 1)
-        found = np.empty_like(row)
-        self._live.read(found[0])
-        self._add_states(result.first_state, 0, row, found)
-        self._desynchronise(0, row[0], found[0])
-        kind = reader.header.observation
+    def _look_at(self, observation: Any) -> None:
+        """Learn what kind of observations there are."""
+        kind = self._reader.header.observation
         if kind is None:
             return
         array = step_array(observation)
         if array is None or array.kind != kind:
             there = "nothing like an array" if array is None else array.kind
-            result.observation_trouble = (
+            self._result.observation_trouble = (
                 f"observations are recorded as {kind}, and are {there} when made again"
             )
             return
         self._observation = array
         names = [f"observation[{index}]" for index in range(int(np.prod(kind.shape)))]
-        result.observations = Differences(names)
-        array.set(observation)
-        self._add_observations(0, [array.bytes.copy()])
+        self._result.observations = Differences(names)
+
+    def _begin(self, observation: Any) -> None:
+        """Compare how the episode begins."""
+        row = self._reader.states(0, 1)
+        found = np.empty_like(row)
+        self._live.read(found[0])
+        self._add_states(self._result.first_state, 0, row, found)
+        self._desynchronise(0, row[0], found[0])
+        if self._observation is not None:
+            self._observation.set(observation)
+            self._add_observations(0, [self._observation.bytes.copy()])
+
+    def _begin_as_recorded(self) -> None:
+        """Let the episode begin in the first recorded state."""
+        row = self._reader.states(0, 1)[0]
+        if np.isnan(row).any():
+            raise InvalidArgument("the first state is not recorded")
+        self._live.begin_at(row)
 
     def _block(self, start: int, stop: int) -> bool:
         """Make some steps; return whether the episode goes on."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -13,6 +14,7 @@ from ...environments.made_again import (
     EnvironmentAgain,
     EpisodeStart,
     NotMadeAgain,
+    made_with,
     recorded_environment,
 )
 from ...errors import InvalidArgument, UnreadableFile
@@ -34,6 +36,7 @@ from .recorded_models import (
     first_changes,
     is_of_pictures,
 )
+from .snapshot_checks import FollowedSnapshots, begun_snapshot, follow_snapshots
 from .step_checks import follow_steps
 from .tolerances import Fit, derived_fit, framework_doubt, state_fit
 
@@ -42,6 +45,7 @@ __all__ = ["EpisodePhysics"]
 _MODEL = "the model is the one that the environment has"
 _SOURCES = "the model is made from the sources in the archive"
 _STEPS = "each recorded state follows from the one before and the recorded controls"
+_PICTURES = "what the pictures are drawn from follows from the recorded states"
 _REPLAY = "the environment itself gives the recorded states, rewards and ends"
 _START = "the environment begins in the recorded state"
 _STATES = "the recorded actions lead the environment through the recorded states"
@@ -71,6 +75,8 @@ class EpisodePhysics:
         self._fit = state_fit(self._facts)
         self._derived = derived_fit(self._facts)
         self._changes = first_changes(reader)
+        # Why the environment did not begin as the episode did, but anyhow.
+        self._unrepeated = ""
 
     def checks(
         self, made: Callable[[Mapping[str, Any]], EnvironmentAgain]
@@ -92,7 +98,7 @@ class EpisodePhysics:
         observation, refusal = None, ""
         try:
             environment = made(self._facts)
-            observation = environment.begin(self._start())
+            observation = self._begun(environment)
         except NotMadeAgain as error:
             refusal = str(error)
         present = (
@@ -103,16 +109,54 @@ class EpisodePhysics:
         if model is not None:
             self._fit = self._fit.of_model(model)
             self._derived = self._derived.of_model(model)
+        begun = None if present is None else self._begun_snapshot(environment)
         replay: Replay | str = refusal
         if environment is not None and not refusal:
             replay = self._replayed(environment, observation)
         yield self._with_changes(of_model, replay)
-        yield self._steps(model, replay)
+        of_steps = self._steps(model, replay)
+        yield of_steps
+        if self._reader.frame_count:
+            yield self._pictures(model, of_steps, begun)
         if isinstance(replay, str) or environment is None:
-            reason = str(replay)
+            reason = "; ".join(filter(None, (str(replay), self._made_with())))
             yield self._check(_REPLAY, Verdict.NOT_CHECKABLE, reason)
         else:
             yield from self._replay_checks(replay, environment)
+
+    def _begun(self, environment: EnvironmentAgain) -> Any:
+        """Begin the episode as it was begun; or anyhow, where its states tell the rest.
+
+        Raises:
+            NotMadeAgain: its beginning is not known, and may have been of a kind that
+                no state tells.
+        """
+        self._unrepeated = ""
+        try:
+            return environment.begin(self._start())
+        except NotMadeAgain as error:
+            if not environment.is_all_in_state:
+                raise
+            observation = environment.begin_anyhow()
+            if not self._has_begun_model(environment.simulation()[0]):
+                raise
+            self._unrepeated = str(error)
+            return observation
+
+    def _has_begun_model(self, present: Any) -> bool:
+        """Tell whether the model is the episode's, whatever its reset has drawn.
+
+        The suite's resets may draw targets that stand in the model, and only there.
+        """
+        if _mapping(self._facts.get("environment")).get("framework") != "dm_control":
+            return True
+        return not self._changes and model_digest(present) == self._sha256()
+
+    def _made_with(self) -> str:
+        try:
+            return made_with(recorded_environment(self._facts))
+        except NotMadeAgain:
+            return ""
 
     def _start(self) -> EpisodeStart:
         facts = self._facts
@@ -335,6 +379,67 @@ class EpisodePhysics:
             )
         return Verdict.FAIL, reason
 
+    # What pictures are drawn from ---------------------------------------------------
+
+    def _begun_snapshot(self, environment: Any) -> Any:
+        if not self._reader.frame_count:
+            return None
+        with contextlib.suppress(InvalidArgument):
+            return begun_snapshot(
+                self._reader,
+                *environment.simulation(),
+                tolerance=self._derived.tolerance,
+            )
+        return None
+
+    def _pictures(self, model: Any, of_steps: Check, begun: Any) -> Check:
+        if model is None:
+            return self._check(_PICTURES, Verdict.NOT_CHECKABLE, of_steps.reason)
+        substeps = of_steps.figures.get("substeps", 0)
+        if not substeps and self._reader.row_count > 1:
+            reason = f"no step could be made again: {of_steps.reason}"
+            return self._check(_PICTURES, Verdict.NOT_CHECKABLE, reason)
+        try:
+            followed = follow_snapshots(
+                self._reader,
+                model,
+                substeps=substeps,
+                uneven=self._is_mjcf(),
+                begun=begun,
+            )
+        except InvalidArgument as error:
+            return self._check(_PICTURES, Verdict.FAIL, _text(error))
+        return self._judged_pictures(followed, of_steps)
+
+    def _judged_pictures(self, followed: FollowedSnapshots, of_steps: Check) -> Check:
+        differences, unknown = followed.differences, followed.unknown
+        last = self._reader.row_count - 1
+        if not differences.rows:
+            reason = "none of the states that it has pictures of is recorded"
+            return self._check(_PICTURES, Verdict.NOT_CHECKABLE, reason)
+        verdict, reason, figures = judged(differences, self._derived, "picture")
+        if verdict is not Verdict.PASS:
+            place = differences.first if self._derived.is_exact else differences.worst
+            assert place is not None
+            frame = int(np.searchsorted(self._reader.frame_steps, place[0]))
+            reason = f"frame {frame}: {reason}"
+        of_step = of_steps.figures
+        if (
+            verdict is Verdict.FAIL
+            and of_steps.verdict is Verdict.NOT_CHECKABLE
+            and of_step.get("maximum", 0.0) > of_step.get("tolerance", 0.0)
+        ):
+            verdict = Verdict.NOT_CHECKABLE
+            reason = f"its states do not follow by mj_step alone either; {reason}"
+        elif unknown:
+            if verdict is Verdict.PASS and unknown != [last]:
+                verdict = Verdict.NOT_CHECKABLE
+            reason += (
+                f"; of {len(unknown)} more the state is not recorded, the first is "
+                f"that after step {unknown[0]}"
+            )
+        return self._check(_PICTURES, verdict, reason, figures)
+
     # The environment --------------------------------------------------------------
 
     def _replayed(
@@ -347,7 +452,7 @@ class EpisodePhysics:
             kinds = action_kinds(self._reader)
             replay = self._run(environment, observation, kinds[0])
             if len(kinds) > 1 and _only_rewards_differ(replay):
-                observation = environment.begin(self._start())
+                observation = self._begun(environment)
                 other = self._run(environment, observation, kinds[1])
                 if other.rewards.differing < replay.rewards.differing:
                     return other
@@ -376,6 +481,7 @@ class EpisodePhysics:
             kind=kind,
             is_exact=self._fit.is_exact,
             has_limit=self._has_limit(),
+            begins_as_recorded=bool(self._unrepeated),
         )
 
     def _has_limit(self) -> bool:
@@ -386,19 +492,21 @@ class EpisodePhysics:
     ) -> Iterator[Check]:
         doubt = self._doubt(replay, environment)
         how = environment.made_with
-        freely = (
-            ""
-            if replay.synchronised_from is None
-            else f"; from step {replay.synchronised_from} on each step begins at the "
-            "recorded state"
-        )
-        compared = (
-            (_START, replay.first_state, self._derived, f"; {self._began()}"),
-            (_STATES, replay.states, self._fit, freely),
-            (_REWARDS, replay.rewards, self._derived, freely),
-        )
-        for claim, differences, fit, suffix in compared:
-            yield self._judged(claim, differences, fit, suffix, doubt, how)
+        freely = "; put into the first recorded state" if self._unrepeated else ""
+        if replay.synchronised_from is not None:
+            freely += (
+                f"; from step {replay.synchronised_from} on each step begins at the "
+                "recorded state"
+            )
+        if self._unrepeated:
+            yield self._check(_START, Verdict.NOT_CHECKABLE, self._unrepeated)
+        else:
+            began = f"; {self._began()}"
+            yield self._judged(
+                _START, replay.first_state, self._derived, began, doubt, how
+            )
+        yield self._judged(_STATES, replay.states, self._fit, freely, doubt, how)
+        yield self._judged(_REWARDS, replay.rewards, self._derived, freely, doubt, how)
         yield self._ends(replay, doubt, how)
         if self._reader.header.observation is not None:
             yield self._observations(replay, freely, doubt, how)
@@ -416,6 +524,8 @@ class EpisodePhysics:
         verdict, reason, figures = judged(differences, fit, unit)
         if verdict is Verdict.FAIL:
             return self._failed(claim, reason + suffix, doubt, how, figures)
+        if how and claim == _REWARDS:
+            suffix += f"; {how}"
         return self._check(claim, verdict, reason + suffix, figures)
 
     def _ends(self, replay: Replay, doubt: str, how: str) -> Check:
@@ -436,6 +546,8 @@ class EpisodePhysics:
             return self._check(_OBSERVATIONS, Verdict.NOT_CHECKABLE, reason)
         if replay.observations is None:
             return self._failed(_OBSERVATIONS, replay.observation_trouble, doubt, how)
+        if self._unrepeated:
+            suffix += "; the first is not compared"
         return self._judged(
             _OBSERVATIONS, replay.observations, self._derived, suffix, doubt, how
         )

@@ -8,6 +8,8 @@ Of each recorded episode, one after the other, three things are asked:
 - whether the environment, made again, goes through the same states, gives the same
   rewards and observations, and ends where the recording ends (`environment_replay`).
 
+Of each recording, whether it is called as what was made (`name_checks`).
+
 A state that does not follow by MuJoCo alone is a failure, even where the environment
 cannot be made again: it may do more than `mj_step`, such as moving a target, but only
 the environment itself can show that. Where it does, by giving those very states, the
@@ -34,6 +36,7 @@ from ...formats.trajectory_file import open_trajectory
 from ...simulation.mujoco_warnings import log_mujoco_warnings
 from ..verification import Check, Level, Verdict
 from .episode_physics import EpisodePhysics
+from .name_checks import EnvironmentNames
 from .recorded_models import RecordedModels
 from .task import Count, Task
 
@@ -55,13 +58,14 @@ def check_physics(
     ]
     # Else MuJoCo writes a file into the reader's working directory.
     log_mujoco_warnings()
-    workshop = _Workshop(task)
+    workshop, names = _Workshop(task), EnvironmentNames()
     try:
         for number, path in enumerate(paths):
             count(number, len(paths))
-            yield from _checks_of(path, workshop)
+            yield from _checks_of(path, workshop, names)
             if made_again is not None:
                 made_again |= workshop.models.made_again
+        yield from names.checks()
         count(len(paths), len(paths))
     finally:
         workshop.close()
@@ -72,7 +76,9 @@ def _is_trajectory(path: Path) -> bool:
     return is_one and path.suffix in (".h5", ".log")
 
 
-def _checks_of(path: Path, workshop: _Workshop) -> Iterator[Check]:
+def _checks_of(
+    path: Path, workshop: _Workshop, names: EnvironmentNames
+) -> Iterator[Check]:
     subject = f"episode {episode_of(path.name)} of {infix_of(path.name)}"
     if path.suffix == ".log":
         yield Check(
@@ -86,6 +92,7 @@ def _checks_of(path: Path, workshop: _Workshop) -> Iterator[Check]:
         return
     try:
         with open_trajectory(path) as reader:
+            names.add(str(infix_of(path.name)), reader.header.facts)
             episode = EpisodePhysics(reader, subject, workshop.models)
             yield from episode.checks(workshop.made)
     except Error as error:
