@@ -23,6 +23,8 @@ from .tendon_colours import TendonColours, has_limited_tendons, has_plastic_tend
 
 __all__ = [
     "SnapshotSource",
+    "drawn_readings",
+    "layout_objection",
     "needs_constraints",
     "restore_snapshot",
     "snapshot_layout",
@@ -156,6 +158,42 @@ def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | 
     )
 
 
+def layout_objection(model: mujoco.MjModel, layout: RowLayout) -> str | None:
+    """Say why recorded snapshots are none of this model; None if they may be.
+
+    They hold at least what MuJoCo's default option needs.
+    """
+    for field in layout.fields:
+        is_colour = field.name == _TENDON_RGBA
+        if not is_colour and field.name not in _ARRAYS:
+            return f"The snapshots hold {field.name!r:.40}, which no picture needs."
+        own = (
+            Array(_COLOUR, (model.ntendon, 4))
+            if is_colour
+            else _array(model, field.name)
+        )
+        if (field.array.dtype, field.array.shape) != (own.dtype, own.shape):
+            return (
+                f"The snapshots' {field.name} is {field.array.dtype} of the shape "
+                f"{field.array.shape}, and in this model {own.dtype} of {own.shape}."
+            )
+    held = {field.name for field in layout.fields}
+    needed = {name for name in _ALWAYS if _array(model, name).size}
+    if needed - held:
+        return f"The snapshots hold no {', no '.join(sorted(needed - held))}."
+    return None
+
+
+def drawn_readings(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Return which numbers of `sensordata` pictures may show."""
+    drawn = np.zeros(model.nsensordata, bool)
+    for index in range(model.nsensor):
+        if int(model.sensor_type[index]) in _sensor_numbers(_DRAWN_SENSORS):
+            first = model.sensor_adr[index]
+            drawn[first : first + model.sensor_dim[index]] = True
+    return drawn
+
+
 def restore_snapshot(
     values: Mapping[str, NDArray[Any]], model: mujoco.MjModel, data: mujoco.MjData
 ) -> None:
@@ -278,7 +316,10 @@ def _has_islands(model: mujoco.MjModel) -> bool:
 
 
 def _has_sensor(model: mujoco.MjModel, names: tuple[str, ...]) -> bool:
-    kinds = [getattr(mujoco.mjtSensor, name, None) for name in names]
-    numbers = {int(kind) for kind in kinds if kind is not None}
     # Not `np.isin`, whose first call loads numpy's masked arrays (100 ms).
-    return not numbers.isdisjoint(model.sensor_type.tolist())
+    return not _sensor_numbers(names).isdisjoint(model.sensor_type.tolist())
+
+
+def _sensor_numbers(names: tuple[str, ...]) -> set[int]:
+    kinds = [getattr(mujoco.mjtSensor, name, None) for name in names]
+    return {int(kind) for kind in kinds if kind is not None}

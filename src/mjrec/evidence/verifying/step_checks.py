@@ -27,7 +27,13 @@ from ...simulation.state_steps import StateSteps
 from .differences import Differences, compared_columns
 from .recorded_models import is_of_pictures
 
-__all__ = ["BLOCK_ROWS", "FollowedSteps", "follow_steps"]
+__all__ = [
+    "BLOCK_ROWS",
+    "FollowedSteps",
+    "allowed_substeps",
+    "follow_steps",
+    "substeps_between",
+]
 
 # Of a row in a hundred numbers this is a hundred kilobytes.
 BLOCK_ROWS: Final = 256
@@ -59,7 +65,7 @@ class FollowedSteps:
     trouble: str = ""
 
 
-def _substeps_between(
+def substeps_between(
     times: NDArray[np.float64], timestep: float
 ) -> NDArray[np.float64]:
     """Return how many physics steps lie between states, as whole floats or NaN."""
@@ -96,14 +102,14 @@ def follow_steps(
     for start in range(0, reader.row_count - 1, BLOCK_ROWS):
         stop = min(start + BLOCK_ROWS, reader.row_count - 1)
         rows = reader.states(start, stop + 1)
-        raw = _substeps_between(rows[:, clock], steps.timestep)
+        raw = substeps_between(rows[:, clock], steps.timestep)
         if not result.substeps:
             result.substeps = _usual(raw)
             if not 1 <= result.substeps <= _MOST_SUBSTEPS:
                 result.trouble = _strange_time(result.substeps)
                 return result
         is_end = stop == reader.row_count - 1
-        numbers = _allowed(raw, result.substeps, uneven=uneven, is_end=is_end)
+        numbers = allowed_substeps(raw, result.substeps, uneven=uneven, is_end=is_end)
         known: NDArray[np.bool_] = np.asarray(~np.isnan(rows).any(axis=1))
         # MuJoCo would warn of what is no number, and start anew.
         filled = np.where(known[:, np.newaxis], rows, 0.0)
@@ -181,7 +187,7 @@ def _usual(raw: NDArray[np.float64]) -> int:
     return int(np.clip(values[np.argmax(counts)], -1, _MOST_SUBSTEPS + 1))
 
 
-def _allowed(
+def allowed_substeps(
     raw: NDArray[np.float64], usual: int, *, uneven: bool, is_end: bool
 ) -> NDArray[np.int64]:
     """Return with how many physics steps each step is made again.
