@@ -21,6 +21,7 @@ import bagit
 import gymnasium
 import pytest
 import yaml
+from forged_episodes import record_gymnasium
 from packed_runs import record_pendulum, the, unpacked
 from recordings import frames_of, manifest_of, metadata_of, videos_in
 
@@ -304,6 +305,15 @@ def test_the_readme_leads_a_stranger(infix: str, bag: Path) -> None:
     ):
         assert part in text
     assert "has chosen" not in text
+
+
+def test_the_readme_says_what_environments_were_made_with(tmp_path: Path) -> None:
+    """Which makes another environment of one with a name that everybody knows."""
+    env = gymnasium.make("HalfCheetah-v5", forward_reward_weight=100.0)
+    directory = record_gymnasium(tmp_path / "run", env, episodes=1, steps=2)
+    folder = unpacked(mjrec.pack(directory, tmp_path / "a.zip"), tmp_path / "x")
+    said = "- Environment: HalfCheetah-v5, made with forward_reward_weight=100.0\n"
+    assert said in (folder / "data/README.md").read_text()
 
 
 def test_nothing_need_be_stated(recorded: Path, tmp_path: Path) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ...environments.environment_arguments import shown_arguments
 from ...formats.json_fields import read_object, unreadable
 from ...formats.monitor_directory import episode_of, infix_of, iter_monitor_files
 from ...formats.trajectory_file import open_trajectory
@@ -52,6 +53,8 @@ class Session:
         files: the names of all its files and of its models, sorted.
         videos: those among them that the manifest lists, in its order.
         models: the models among them.
+        made_with: the arguments that its environments were made with, each set once,
+            as text; "" is one that had none, or of which nothing is known.
         episodes: how many are complete.
         steps: of these.
         start: when the first began, in seconds since the epoch; None where nothing
@@ -65,6 +68,7 @@ class Session:
     files: tuple[str, ...]
     videos: tuple[PackedVideo, ...]
     models: tuple[str, ...]
+    made_with: tuple[str, ...]
     episodes: int
     steps: int
     start: float | None
@@ -215,7 +219,8 @@ def _session(recordings: Path, files: MonitorFiles, tally: _Tally) -> Session:
         for path in iter_monitor_files(recordings)
         if infix_of(path.name) == files.infix
     ]
-    models = sorted(set(_models(recordings, own)))
+    known = [_of_trajectory(recordings, name) for name in own if name.endswith(".h5")]
+    models = sorted({name for found, _ in known for name in found})
     return Session(
         infix=files.infix,
         env_id=str((results.env_info or {}).get("env_id", "(unknown)")),
@@ -223,6 +228,7 @@ def _session(recordings: Path, files: MonitorFiles, tally: _Tally) -> Session:
         files=tuple(sorted([*own, *models])),
         videos=tuple(_video(recordings, *names) for names in manifest.videos),
         models=tuple(models),
+        made_with=tuple(dict.fromkeys(arguments for _, arguments in known)),
         episodes=tally.episodes,
         steps=tally.steps,
         start=tally.start,
@@ -230,15 +236,19 @@ def _session(recordings: Path, files: MonitorFiles, tally: _Tally) -> Session:
     )
 
 
-def _models(recordings: Path, names: Sequence[str]) -> Iterator[str]:
-    for name in names:
-        if name.endswith(".h5"):
-            with open_trajectory(recordings / name) as reader:
-                model = _mapping(reader.header.facts.get("model"))
-            for kind in ("xml", "mjb"):
-                file = model.get(kind)
-                if isinstance(file, str) and (recordings / file).exists():
-                    yield file
+def _of_trajectory(recordings: Path, name: str) -> tuple[list[str], str]:
+    """Return the names of a trajectory's models, and its environment's arguments."""
+    with open_trajectory(recordings / name) as reader:
+        facts = reader.header.facts
+    model = _mapping(facts.get("model"))
+    files = [
+        file for kind in ("xml", "mjb") if isinstance(file := model.get(kind), str)
+    ]
+    present = [file for file in files if (recordings / file).exists()]
+    environment = _mapping(facts.get("environment"))
+    if environment and environment.get("kwargs") is None:
+        return present, "arguments that are not recorded"
+    return present, shown_arguments(environment.get("kwargs"))
 
 
 def _video(recordings: Path, video: str, metadata: str) -> PackedVideo:

@@ -194,6 +194,10 @@ def _hardware(session: Session) -> Iterator[tuple[str, str]]:
     around = session.surroundings
     cpu = around.get("cpu")
     machine = around.get("machine")
+    arguments = [said or "its defaults" for said in session.made_with]
+    if any(session.made_with):
+        made = "; in other episodes with ".join(arguments)
+        yield "Environment", f"{session.env_id}, made with {made}"
     model = cpu.get("model") if isinstance(cpu, Mapping) else None
     libc = machine.get("libc") if isinstance(machine, Mapping) else None
     yield "System", _said(around.get("system"))
