@@ -27,6 +27,8 @@ from packed_runs import edit_json, make_bag_fit, record_pendulum, the, unpacked
 
 import mjrec
 from mjrec.evidence.verification import Level, Verdict
+from mjrec.formats.trajectory import TrajectoryContent
+from mjrec.formats.trajectory_file import open_trajectory
 
 EPISODES = 4
 
@@ -48,6 +50,11 @@ def bag(honest: Path, tmp_path: Path) -> Path:
 
 def recordings(bag: Path) -> Path:
     return bag / "data" / "recordings"
+
+
+def trajectory(path: Path) -> TrajectoryContent:
+    with open_trajectory(path) as reader:
+        return reader.content()
 
 
 def episode(bag: Path, number: int) -> Path:
@@ -186,6 +193,35 @@ def swap_the_model(bag: Path) -> None:
         old.with_name(old.name.replace(".mjb.gz", ".zip")).unlink()
 
 
+def lift_what_is_drawn(bag: Path) -> None:
+    """The pole is drawn higher than it is, and the video made from that."""
+    path = episode(bag, 1)
+    layout = trajectory(path).header.snapshot
+    [field] = [field for field in layout.fields if field.name == "geom_xpos"]
+
+    def lift(rows: Any) -> None:
+        part = rows[:, field.offset : field.offset + field.array.size]
+        places = np.ascontiguousarray(part).view("<f8")
+        # Of the last geom, the pole.
+        places[:, -1] += 0.2
+        part[:] = places.view(np.uint8)
+
+    forge_episode(path, snapshots=lift)
+    forge_video(bag, 1, drawn(recordings(bag), 1))
+
+
+def draw_another_episode(bag: Path) -> None:
+    """What is drawn of the first episode is shown as the second."""
+    other = trajectory(episode(bag, 0)).snapshots
+
+    def put(rows: Any) -> None:
+        shared = min(len(rows), len(other))
+        rows[:shared] = other[:shared]
+
+    forge_episode(episode(bag, 1), snapshots=put)
+    forge_video(bag, 1, drawn(recordings(bag), 1))
+
+
 def add_a_file(bag: Path) -> None:
     first = video(recordings(bag), 0)
     shutil.copy(
@@ -282,6 +318,8 @@ CASES = (
     Case(swap_videos, PIXELS, "other hashes"),
     Case(relabel_the_best, PIXELS, "other hashes"),
     Case(swap_the_model, PHYSICS, "body_mass"),
+    Case(lift_what_is_drawn, PHYSICS, "frame 0: after step 0 geom_xpos["),
+    Case(draw_another_episode, PHYSICS, "pictures differ"),
     Case(add_a_file, FILES, "video000002"),
     Case(rename_a_file, STATS, "what is inside says 1, its name 9"),
     Case(add_a_scheduled_episode, STATS, "3"),
