@@ -110,20 +110,21 @@ def forge(path: Path, **arrays: Any) -> None:
     Args:
         path: of its file.
         arrays: fields of `TrajectoryContent`, or functions that change a copy of one
-            in place; and `action`, of the header.
+            in place; and `action` and `snapshot`, of the header.
     """
     with open_trajectory(path) as reader:
         content = reader.content()
     header = content.header
     facts = {**header.facts, **arrays.pop("facts", {})}
     action = arrays.pop("action", header.action)
+    snapshot = arrays.pop("snapshot", header.snapshot)
     changed: dict[str, Any] = {}
     for name, value in arrays.items():
         changed[name] = value
         if callable(value):
             changed[name] = np.array(getattr(content, name))
             value(changed[name])
-    header = dataclasses.replace(header, facts=facts, action=action)
+    header = dataclasses.replace(header, facts=facts, action=action, snapshot=snapshot)
     path.unlink()
     write_hdf5(
         _Forged(path, dataclasses.replace(content, header=header, **changed)), path
@@ -184,12 +185,14 @@ def failed(checks: list[Check]) -> list[str]:
     claims = (
         ("the model", "model"),
         ("each recorded state", "steps"),
+        ("what the pictures", "pictures"),
         ("the environment begins", "start"),
         ("the recorded actions", "states"),
         ("the environment gives the recorded rewards", "rewards"),
         ("the environment ends", "ends"),
         ("the environment gives the recorded observations", "observations"),
         ("the episode's states", "file"),
+        ("what the pictures", "pictures"),
         ("the name", "name"),
     )
     short: Mapping[str, str] = dict(claims)

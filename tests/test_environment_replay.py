@@ -107,7 +107,7 @@ def test_a_trusted_environment_shows_what_it_does_besides(tmp_path: Path) -> Non
     """Where the environment gives those very states, MuJoCo alone is not asked."""
     directory = recorded(tmp_path, TELEPORTING)
     checks = physics_of(directory, trust=frozenset([TELEPORTING]))
-    assert verdicts(checks) == {"pass": 7, "not checkable": 1}
+    assert verdicts(checks) == {"pass": 8, "not checkable": 1}
     assert "does more than mj_step" in checks[1].reason
 
 
@@ -120,7 +120,7 @@ def test_a_forged_state_of_such_an_environment_fails(tmp_path: Path) -> None:
 
     forge(episode(directory), states=move)
     checks = physics_of(directory, trust=frozenset([TELEPORTING]))
-    assert failed(checks) == ["steps", "states"]
+    assert failed(checks) == ["steps", "pictures", "states"]
 
 
 def test_actions_with_names_are_put_together_again(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_actions_with_names_are_put_together_again(tmp_path: Path) -> None:
     directory = recorded(tmp_path, NAMED)
     checks = physics_of(directory, trust=frozenset([NAMED]))
     assert failed(checks) == []
-    assert verdicts(checks)["pass"] == 7
+    assert verdicts(checks)["pass"] == 8
 
 
 @pytest.mark.parametrize("parts", ["push", [["push"]], [["push", [7]]], [[1, [1]]]])
@@ -170,7 +170,7 @@ def test_wrappers_that_are_known_are_named(tmp_path: Path) -> None:
     env = gymnasium.wrappers.ClipAction(gymnasium.make("InvertedPendulum-v5"))
     directory = record_gymnasium(tmp_path / "run", env, episodes=1, size=0.02)
     checks = physics_of(directory)
-    assert verdicts(checks) == {"pass": 3, "not checkable": 1}
+    assert verdicts(checks) == {"pass": 4, "not checkable": 1}
     assert "ClipAction" in unchecked(checks)[0].reason
     assert "put Monitor around the environment itself" in unchecked(checks)[0].reason
 

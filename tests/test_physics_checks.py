@@ -80,7 +80,7 @@ def test_an_honest_recording_passes(env_id: str, kind: type, tmp_path: Path) -> 
     """All of a Gymnasium environment passes, whatever float the actions were."""
     env = gymnasium.make(env_id, max_episode_steps=15)
     checks = physics_of(record_gymnasium(tmp_path / "run", env, kind=kind))
-    assert verdicts(checks) == {"pass": 15}
+    assert verdicts(checks) == {"pass": 17}
     assert all(check.reason.startswith("bit for bit") for check in checks[:5])
 
 
@@ -88,7 +88,7 @@ def test_an_episode_that_ends_by_itself_passes(hopper: Path) -> None:
     """A termination is one that the environment gives."""
     with first_episode(hopper) as reader:
         assert reader.terminated[-1]
-    assert verdicts(physics_of(hopper)) == {"pass": 8}
+    assert verdicts(physics_of(hopper)) == {"pass": 9}
 
 
 def test_episodes_that_were_not_seeded_pass(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_episodes_that_were_not_seeded_pass(tmp_path: Path) -> None:
     record_gymnasium(directory, env, seeds=lambda number: None if number else 1)
     # Else the generator would be where it should be by itself.
     episode(directory, 0).unlink()
-    assert verdicts(physics_of(directory)) == {"pass": 8}
+    assert verdicts(physics_of(directory)) == {"pass": 9}
 
 
 @pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Reacher-v5", "Humanoid-v5"])
@@ -110,8 +110,8 @@ def test_an_episode_that_was_never_seeded_goes_on_from_its_first_state(
     directory = tmp_path / "run"
     record_gymnasium(directory, env, seeds=lambda number: None, episodes=1)
     checks = physics_of(directory)
-    assert verdicts(checks) == {"pass": 7, "not checkable": 1}
-    assert all(check.reason.startswith("bit for bit") for check in checks[3:5])
+    assert verdicts(checks) == {"pass": 8, "not checkable": 1}
+    assert all(check.reason.startswith("bit for bit") for check in checks[4:6])
     [start] = unchecked(checks)
     assert start.claim == "the environment begins in the recorded state"
     assert "give reset(seed=...)" in start.reason
@@ -130,7 +130,7 @@ def test_a_random_state_that_is_taken_out_hides_no_reward(tmp_path: Path) -> Non
     """Of the suite's tasks whose resets draw nothing that is not in the state."""
     directory = record_suite(tmp_path / "run", "cheetah", "run", episodes=1)
     forge(episode(directory), facts=NO_SEED)
-    assert verdicts(physics_of(directory)) == {"pass": 7, "not checkable": 1}
+    assert verdicts(physics_of(directory)) == {"pass": 8, "not checkable": 1}
     forge(episode(directory), rewards=lambda r: r.__setitem__(3, 1e3))
     assert failed(physics_of(directory)) == ["rewards"]
 
@@ -171,7 +171,7 @@ def test_what_an_environment_was_made_with_is_said(tmp_path: Path) -> None:
         "HalfCheetah-v5", forward_reward_weight=100.0, render_mode="rgb_array"
     )
     checks = physics_of(record_gymnasium(tmp_path / "run", env, episodes=1))
-    assert verdicts(checks) == {"pass": 8}
+    assert verdicts(checks) == {"pass": 9}
     saying = [c.claim for c in checks if "forward_reward_weight=100.0" in c.reason]
     assert saying == [
         "the environment gives the recorded rewards",
@@ -196,7 +196,7 @@ def test_a_recording_of_the_suite_passes(
 ) -> None:
     """All of a suite's task passes, also where resets change the model."""
     directory = record_suite(tmp_path / "run", domain, task)
-    assert verdicts(physics_of(directory)) == {"pass": 15}
+    assert verdicts(physics_of(directory)) == {"pass": 17}
 
 
 @needs_dm_control
@@ -204,7 +204,7 @@ def test_a_model_that_is_drawn_at_random_is_not_checkable(tmp_path: Path) -> Non
     """The seed of lqr's springs is not recorded, and nobody is accused."""
     directory = record_suite(tmp_path / "run", "lqr", "lqr_2_1", episodes=1)
     checks = physics_of(directory)
-    assert verdicts(checks) == {"not checkable": 3, "pass": 1}
+    assert verdicts(checks) == {"not checkable": 4, "pass": 1}
     assert "draws its model at random" in unchecked(checks)[-1].reason
 
 
@@ -212,7 +212,7 @@ def test_an_mjcf_file_passes(tmp_path: Path) -> None:
     """Its environment is made again from the sources beside the recording."""
     directory = record_mjcf(tmp_path / "run", tmp_path / "ball.xml", BALL)
     checks = physics_of(directory)
-    assert verdicts(checks) == {"pass": 8}
+    assert verdicts(checks) == {"pass": 9}
     assert checks[1].figures["rows"] == 15
 
 
@@ -238,7 +238,9 @@ def raised(index: int) -> Callable[[Any], None]:
     ("forgery", "found"),
     [
         pytest.param(
-            {"states": edited(6, 1)}, ["steps", "states"], id="one bit of a position"
+            {"states": edited(6, 1)},
+            ["steps", "pictures", "states"],
+            id="one bit of a position",
         ),
         pytest.param({"states": edited(6, 0)}, ["steps", "states"], id="of a time"),
         pytest.param({"actions": raised(4)}, ["states", "observations"], id="action"),
@@ -356,7 +358,7 @@ def test_another_machine_is_compared_within_a_tolerance(pendulum: Path) -> None:
     """Numbers that are the same bit for bit pass wherever they were recorded."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mjrec.evidence.verifying.tolerances.machine_fingerprint", dict)
-        assert verdicts(physics_of(pendulum)) == {"pass": 15}
+        assert verdicts(physics_of(pendulum)) == {"pass": 17}
 
 
 @pytest.mark.parametrize(("error", "found"), [(1e-12, []), (1e-7, ["steps", "states"])])
@@ -394,7 +396,7 @@ def test_steps_begin_at_recorded_states_on_another_machine(
 
     forge(episode(directory), states=nudge, facts={"machine": OTHER_MACHINE})
     checks = physics_of(directory)
-    assert verdicts(checks) == {"pass": 8}
+    assert verdicts(checks) == {"pass": 9}
     assert any("begins at the recorded state" in check.reason for check in checks)
 
 
@@ -474,7 +476,7 @@ def test_without_sources_and_environment_nothing_is_proved(forged: Path) -> None
     said = {"framework": "gymnasium", "id": "Nobody-v0", "kwargs": {}, "wrappers": []}
     forge(episode(forged), facts={"environment": said})
     checks = [c for c in physics_of(forged) if "episode 0" in c.subject]
-    assert verdicts(checks) == {"not checkable": 3}
+    assert verdicts(checks) == {"not checkable": 4}
 
 
 def test_a_forged_state_fails_without_its_environment(forged: Path) -> None:
@@ -483,7 +485,7 @@ def test_a_forged_state_fails_without_its_environment(forged: Path) -> None:
     facts = {"environment": said, "env_id": "Nobody-v0"}
     forge(episode(forged), states=edited(6, 1), facts=facts)
     checks = physics_of(forged)
-    assert failed(checks) == ["steps"]
+    assert failed(checks) == ["steps", "pictures"]
 
 
 def test_an_unfinished_log_is_not_checkable(tmp_path: Path) -> None:
@@ -501,7 +503,7 @@ def test_a_damaged_file_is_a_failure_of_its_own(forged: Path) -> None:
     path.write_bytes(path.read_bytes()[:900])
     checks = physics_of(forged)
     assert failed(checks) == ["file"]
-    assert verdicts(checks)["pass"] == 8
+    assert verdicts(checks)["pass"] == 9
 
 
 def first_episode(directory: Path) -> TrajectoryReader:
