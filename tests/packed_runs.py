@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import urllib.parse
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ __all__ = [
     "edit_json",
     "edit_trajectory",
     "make_bag_fit",
+    "make_manifests_fit",
     "record_pendulum",
     "the",
     "unpacked",
@@ -67,7 +69,14 @@ def zipped(bag: Path, archive: Path) -> Path:
 
 
 def make_bag_fit(bag: Path) -> None:
-    """Let the manifests of a bag say what is there, whatever that is."""
+    """Let the lists of a packed run say what is there, whatever that is."""
+    if (bag / "data" / "ro-crate-metadata.json").exists():
+        edit_json(bag / "data" / "ro-crate-metadata.json", _make_crate_fit(bag))
+    make_manifests_fit(bag)
+
+
+def make_manifests_fit(bag: Path) -> None:
+    """Let the manifests alone say it."""
     _write_manifest(bag, "manifest-sha512.txt", _files(bag / "data"))
     tags = (
         path
@@ -115,6 +124,33 @@ def set_reward(path: Path, step: int, reward: float) -> None:
         lambda file: file["rewards"].__setitem__(slice(None), rewards),
         reward=float(np.add.accumulate(rewards)[-1]),
     )
+
+
+def _make_crate_fit(bag: Path) -> Callable[[Any], None]:
+    payload = bag / "data"
+    sizes = {
+        urllib.parse.quote(path.relative_to(payload).as_posix()): path.stat().st_size
+        for path in _files(payload)
+        if path.name != "ro-crate-metadata.json"
+    }
+    recorded = [{"@id": name} for name in sizes if name.startswith("recordings/")]
+    others = [{"@id": name} for name in sizes if not name.startswith("recordings/")]
+    parts = {"./": [*others, {"@id": "recordings/"}], "recordings/": recorded}
+
+    def edit(crate: Any) -> None:
+        graph = [e for e in crate["@graph"] if e["@type"] != "File"]
+        for entity in graph:
+            if entity["@id"] in parts:
+                entity["hasPart"] = parts[entity["@id"]]
+        crate["@graph"] = [
+            *graph,
+            *(
+                {"@id": name, "@type": "File", "contentSize": str(size)}
+                for name, size in sizes.items()
+            ),
+        ]
+
+    return edit
 
 
 def _write_manifest(bag: Path, name: str, paths: Iterable[Path]) -> None:

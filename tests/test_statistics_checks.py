@@ -88,6 +88,14 @@ def test_honest_recordings_pass(honest: Path) -> None:
     assert {check.verdict for check in checks_of(honest)} == {Verdict.PASS}
 
 
+def test_episode_that_is_another_again_is_told(recordings: Path) -> None:
+    """No failure: an author may begin from one seed twice, with the same policy."""
+    first, second = (the(recordings, f"*.episode00000{n}.h5") for n in (0, 1))
+    shutil.copy(first, second)
+    [reason] = [reason for reason in unknown(recordings) if "same seed" in reason]
+    assert reason.startswith("episodes 0, 1 have")
+
+
 def test_returns_are_added_up_as_the_recorder_does() -> None:
     """One after the other: neither in pairs nor with compensation."""
     rewards = np.random.default_rng(0).normal(size=10_000) * 1e8

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..verification import Check
 from .bag_checks import check_bag, no_bag
+from .packed_file_checks import check_packed_files
 from .recorded_file_checks import check_recorded_files
 from .task import Count, Task
 
@@ -26,4 +27,5 @@ def check_files(task: Task, count: Count, *, bag: Path | None) -> Iterator[Check
         yield no_bag()
     else:
         yield from check_bag(bag, count)
+        yield from check_packed_files(bag)
     yield from check_recorded_files(task.recordings, count, is_packed=bag is not None)

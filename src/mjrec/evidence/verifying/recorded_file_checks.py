@@ -57,7 +57,7 @@ def check_recorded_files(
         _check_videos(paths),
         _check_frame_hashes(paths),
         _check_manifests(paths),
-        _check_models(paths),
+        _check_models(paths, is_packed=is_packed),
         _check_strays(directory, paths, is_packed=is_packed),
     )
     for done, part in enumerate(parts):
@@ -214,7 +214,7 @@ def _says_broken(video: Path) -> bool:
         return False
 
 
-def _check_models(paths: list[Path]) -> Iterator[Check]:
+def _check_models(paths: list[Path], *, is_packed: bool) -> Iterator[Check]:
     found = Findings(
         Level.FILES, "each recorded model is the one that its name and the states name"
     )
@@ -227,6 +227,9 @@ def _check_models(paths: list[Path]) -> Iterator[Check]:
         match = _MODEL.fullmatch(path.name)
         if match is not None:
             found.look(path.name, _objection_to_model(path, match["digits"]))
+        # Packing leaves out what nothing refers to; anything may be called so.
+        if is_packed and _is_model(path) and path.name not in named:
+            found.look(path.name, "no recorded states are of this model")
     for name, owner in sorted(named.items()):
         # What it was made from need not be known.
         if name not in known and name.endswith(".mjb.gz"):
@@ -235,6 +238,10 @@ def _check_models(paths: list[Path]) -> Iterator[Check]:
                 f"(of {owner})"
             )
     yield from found.checks(passed="by SHA-256")
+
+
+def _is_model(path: Path) -> bool:
+    return path.name.startswith("openaigym.model.")
 
 
 def _models_of(trajectory: Path, found: Findings) -> Mapping[str, str]:

@@ -17,11 +17,13 @@ import numpy as np
 from ...errors import UnreadableFile
 from ...formats.journal import JournalEntry
 from ...formats.trajectory_file import TrajectoryReader, open_trajectory
-from ..layout import STATISTICS
+from ..layout import ENVIRONMENT, STATISTICS
 from ..verification import Check, Level
 from .choice_checks import check_choice
+from .environment_file_checks import check_environment_file
 from .findings import Findings
 from .recorded_monitors import RecordedMonitor, RecordedVideo, recorded_monitors
+from .repeated_episodes import RepeatedEpisodes
 from .statistics_table import check_table
 from .task import Count, Task
 
@@ -38,7 +40,8 @@ def check_statistics(
     Args:
         task: what is asked for.
         count: told how many trajectories are looked at.
-        is_packed: beside the recordings stands a table of the same statistics.
+        is_packed: beside the recordings stand a table of the same statistics, and what
+            they were made with.
     """
     monitors = list(recorded_monitors(task.recordings))
     total = sum(len(monitor.files.trajectories) for monitor in monitors)
@@ -51,7 +54,9 @@ def check_statistics(
         yield from _check_metadata(monitor)
         yield from check_choice(monitor)
     if is_packed:
-        yield from check_table(task.recordings.parent / STATISTICS, monitors)
+        payload = task.recordings.parent
+        yield from check_table(payload / STATISTICS, monitors)
+        yield from check_environment_file(payload / ENVIRONMENT, monitors)
 
 
 def same(one: Any, other: Any) -> bool:
@@ -191,11 +196,13 @@ def _check_trajectories(monitor: RecordedMonitor, count: Any) -> Iterator[Check]
         "length, return and end of each episode follow from its recorded rewards",
     )
     entries = {entry.episode_id: entry for entry in monitor.entries or ()}
+    repeated = RepeatedEpisodes()
     compared = 0
     for number, path in sorted(monitor.files.trajectories.items()):
         try:
             with open_trajectory(path) as reader:
                 objections = list(_objections(monitor, number, reader, entries))
+                repeated.note(number, reader)
         except UnreadableFile as error:
             objections = [f"it cannot be read: {error.reason}"]
         found.look(_episode(monitor, number), *objections)
@@ -209,6 +216,9 @@ def _check_trajectories(monitor: RecordedMonitor, count: Any) -> Iterator[Check]
             "records those of all)"
         )
     yield from found.checks(passed="bit for bit")
+    different = _findings(monitor, "no two recorded episodes are the same")
+    repeated.look(different)
+    yield from different.checks()
 
 
 def _objections(
