@@ -185,7 +185,6 @@ def failed(checks: list[Check]) -> list[str]:
     claims = (
         ("the model", "model"),
         ("each recorded state", "steps"),
-        ("what the pictures", "pictures"),
         ("the environment begins", "start"),
         ("the recorded actions", "states"),
         ("the environment gives the recorded rewards", "rewards"),

@@ -65,6 +65,7 @@ class RecordedMonitor:
         stats: the statistics file, likewise.
         entries: of the journal; None where there is none that can be read.
         dropped: how many lines of the journal are no episodes.
+        journal_env_id: what the journal says it is of; None where it says nothing.
         videos: in the order of their names.
         reasons: why files cannot be read, by their names.
     """
@@ -75,6 +76,7 @@ class RecordedMonitor:
     stats: StatsFile | None
     entries: tuple[JournalEntry, ...] | None
     dropped: int
+    journal_env_id: Any
     videos: tuple[RecordedVideo, ...]
     reasons: Mapping[str, str]
 
@@ -92,7 +94,7 @@ def recorded_monitors(directory: Path) -> Iterator[RecordedMonitor]:
 
 def _read(directory: Path, files: MonitorFiles) -> RecordedMonitor:
     reasons: dict[str, str] = {}
-    manifest = stats = entries = None
+    manifest = stats = entries = env_id = None
     dropped = 0
     with _noting(reasons):
         manifest = None if files.manifest is None else read_manifest(files.manifest)
@@ -100,7 +102,7 @@ def _read(directory: Path, files: MonitorFiles) -> RecordedMonitor:
         stats = _stats(directory, files, manifest)
     with _noting(reasons):
         if files.journal is not None:
-            entries, dropped = _entries(files.journal)
+            entries, dropped, env_id = _entries(files.journal)
     return RecordedMonitor(
         infix=files.infix,
         files=files,
@@ -108,6 +110,7 @@ def _read(directory: Path, files: MonitorFiles) -> RecordedMonitor:
         stats=stats,
         entries=entries,
         dropped=dropped,
+        journal_env_id=env_id,
         videos=tuple(_videos(directory, files.infix)),
         reasons=reasons,
     )
@@ -128,14 +131,14 @@ def _stats(
     return None if path is None else read_stats_file(path)
 
 
-def _entries(journal: Path) -> tuple[tuple[JournalEntry, ...], int]:
+def _entries(journal: Path) -> tuple[tuple[JournalEntry, ...], int, Any]:
     reader = JournalReader(journal)
     entries: list[JournalEntry] = []
     for entry in reader:
         entries.append(entry)
         if len(entries) > _MOST_EPISODES:
             raise UnreadableFile(journal, f"it has more than {_MOST_EPISODES} episodes")
-    return tuple(entries), reader.dropped
+    return tuple(entries), reader.dropped, (reader.env_info or {}).get("env_id")
 
 
 def _videos(directory: Path, infix: str) -> Iterator[RecordedVideo]:
