@@ -148,6 +148,15 @@ def test_edit_of_the_statistics_file_alone_is_found(
     assert [subject.split(" of")[0] for subject, _ in found] == ["episode 2"]
 
 
+def test_journal_of_another_environment_is_found(recordings: Path) -> None:
+    """The manifest says which it is."""
+    journal = the(recordings, "*.jsonl")
+    text = journal.read_text().replace("InvertedPendulum-v5", "Humanoid-v5")
+    journal.write_text(text)
+    [(_, reason)] = failures(recordings)
+    assert reason.startswith("env_id: the journal says 'Humanoid-v5'")
+
+
 def test_return_that_does_not_follow_from_the_rewards_is_found(
     recordings: Path,
 ) -> None:

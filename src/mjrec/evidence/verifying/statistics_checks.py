@@ -108,6 +108,8 @@ def _check_journal(monitor: RecordedMonitor) -> Iterator[Check]:
         )
     elif monitor.dropped:
         found.cannot_tell(f"{monitor.dropped} lines of the journal are no episodes")
+    for objection in _other_name(monitor):
+        found.fail(f"recording {monitor.infix}", objection)
     types = stats.episode_types or ("t",) * len(stats.timestamps)
     for entry, *row in zip(
         entries,
@@ -131,6 +133,14 @@ def _check_journal(monitor: RecordedMonitor) -> Iterator[Check]:
             ),
         )
     yield from found.checks(passed=f"bit for bit, {len(entries)} episodes")
+
+
+def _other_name(monitor: RecordedMonitor) -> Iterator[str]:
+    said = monitor.journal_env_id
+    if said is not None and monitor.manifest is not None:
+        env_id = monitor.manifest.env_info.get("env_id", said)
+        pairs = {"env_id": (said, env_id)}
+        yield from _differences(pairs, "the journal", "the manifest")
 
 
 def _check_numbers(monitor: RecordedMonitor) -> Iterator[Check]:
