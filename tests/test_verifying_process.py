@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ import mjrec
 from mjrec.evidence.verification import Check, Level, Verdict
 from mjrec.evidence.verifying.level_process import LIMITS, checks_of
 from mjrec.evidence.verifying.task import Task
+from mjrec.formats.locks import Lock
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +147,23 @@ def test_nothing_is_left_after_a_verification(
     assert list(temporary.iterdir()) == []
 
 
+def test_folders_that_killed_verifications_left_are_removed(
+    recordings: Path, temporary: Path
+) -> None:
+    """Not those of the living, nor those that may be anything else."""
+    names = ("killed", "living", "unknown")
+    killed, living, unknown = (temporary / f"mjrec-verify-{name}" for name in names)
+    for folder in (killed, living, unknown):
+        (folder / "unpacked").mkdir(parents=True)
+    (killed / "lock").touch()
+    lock = Lock(living / "lock", "")
+    for folder in (killed, living):
+        os.utime(folder / "lock", (0, 0))
+    mjrec.verify(recordings, level="files")
+    assert set(temporary.iterdir()) == {living, unknown}
+    lock.release()
+
+
 def test_process_ends_with_its_parent(recordings: Path, tmp_path: Path) -> None:
     """However that one dies."""
     program = tmp_path / "program.py"
@@ -184,6 +203,7 @@ def test_process_ends_with_its_parent(recordings: Path, tmp_path: Path) -> None:
 )
 def test_code_that_an_archive_names_is_not_run(
     environment: dict[str, object],
+    recordings: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -194,8 +214,7 @@ def test_code_that_an_archive_names_is_not_run(
     (modules / "evil_of_mjrec_tests.py").write_text(f"open({str(marker)!r}, 'w')\n")
     monkeypatch.setenv("PYTHONPATH", str(modules))
     monkeypatch.syspath_prepend(modules)
-    folder = tmp_path / "recordings"
-    record_pendulum(folder, 1)
+    folder = Path(shutil.copytree(recordings, tmp_path / "recordings"))
     recorded = {
         "framework": "gymnasium",
         "kwargs": {"args": ["touch", str(marker)]},
@@ -212,11 +231,10 @@ def test_code_that_an_archive_names_is_not_run(
 
 
 def test_model_that_includes_files_from_outside_is_not_compiled(
-    tmp_path: Path,
+    recordings: Path, tmp_path: Path
 ) -> None:
     """Neither by an absolute path nor by a relative one."""
-    folder = tmp_path / "recordings"
-    record_pendulum(folder, 1)
+    folder = Path(shutil.copytree(recordings, tmp_path / "recordings"))
     secret = tmp_path / "secret.xml"
     secret.write_text("<mujoco><option timestep='0.5'/></mujoco>")
     model = the(folder, "openaigym.model.*.zip")
@@ -233,6 +251,7 @@ def test_model_that_includes_files_from_outside_is_not_compiled(
     edit_trajectory(
         the(folder, "*episode000000.h5"),
         environment={"framework": "gymnasium", "id": "Mine-v0", "kwargs": {}},
+        env_id="Mine-v0",
     )
     verification = mjrec.verify(folder, level="physics")
     of_physics = [c for c in verification.checks if c.level is Level.PHYSICS]

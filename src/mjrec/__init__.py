@@ -39,6 +39,7 @@ from .errors import (
     ResetNotAllowed,
     UnfinishedRecordings,
     UnknownName,
+    UnreadableArchive,
     UnreadableFile,
     UntrustedModel,
 )
@@ -149,6 +150,7 @@ __all__ = [
     "Trajectory",
     "UnfinishedRecordings",
     "UnknownName",
+    "UnreadableArchive",
     "UnreadableFile",
     "UntrustedModel",
     "VectorMonitor",

@@ -31,6 +31,7 @@
     │   ├── ArchiveTooLarge                 max_size, also with smaller videos
     │   └── IdentityLeft                    anonymous=True, and somebody is named
     ├── UnreadableFile                      a damaged or foreign file
+    │   ├── UnreadableArchive               which `mjrec verify` was given
     │   └── UntrustedModel                  a stranger's, and without its sources
     └── MissingDependency (also ImportError)  an extra is not installed
 
@@ -74,6 +75,7 @@ __all__ = [
     "ResetNotAllowed",
     "UnfinishedRecordings",
     "UnknownName",
+    "UnreadableArchive",
     "UnreadableFile",
     "UntrustedModel",
 ]
@@ -413,6 +415,21 @@ class UnreadableFile(Error):
             else ""
         )
         super().__init__(f"Cannot read {path}: {reason}.{advice}")
+
+
+class UnreadableArchive(UnreadableFile):
+    """What was given to be verified is no packed run, or is damaged."""
+
+    def __init__(self, path: Path, reason: object) -> None:
+        super().__init__(path, reason)
+        # It stands alone: there are no other files of its directory.
+        advice = (
+            " It may not have come whole, or was packed anew by another program: ask "
+            "for the file that `mjrec pack` made again."
+            if path.is_file() and os.access(path, os.R_OK)
+            else ""
+        )
+        self.args = (f"Cannot verify {path}: {self.reason}.{advice}",)
 
 
 class UntrustedModel(UnreadableFile):

@@ -11,8 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from ...errors import UnreadableFile
-from ...formats.json_fields import unreadable
+from ...errors import UnreadableArchive
 from ...formats.monitor_directory import iter_monitor_files
 from ..layout import PAYLOAD, RECORDINGS
 from .digests import digest_of
@@ -60,13 +59,16 @@ def open_archive(path: Path, into: Path) -> Archive:
         into: an empty folder, for what is unpacked.
 
     Raises:
-        UnreadableFile: it is none of these, or damaged, or made to do harm.
+        UnreadableArchive: it is none of these, or damaged, or made to do harm.
         Error: there is too little room in `into`.
     """
     if path.is_dir():
         return _of_folder(path)
-    with unreadable(path):
+    try:
         digest, size = digest_of(path), path.stat().st_size
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else None
+        raise UnreadableArchive(path, reason or error) from error
     bag = unpack(path, into)
     return Archive(
         path=path,
@@ -83,7 +85,7 @@ def _of_folder(path: Path) -> Archive:
         recordings = _recordings_of(bag, path)
         return Archive(path=path, kind=Kind.BAG, bag=bag, recordings=recordings)
     if next(iter_monitor_files(path), None) is None:
-        raise UnreadableFile(
+        raise UnreadableArchive(
             path,
             "it is neither a packed run (a zip file, or a folder with bagit.txt) nor a "
             "monitor directory: nothing is recorded in it",
@@ -105,11 +107,11 @@ def _recordings_of(bag: Path, given: Path) -> Path:
     """Return the monitor directory inside a bag, which no link leads to."""
     place = bag
     if not _is_folder(bag):
-        raise UnreadableFile(given, "the folder that it holds is a link")
+        raise UnreadableArchive(given, "the folder that it holds is a link")
     for name in (PAYLOAD, RECORDINGS):
         place /= name
         if not _is_folder(place):
-            raise UnreadableFile(
+            raise UnreadableArchive(
                 given,
                 f"it has no folder {PAYLOAD}/{RECORDINGS}: it is not what `mjrec pack` "
                 "makes",

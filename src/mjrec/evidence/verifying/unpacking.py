@@ -9,7 +9,7 @@ import zlib
 from pathlib import Path
 from typing import IO
 
-from ...errors import Error, FileNotWritten, UnreadableFile
+from ...errors import Error, FileNotWritten, UnreadableArchive
 from ...formats.regular_files import open_regular
 from .portable_names import portable_parts
 from .zip_contents import ZipContents, check_table, zip_contents
@@ -32,7 +32,7 @@ def unpack(path: Path, into: Path) -> Path:
         into: a folder that is there, empty, and nobody else's.
 
     Raises:
-        UnreadableFile: it is damaged, no plain archive, or made to do harm.
+        UnreadableArchive: it is damaged, no plain archive, or made to do harm.
         Error: there is too little room in `into`.
     """
     try:
@@ -44,9 +44,9 @@ def unpack(path: Path, into: Path) -> Path:
     except FileNotWritten:
         raise
     except OSError as error:
-        raise UnreadableFile(path, error.strerror or error) from error
+        raise UnreadableArchive(path, error.strerror or error) from error
     except _NOT_READ as error:
-        raise UnreadableFile(path, error) from error
+        raise UnreadableArchive(path, error) from error
     return into / contents.top
 
 

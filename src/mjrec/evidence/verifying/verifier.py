@@ -8,13 +8,17 @@ import importlib
 import importlib.metadata
 import operator
 import os
-import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...errors import DirectoryNotWritable, InvalidArgument, UnknownName, UnreadableFile
+from ...errors import (
+    DirectoryNotWritable,
+    InvalidArgument,
+    UnknownName,
+    UnreadableArchive,
+)
 from ...fingerprint import machine_fingerprint
 from ...formats.json_fields import read_object
 from ..layout import ENVIRONMENT
@@ -22,6 +26,7 @@ from ..verification import Level, Verification
 from .archive import Archive, open_archive
 from .level_process import checks_of
 from .task import Task
+from .working_folder import working_folder
 
 __all__ = ["VerificationProgress", "verify"]
 
@@ -78,7 +83,7 @@ def verify(
         All that was found. Nothing that fails raises.
 
     Raises:
-        UnreadableFile: there is no such file, or it is damaged, or made to do harm.
+        UnreadableArchive: there is no such file, or it is damaged, or made to do harm.
         InvalidArgument: there is no such level, or `sample` is not 1 or more.
         MissingDependency: a report needs the extra `evidence`.
         DirectoryNotWritable: the report cannot be written there.
@@ -91,8 +96,8 @@ def verify(
     told = on_progress or (lambda _: None)
     given = Path(path)
     if not given.exists():
-        raise UnreadableFile(given, "there is no such file or directory")
-    with _temporary_folder() as folder:
+        raise UnreadableArchive(given, "there is no such file or directory")
+    with working_folder() as folder:
         unpacked, place = folder / "unpacked", folder / "child"
         pictures = folder / "pictures"
         for made in (unpacked, place, pictures):
@@ -153,14 +158,6 @@ def _report_writer(page: Path) -> Callable[..., object]:
     module = importlib.import_module(".verification_report", __package__)
     writer: Callable[..., object] = module.write_verification_report
     return writer
-
-
-@contextlib.contextmanager
-def _temporary_folder() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(
-        prefix="mjrec-verify-", ignore_cleanup_errors=True
-    ) as folder:
-        yield Path(folder)
 
 
 def _environment(archive: Archive) -> Mapping[str, Any]:
