@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,10 @@ from mjrec.evidence.verifying.pixel_checks import check_pixels
 from mjrec.evidence.verifying.task import Task
 
 STEPS = 6
-DECODES, DRAWN, ENCODED, ALIKE = range(4)
+DECODES, PACED, DRAWN, ENCODED, ALIKE = range(5)
 CLAIMS = (
     "the video decodes to the recorded number of frames and to their hash",
+    "each frame of the video is shown for as long as was recorded",
     "the pictures drawn from the recorded snapshots have the shipped hashes",
     "encoding the drawn pictures again gives the shipped file",
     "the shipped frames show the pictures drawn",
@@ -95,7 +97,7 @@ def verdicts(directory: Path, episode: int = 0, **options: Any) -> list[Verdict]
 def test_an_honest_run_passes(honest: Path) -> None:
     """Bit for bit and byte for byte, on the machine that recorded it."""
     checks = found(honest)
-    assert len(checks) == 8
+    assert len(checks) == 10
     assert {check.verdict for check in checks.values()} == {PASS}
     assert checks[1, DRAWN].reason == "7 frames, bit for bit"
     assert checks[1, ENCODED].reason == "7 frames, byte for byte"
@@ -135,15 +137,15 @@ def test_one_pixel_changed_with_every_hash_made_to_fit(run: Path) -> None:
     """The drawn picture has another hash, and is encoded to another file."""
     forge(video(run), one_pixel(drawn(run)))
     checks = found(run)
-    assert [checks[0, claim].verdict for claim in range(3)] == [PASS, FAIL, FAIL]
+    assert [checks[0, claim].verdict for claim in range(4)] == [PASS, PASS, FAIL, FAIL]
     assert "1 of 7 drawn have other hashes: 3" in checks[0, DRAWN].reason
-    assert verdicts(run, 1) == [PASS] * 4
+    assert verdicts(run, 1) == [PASS] * 5
 
 
 def test_one_pixel_changed_in_the_video_alone(alone: Path) -> None:
     """The frames' hashes are true, and the file is not what they are encoded to."""
     forge(video(alone), one_pixel(drawn(alone)), hashes=False)
-    assert verdicts(alone)[:3] == [PASS, PASS, FAIL]
+    assert verdicts(alone)[:4] == [PASS, PASS, PASS, FAIL]
 
 
 @pytest.mark.parametrize(
@@ -177,7 +179,7 @@ def test_videos_swapped_between_episodes(run: Path) -> None:
         one.write_bytes(other.read_bytes())
         other.write_bytes(content)
     for episode in (0, 1):
-        assert verdicts(run, episode) == [PASS, FAIL, FAIL, FAIL]
+        assert verdicts(run, episode) == [PASS, PASS, FAIL, FAIL, FAIL]
 
 
 def test_a_video_relabelled_as_another_episodes(run: Path) -> None:
@@ -187,8 +189,8 @@ def test_a_video_relabelled_as_another_episodes(run: Path) -> None:
         video(run, 0).with_suffix(ending).write_bytes(content)
     said = metadata(video(run, 1))
     say(video(run, 0), decoded_sha256=said["decoded_sha256"])
-    assert verdicts(run, 0) == [PASS, FAIL, FAIL, FAIL]
-    assert verdicts(run, 1) == [PASS] * 4
+    assert verdicts(run, 0) == [PASS, PASS, FAIL, FAIL, FAIL]
+    assert verdicts(run, 1) == [PASS] * 5
 
 
 def test_who_names_another_driver_is_left_with_little_room(alone: Path) -> None:
@@ -210,12 +212,12 @@ def test_the_same_software_on_another_cpu_may_differ_by_roundings(alone: Path) -
     changed = [frame ^ np.uint8(1) for frame in drawn(alone)]
     forge(video(alone), changed)
     say(video(alone), machine={"architecture": "x86_64", "cpu_flags": "0" * 64})
-    assert verdicts(alone) == [PASS, OPEN, OPEN, PASS]
+    assert verdicts(alone) == [PASS, PASS, OPEN, OPEN, PASS]
     painted = [frame.copy() for frame in changed]
     # Fainter than what another driver might differ.
     painted[4][8:16, 8:16] = np.minimum(painted[4][8:16, 8:16], 219) + np.uint8(36)
     forge(video(alone), painted)
-    assert verdicts(alone) == [PASS, OPEN, OPEN, FAIL]
+    assert verdicts(alone) == [PASS, PASS, OPEN, OPEN, FAIL]
 
 
 def test_an_honest_video_that_another_driver_drew(
@@ -224,7 +226,11 @@ def test_an_honest_video_that_another_driver_drew(
     """Mesa's other rasteriser draws otherwise, and near enough; the room is stated."""
     monkeypatch.setenv("GALLIUM_DRIVER", "softpipe")
     checks = found(alone)
-    assert [checks[0, claim].verdict for claim in range(4)] == [PASS, OPEN, OPEN, PASS]
+    assert [checks[0, claim].verdict for claim in (DRAWN, ENCODED, ALIKE)] == [
+        OPEN,
+        OPEN,
+        PASS,
+    ]
     assert "softpipe" in checks[0, DRAWN].reason
     assert "not noticed would be" in checks[0, ALIKE].reason
     assert checks[0, ALIKE].figures["unnoticed_square"] < 4
@@ -236,7 +242,7 @@ def test_another_pose_is_noticed_with_another_driver(
     """The other episode's pictures are beyond what a driver may differ."""
     forge(video(run), drawn(run, 1))
     monkeypatch.setenv("GALLIUM_DRIVER", "softpipe")
-    assert verdicts(run) == [PASS, OPEN, OPEN, FAIL]
+    assert verdicts(run) == [PASS, PASS, OPEN, OPEN, FAIL]
 
 
 def test_an_honest_video_of_another_encoder(run: Path) -> None:
@@ -245,11 +251,15 @@ def test_an_honest_video_of_another_encoder(run: Path) -> None:
     forge(video(run), drawn(run), crf=17)
     say(video(run), ffmpeg_sha256="0" * 64, encoder_version=arguments)
     checks = found(run)
-    assert [checks[0, claim].verdict for claim in range(4)] == [PASS, PASS, OPEN, PASS]
+    assert [checks[0, claim].verdict for claim in (DRAWN, ENCODED, ALIKE)] == [
+        PASS,
+        OPEN,
+        PASS,
+    ]
     assert "another ffmpeg encoded it" in checks[0, ENCODED].reason
     # Who was that very ffmpeg has to make the very bytes.
     say(video(run), ffmpeg_sha256=metadata(video(run, 1))["ffmpeg_sha256"])
-    assert verdicts(run) == [PASS, PASS, FAIL, PASS]
+    assert verdicts(run) == [PASS, PASS, PASS, FAIL, PASS]
 
 
 def test_a_command_line_of_the_archive_is_not_run(alone: Path, tmp_path: Path) -> None:
@@ -267,7 +277,11 @@ def test_a_command_line_of_the_archive_is_not_run(alone: Path, tmp_path: Path) -
 def test_a_sample_is_drawn_from_its_seed(alone: Path) -> None:
     """So many frames of each video, the same each time; the rest is said."""
     checks = found(alone, sample=2, seed=5)
-    assert [checks[0, claim].verdict for claim in range(4)] == [PASS, PASS, OPEN, PASS]
+    assert [checks[0, claim].verdict for claim in (DRAWN, ENCODED, ALIKE)] == [
+        PASS,
+        OPEN,
+        PASS,
+    ]
     assert checks[0, DRAWN].reason == "2 of 7 frames, bit for bit"
     assert "leave --sample out" in checks[0, ENCODED].reason
     assert found(alone, sample=2, seed=5) == checks
@@ -276,7 +290,7 @@ def test_a_sample_is_drawn_from_its_seed(alone: Path) -> None:
 
 def test_a_sample_of_all_frames_is_no_sample(alone: Path) -> None:
     """Also where more are asked for than there are."""
-    assert verdicts(alone, sample=100) == [PASS] * 4
+    assert verdicts(alone, sample=100) == [PASS] * 5
 
 
 def test_the_frame_that_differs_most_is_shown(alone: Path, tmp_path: Path) -> None:
@@ -306,7 +320,7 @@ def test_every_kind_of_video_is_drawn_again(
 ) -> None:
     """With its cameras, captions, quality, size and rate."""
     checks = checks_of(record(tmp_path / "run", **options))
-    assert len(checks) == 4 * videos
+    assert len(checks) == 5 * videos
     assert {check.verdict for check in checks} == {PASS}
 
 
@@ -318,22 +332,99 @@ def test_a_video_rendered_again_beside_the_original(alone: Path) -> None:
     variant = Variant(view=View(camera=-1, height=24, width=32), max_fps=10)
     [outcome] = render_again(sorted(alone.glob("*.h5"))[:1], variant, workers=1)
     checks = [check for check in checks_of(alone) if check.subject == outcome.name]
-    assert [check.verdict for check in checks] == [PASS] * 4
+    assert [check.verdict for check in checks] == [PASS] * 5
 
 
-def test_a_live_video_is_decoded_and_the_rest_is_said(tmp_path: Path) -> None:
-    """With the reason why it was drawn live."""
-    run = record(tmp_path / "run", render="live")
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"camera": [None, "track"], "tiled": True}, {"annotate": True}],
+    ids=["alone", "tiled", "annotated"],
+)
+def test_a_live_video_of_a_known_environment_shows_its_snapshots(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    """It is drawn from them, whatever was said of when it was drawn."""
+    run = record(tmp_path / "run", render="live", **options)
+    assert verdicts(run) == [PASS] * 5
+    forge(video(run), [255 - frame for frame in drawn(run)])
+    assert FAIL in verdicts(run)
+
+
+class Bar(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Draws on the pictures."""
+
+    def render(self) -> Any:
+        frame = np.array(self.env.render())
+        frame[:4] = 255
+        return frame
+
+
+@pytest.mark.parametrize("render", [None, "live"])
+def test_a_live_video_may_show_what_wrappers_draw(
+    tmp_path: Path, render: str | None
+) -> None:
+    """No failure: the reason names the wrapper."""
+    made = gymnasium.make(
+        "HalfCheetah-v5",
+        max_episode_steps=2,
+        render_mode="rgb_array",
+        height=48,
+        width=64,
+    )
+    with mjrec.Monitor(
+        Bar(made), tmp_path / "run", mode="evaluation", render=render
+    ) as env:
+        run_episodes(env, 1)
+    checks = found(tmp_path / "run")
+    assert [checks[0, claim].verdict for claim in range(5)] == [PASS] * 2 + [OPEN] * 3
+    assert "Bar" in checks[0, DRAWN].reason
+
+
+def test_a_video_that_plays_at_another_speed(alone: Path) -> None:
+    """The frames are the same, and the time of each is another."""
+    forge(video(alone), drawn(alone), fps=30)
+    checks = found(alone)
+    assert checks[0, DECODES].verdict is PASS
+    assert checks[0, PACED].verdict is FAIL
+    assert "30 frames a second" in checks[0, PACED].reason
+
+
+def test_a_video_whose_rate_an_older_version_rounded(alone: Path) -> None:
+    """It plays at the usual rate next to the recorded one, and nobody is to blame."""
+    forge(video(alone), drawn(alone), fps=Fraction(201, 10), hashes=False)
+    encoder = metadata(video(alone))["encoder_version"]
+    old = ["-framerate" if each == "-r" else each for each in encoder["cmdline"]]
+    say(video(alone), encoder_version={**encoder, "cmdline": old})
+    assert verdicts(alone) == [PASS, OPEN, PASS, OPEN, PASS]
+
+
+def test_a_video_of_an_older_version_is_encoded_again(alone: Path) -> None:
+    """What it told ffmpeg of the rate has given the same file."""
+    encoder = metadata(video(alone))["encoder_version"]
+    old = ["-framerate" if each == "-r" else each for each in encoder["cmdline"]]
+    say(video(alone), encoder_version={**encoder, "cmdline": old})
+    assert verdicts(alone) == [PASS] * 5
+
+
+def test_a_live_video_that_is_counted_in_steps(tmp_path: Path) -> None:
+    """It is of no episode, so it fits none."""
+    run = record(
+        tmp_path / "run",
+        mode="evaluation",
+        render="live",
+        episodes="none",
+        video_length=3,
+    )
     checks = found(run)
-    assert [checks[0, claim].verdict for claim in range(4)] == [PASS] + [OPEN] * 3
-    assert "drawn live" in checks[0, DRAWN].reason
+    assert checks[0, DRAWN].verdict is OPEN
+    assert "counted in steps" in checks[0, DRAWN].reason
 
 
 def test_a_video_without_a_simulation(tmp_path: Path) -> None:
     """There is no trajectory to draw from."""
     with mjrec.Monitor(Corridor(), tmp_path / "run") as env:
         run_episodes(env, 1)
-    assert verdicts(tmp_path / "run") == [PASS, OPEN, OPEN, OPEN]
+    assert verdicts(tmp_path / "run") == [PASS, PASS, OPEN, OPEN, OPEN]
 
 
 def test_a_text_recording_has_no_pixels(tmp_path: Path) -> None:
@@ -358,11 +449,11 @@ def test_a_model_that_is_missing_or_a_strangers(
 ) -> None:
     """Without its sources nothing is drawn, and that is said."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "stranger"))
-    assert verdicts(alone) == [PASS] * 4
+    assert verdicts(alone) == [PASS] * 5
     for path in alone.glob("*.zip"):
         path.unlink()
     checks = found(alone)
-    assert [checks[0, claim].verdict for claim in range(4)] == [PASS] + [OPEN] * 3
+    assert [checks[0, claim].verdict for claim in range(5)] == [PASS] * 2 + [OPEN] * 3
     assert "is not loaded" in checks[0, DRAWN].reason
 
 
@@ -412,7 +503,7 @@ def test_what_is_no_video_is_a_failure(
     """Told, not raised; and the other video is checked."""
     damage(video(run))
     assert verdicts(run)[0] is FAIL
-    assert verdicts(run, 1) == [PASS] * 4
+    assert verdicts(run, 1) == [PASS] * 5
 
 
 @pytest.mark.parametrize(
@@ -463,4 +554,4 @@ def test_where_nothing_can_be_drawn(
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json")
     for episode in (0, 1):
-        assert verdicts(honest, episode) == [PASS, OPEN, OPEN, OPEN]
+        assert verdicts(honest, episode) == [PASS, PASS, OPEN, OPEN, OPEN]

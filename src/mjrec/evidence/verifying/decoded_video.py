@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
@@ -27,9 +26,7 @@ __all__ = ["DecodedVideo"]
 
 _READ_SIZE: Final = 1 << 20
 _LONGEST_HEADER: Final = 1024
-_HEADER: Final = re.compile(
-    rb"YUV4MPEG2 W(\d{1,5}) H(\d{1,5}) F(\d{1,10}):(\d{1,10}) [^\n]*"
-)
+_HEADER: Final = re.compile(rb"YUV4MPEG2 W(\d{1,5}) H(\d{1,5}) [^\n]*")
 _FRAME: Final = b"FRAME\n"
 
 
@@ -42,7 +39,6 @@ class DecodedVideo:
     Attributes:
         height: of its frames, in pixels.
         width: likewise.
-        fps: frames per second; None where the file does not say.
 
     Raises:
         UnreadableFile: it is no regular file.
@@ -120,11 +116,10 @@ class DecodedVideo:
         match = _HEADER.fullmatch(line)
         if match is None:
             raise UnreadableFile(path, f"ffmpeg says {line!r:.80} of it")
-        width, height, above, below = map(int, match.groups())
+        width, height = map(int, match.groups())
         if height % 2 or width % 2:
             raise UnreadableFile(path, f"its frames are {width}x{height}")
         self.height, self.width = height, width
-        self.fps = Fraction(above, below) if above and below else None
 
     def _take(self, size: int) -> bytes:
         """Return so many bytes; fewer at the end."""

@@ -7,6 +7,7 @@ metadata: that has to fit. Which trajectory it is follows from the video's name.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -35,6 +36,7 @@ from ...rendering.videos import (
     video_path,
 )
 from ...rendering.views import PlainCamera, View, plain_camera
+from .live_pictures import told_live, why_others_are_shown
 from .shipped_video import ShippedVideo
 
 __all__ = ["DoesNotFit", "DrawingPlan", "NotDrawable", "plan_drawing"]
@@ -58,6 +60,8 @@ class DrawingPlan:
         view: how they are drawn.
         cameras: all of them, where they are in one picture.
         captions: what is written on them, by frame; None where nothing is.
+        excuse: why the video may show something else than what is drawn, as it was
+            drawn live; None where it must show that.
         mujoco: the version that recorded it, or None.
         machine: the fingerprint of the machine that recorded it; None where nobody
             says.
@@ -68,6 +72,7 @@ class DrawingPlan:
     view: View
     cameras: Sequence[PlainCamera | None] | None
     captions: Sequence[Caption] | None
+    excuse: str | None
     mujoco: str | None
     machine: Mapping[str, Any] | None
 
@@ -96,22 +101,49 @@ def plan_drawing(video: ShippedVideo) -> DrawingPlan:
     except Error as error:
         raise DoesNotFit(f"its trajectory cannot be read: {error}") from error
     with reader:
-        facts = reader.header.facts
         try:
-            seen = _seen(video, path, reader)
-            _check_fits(video, reader, seen)
-            captions = _captions(reader, seen)
+            excuse = _excuse(video, path, reader)
         except Error as error:
             raise DoesNotFit(str(error)) from error
+        try:
+            return _plan(video, path, reader, excuse)
+        except (DoesNotFit, Error) as error:
+            told = str(error)
+            if excuse is None:
+                raise DoesNotFit(told) from error
+            reason = f"{told}; it was drawn live, and {excuse}"
+            raise NotDrawable(reason) from error
+
+
+def _plan(
+    video: ShippedVideo, path: Path, reader: TrajectoryReader, excuse: str | None
+) -> DrawingPlan:
+    seen = _seen(video, path, reader)
+    _check_fits(video, reader, seen)
+    facts = reader.header.facts
     return DrawingPlan(
         trajectory=path,
         indices=seen.chosen.indices,
         view=seen.view,
         cameras=seen.cameras,
-        captions=captions,
+        captions=_captions(reader, seen),
+        excuse=excuse,
         mujoco=_mujoco(facts),
         machine=_machine(facts),
     )
+
+
+def _excuse(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> str | None:
+    """Return why a video may show something else than what was recorded."""
+    facts = reader.header.facts
+    if not _is_live(facts) or video.name not in _original_views(path, facts):
+        return None
+    return why_others_are_shown(video, facts)
+
+
+def _is_live(facts: Mapping[str, Any]) -> bool:
+    recorded = facts.get("video")
+    return recorded is not None and recorded.get("recording") == "live"
 
 
 def _trajectory_of(video: ShippedVideo) -> Path:
@@ -124,7 +156,7 @@ def _trajectory_of(video: ShippedVideo) -> Path:
         if path.exists():
             return path
     if video.is_live:
-        raise NotDrawable(_told_live(video.live_reason))
+        raise NotDrawable(told_live(video.live_reason))
     raise NotDrawable(
         f"there is no trajectory {stem}.h5 to draw from: the states of its episode "
         "were not recorded (mode='evaluation' or trajectory_callable records them), or "
@@ -136,20 +168,28 @@ def _seen(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> _Seen:
     """Return what a video is to show, after its own trajectory."""
     facts = reader.header.facts
     recorded = facts.get("video")
+    if recorded is None and video.is_clip:
+        raise NotDrawable("it is a video that is counted in steps")
     if recorded is None:
         raise DoesNotFit(
             f"{path.name} says that no video of its episode was to be recorded"
         )
     views = _original_views(path, facts)
-    if video.name in views and recorded.get("recording") == "live":
-        raise NotDrawable(_told_live(recorded.get("reason") or video.live_reason))
     try:
         check_has_pictures(reader)
     except NoPictures as error:
+        if video.name in views and _is_live(facts):
+            reason = recorded.get("reason") or facts.get("refusal")
+            raise NotDrawable(told_live(reason or video.live_reason)) from error
         raise NotDrawable(str(error).removesuffix(".")) from error
     if video.name not in views:
         return _seen_again(video, reader)
     camera, tiles = views[video.name]
+    if _is_live(facts):
+        # Drawn with a size of its own it may show what the environment does not.
+        first = _variant_camera(video.first_camera, facts)
+        camera = first if camera is None and tiles is None else camera
+        tiles = None if tiles is None else (first, *tiles[1:])
     chosen = ChosenFrames(list(range(reader.frame_count)), 1)
     return _Seen(
         view=_sized(video, reader, camera, tiles),
@@ -157,14 +197,6 @@ def _seen(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> _Seen:
         chosen=chosen,
         is_annotated=is_annotated(facts),
         fps=usual_fps(facts, chosen),
-    )
-
-
-def _told_live(reason: str | None) -> str:
-    why = f", because {reason:.500}" if reason else ""
-    return (
-        f"it was drawn live, as the environment itself showed it{why}; nothing else "
-        "is recorded that it could be drawn from"
     )
 
 
@@ -191,6 +223,9 @@ def _sized(
     """Return the view of a recorded video: as recorded, or smaller."""
     facts = reader.header.facts
     quality = facts["video"].get("quality", "full")
+    if _is_live(facts):
+        # Whoever draws live draws as the environment does.
+        quality = video.quality
     if video.quality != quality:
         raise DoesNotFit(
             f"its metadata says quality {video.quality}, and its trajectory {quality}"
@@ -204,7 +239,8 @@ def _sized(
             f"its metadata says {width}x{height} pixels, and its trajectory "
             f"{recorded[1]}x{recorded[0]}"
         )
-    return View(camera=camera, height=height, width=width)
+    view = View(camera=camera, height=height, width=width)
+    return dataclasses.replace(view, quality=quality) if _is_live(facts) else view
 
 
 def _seen_again(video: ShippedVideo, reader: TrajectoryReader) -> _Seen:
@@ -220,7 +256,7 @@ def _seen_again(video: ShippedVideo, reader: TrajectoryReader) -> _Seen:
     last = reader.frame_count - 1
     return _Seen(
         view=View(
-            camera=_variant_camera(video, reader.header.facts),
+            camera=_variant_camera(video.camera, reader.header.facts),
             height=video.height,
             width=video.width,
             quality=video.quality,
@@ -232,11 +268,10 @@ def _seen_again(video: ShippedVideo, reader: TrajectoryReader) -> _Seen:
 
 
 def _variant_camera(
-    video: ShippedVideo, facts: Mapping[str, Any]
+    camera: PlainCamera | None, facts: Mapping[str, Any]
 ) -> PlainCamera | None:
-    """Return the camera of a video that was rendered again; None is as recorded."""
-    label = facts["scene"].get("label")
-    return None if video.camera == label else video.camera
+    """Return the camera that metadata names, as a view has it: None is as recorded."""
+    return None if camera == facts["scene"].get("label") else camera
 
 
 def _check_fits(video: ShippedVideo, reader: TrajectoryReader, seen: _Seen) -> None:

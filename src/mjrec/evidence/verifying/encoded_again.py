@@ -20,7 +20,9 @@ from ...formats.video_writer import VideoWriter
 from ...frames import Frame
 from .shipped_video import ShippedVideo
 
-__all__ = ["EncodedAgain"]
+__all__ = ["OLD_RATE", "EncodedAgain"]
+
+OLD_RATE: Final = "-framerate"
 
 _READ_SIZE: Final = 1 << 20
 
@@ -101,7 +103,9 @@ class EncodedAgain:
         # But for the name of the file.
         ours = unfinished.encoder["arguments"][:-1]
         theirs = list(video.encoder_arguments)[:-1]
-        if ours == theirs:
+        # An older mjrec said `-framerate`, which gives the same file wherever its
+        # frames then last as long as recorded; else that is told already.
+        if ours in (theirs, ["-r" if each == OLD_RATE else each for each in theirs]):
             return None
         odd = [argument for argument in theirs if argument not in ours]
         missing = [argument for argument in ours if argument not in theirs]

@@ -3,7 +3,8 @@
 
 What proves most comes first, and what is left is said:
 
-- the shipped file decodes to the recorded number of frames and to their recorded hash;
+- the shipped file decodes to the recorded number of frames and to their recorded hash,
+  and shows each for the recorded time;
 - the pictures drawn from the recorded snapshots are those whose hashes were shipped,
   bit for bit where the same driver draws;
 - encoding them again gives the shipped file, byte for byte, where the same ffmpeg does;
@@ -17,11 +18,13 @@ forges it may name others; then the last of these is what is left, with its limi
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import itertools
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,7 +44,8 @@ from ..verification import Check, Level, Verdict
 from .decoded_video import DecodedVideo
 from .difference_picture import difference_picture, png
 from .drawing_plan import DoesNotFit, DrawingPlan, NotDrawable, plan_drawing
-from .encoded_again import EncodedAgain
+from .encoded_again import OLD_RATE, EncodedAgain
+from .frame_times import UnevenTimes, rate_of_frames
 from .likeness import OTHER_ENCODER, OTHER_RENDERER, Likeness
 from .picture_similarity import Planes, planes_of, similarity
 from .shipped_video import (
@@ -55,6 +59,7 @@ from .task import Count, Task
 __all__ = ["check_pixels"]
 
 _DECODES: Final = "the video decodes to the recorded number of frames and to their hash"
+_PACED: Final = "each frame of the video is shown for as long as was recorded"
 _DRAWN: Final = "the pictures drawn from the recorded snapshots have the shipped hashes"
 _ENCODED: Final = "encoding the drawn pictures again gives the shipped file"
 _ALIKE: Final = "the shipped frames show the pictures drawn"
@@ -66,6 +71,8 @@ _TEXT: Final = "video/vnd.openai.ansivid"
 _SOFTWARE: Final = ("llvmpipe", "softpipe", "swrast")
 _MOST_NAMED: Final = 5
 _FRAMES_OF_A_WORKER: Final = 32
+# As far from a usual rate as ffmpeg has been seen to round one: 125 to 120.
+_NEAR: Final = Fraction(1, 20)
 
 
 def check_pixels(
@@ -102,10 +109,12 @@ def check_pixels(
                 yield video
                 continue
             whole = _check_decodes(video)
-            yield whole
+            paced = _check_paced(video)
+            yield from (whole, paced)
             yield from studio.check(
                 video,
                 is_whole=whole.verdict is Verdict.PASS,
+                is_paced=paced.verdict is not Verdict.NOT_CHECKABLE,
                 on_frame=lambda done=done: count(next(done), sum(totals)),
             )
             count(end, sum(totals))
@@ -186,11 +195,6 @@ def _what_is_wrong_inside(video: ShippedVideo) -> str | None:
                 f"it is {decoded.width}x{decoded.height} pixels large, and its "
                 f"metadata says {width}x{height}"
             )
-        if decoded.fps is not None and decoded.fps != video.fps:
-            return (
-                f"it has {decoded.fps} frames a second, and its metadata says "
-                f"{video.fps}"
-            )
         for number, planes in enumerate(decoded, 1):
             # Nobody need decode for ever what is too long already.
             if number > video.frame_count:
@@ -205,6 +209,26 @@ def _what_is_wrong_inside(video: ShippedVideo) -> str | None:
             f"{video.decoded_sha256}"
         )
     return None
+
+
+def _check_paced(video: ShippedVideo) -> Check:
+    """Check how long the file shows its frames, which no hash of them says."""
+    try:
+        rate = rate_of_frames(video.path, most=video.frame_count)
+    except MissingDependency as error:
+        return _check(_PACED, video.name, Verdict.NOT_CHECKABLE, _one_line(error))
+    except (UnevenTimes, Error) as error:
+        return _check(_PACED, video.name, Verdict.FAIL, _one_line(error))
+    if rate == video.fps:
+        reason = f"{rate} frames a second"
+        return _check(_PACED, video.name, Verdict.PASS, reason)
+    reason = f"it has {rate} frames a second, and its metadata says {video.fps}"
+    if OLD_RATE in video.encoder_arguments and abs(rate / video.fps - 1) < _NEAR:
+        reason += (
+            ", which the ffmpeg of an older mjrec took for the usual rate next to it"
+        )
+        return _check(_PACED, video.name, Verdict.NOT_CHECKABLE, reason)
+    return _check(_PACED, video.name, Verdict.FAIL, reason)
 
 
 @dataclass
@@ -249,9 +273,21 @@ class _Studio:
         self._gl_failure: str | None = None
 
     def check(
-        self, video: ShippedVideo, *, is_whole: bool, on_frame: Any
+        self,
+        video: ShippedVideo,
+        *,
+        is_whole: bool,
+        is_paced: bool,
+        on_frame: Any,
     ) -> Iterator[Check]:
-        """Yield what is found of a video by drawing its pictures again."""
+        """Yield what is found of a video by drawing its pictures again.
+
+        Args:
+            video: the shipped one.
+            is_whole: whether it decodes as recorded.
+            is_paced: False where it plays at another rate for a known reason.
+            on_frame: called for each picture that was drawn.
+        """
         try:
             plan = plan_drawing(video)
         except NotDrawable as error:
@@ -278,7 +314,14 @@ class _Studio:
             yield _check(_DRAWN, video.name, Verdict.FAIL, reason)
             hashes = None
         try:
-            found = self._draw(video, plan, hashes, is_whole=is_whole, tell=on_frame)
+            found = self._draw(
+                video,
+                plan,
+                hashes,
+                is_whole=is_whole,
+                is_paced=is_paced,
+                tell=on_frame,
+            )
         except GLError as error:
             self._gl_failure = f"nothing can be drawn here: {_one_line(error)}"
             yield from _all_not_checkable(video, self._gl_failure)
@@ -286,7 +329,8 @@ class _Studio:
         except Error as error:
             yield from _not_drawn(video, plan, error)
             return
-        yield from self._judge(video, plan, found, hashes)
+        for check in self._judge(video, plan, found, hashes):
+            yield check if plan.excuse is None else _excused(check, plan.excuse)
 
     def _draw(
         self,
@@ -295,6 +339,7 @@ class _Studio:
         hashes: Sequence[str] | None,
         *,
         is_whole: bool,
+        is_paced: bool,
         tell: Any,
     ) -> _Found:
         """Draw the pictures, compare them with what was shipped, and encode them."""
@@ -309,6 +354,8 @@ class _Studio:
                     f"only {len(found.positions)} of {_frames(video.frame_count)} were "
                     "drawn: leave --sample out"
                 )
+            if not is_paced:
+                found.refusal = "it plays at another rate than was recorded"
             for position, frame in self._frames(video, plan, found.positions):
                 digest = hashlib.sha256(np.ascontiguousarray(frame).data).hexdigest()
                 if hashes is not None and digest != hashes[position]:
@@ -504,6 +551,14 @@ def _judged_bytes(
         "these, or was changed afterwards"
     )
     return _check(_ENCODED, video.name, Verdict.FAIL, reason)
+
+
+def _excused(check: Check, excuse: str) -> Check:
+    """Return what a check says of a live video that may show something else."""
+    if check.verdict is not Verdict.FAIL:
+        return check
+    reason = f"it was drawn live, and {excuse}: {check.reason}"
+    return dataclasses.replace(check, verdict=Verdict.NOT_CHECKABLE, reason=reason)
 
 
 def _not_drawn(video: ShippedVideo, plan: DrawingPlan, error: Error) -> Iterator[Check]:

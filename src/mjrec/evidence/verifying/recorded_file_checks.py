@@ -118,9 +118,23 @@ def _check_frame_hashes(paths: list[Path]) -> Iterator[Check]:
             found.look(path.name, "it belongs to no video")
         if path.suffix == ".mp4" and frame_hash_path(path).name in known:
             found.look(path.name, _objection_to_hashes(path))
+        elif path.suffix == ".mp4" and _had_hashes(path):
+            found.look(path.name, "the file of the hashes of its frames is missing")
         elif path.suffix == ".mp4":
             found.cannot_tell("a video has no file of the hashes of its frames")
     yield from found.checks()
+
+
+def _had_hashes(video: Path) -> bool:
+    """Tell whether mjrec made a video whole, which never leaves out the hashes.
+
+    Of one that a killed process left they may have been lost.
+    """
+    try:
+        said = read_object(metadata_path(video))
+    except (OSError, ValueError):
+        return False
+    return said.get("decoded_sha256") is not None and said.get("complete") is not False
 
 
 def _objection_to_hashes(video: Path) -> str | None:

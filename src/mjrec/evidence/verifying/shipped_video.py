@@ -58,7 +58,10 @@ class ShippedVideo:
         pixel_format: ffmpeg's name.
         is_live: whether it was drawn while the episode ran.
         live_reason: why; None where nobody says.
+        cut_short: why it ended before its episode; None where nobody says that it did.
         camera: which one is said to have seen it, or None.
+        first_camera: the same, or the first where several are in one picture.
+        is_clip: whether it is one of those that are counted in steps.
         quality: how well it was drawn.
         pillow: the version that wrote on the frames; None where nothing is on them.
         ffmpeg_sha256: of the binary that encoded it; None where nobody knows.
@@ -79,7 +82,10 @@ class ShippedVideo:
     pixel_format: str
     is_live: bool
     live_reason: str | None
+    cut_short: str | None
     camera: PlainCamera | None
+    first_camera: PlainCamera | None
+    is_clip: bool
     quality: str
     pillow: str | None
     ffmpeg_sha256: str | None
@@ -126,7 +132,10 @@ def read_shipped_video(path: Path) -> ShippedVideo:
             pixel_format=field(said, "pixel_format", text),
             is_live=field(said, "recording", text, default="live") != "deferred",
             live_reason=field(said, "recording_reason", optional(text), default=None),
+            cut_short=_cut_short(said),
             camera=_camera(said.get("camera")),
+            first_camera=_camera(_first(said.get("camera"))),
+            is_clip="first_step" in said,
             quality=field(said, "quality", _quality, default="full"),
             pillow=_pillow(field(said, "annotated", optional(mapping), default=None)),
             ffmpeg_sha256=field(said, "ffmpeg_sha256", optional(_sha256), default=None),
@@ -204,12 +213,23 @@ def _quality(value: Any) -> str:
     return str(value)
 
 
+def _cut_short(said: Mapping[str, Any]) -> str | None:
+    broken = field(said, "broken_reason", optional(text), default=None)
+    if said.get("complete") is False:
+        return broken or field(said, "reason", optional(text), default=None)
+    return broken
+
+
 def _camera(value: Any) -> PlainCamera | None:
     """Return a camera, or None for what is none: nothing, or several."""
     try:
         return None if value is None else plain_camera(value)
     except InvalidArgument:
         return None
+
+
+def _first(cameras: Any) -> Any:
+    return cameras[0] if isinstance(cameras, list) and cameras else cameras
 
 
 def _pillow(annotated: Mapping[str, Any] | None) -> str | None:
