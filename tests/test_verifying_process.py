@@ -254,6 +254,10 @@ def test_model_that_includes_files_from_outside_is_not_compiled(
         env_id="Mine-v0",
     )
     verification = mjrec.verify(folder, level="physics")
-    of_physics = [c for c in verification.checks if c.level is Level.PHYSICS]
+    of_physics = [
+        check
+        for check in verification.checks
+        if check.level is Level.PHYSICS and "the name" not in check.claim
+    ]
     assert {check.verdict for check in of_physics} == {Verdict.NOT_CHECKABLE}
     assert not any("come to an end" in check.claim for check in verification.checks)
