@@ -405,11 +405,16 @@ class EpisodePhysics:
                 model,
                 substeps=substeps,
                 uneven=self._is_mjcf(),
+                few=not self._is_shown(),
                 begun=begun,
             )
         except InvalidArgument as error:
             return self._check(_PICTURES, Verdict.FAIL, _text(error))
         return self._judged_pictures(followed, of_steps)
+
+    def _is_shown(self) -> bool:
+        """Tell whether there is any video beside the episode, be it of another."""
+        return any(self._reader.path.parent.glob("*.video.*"))
 
     def _judged_pictures(self, followed: FollowedSnapshots, of_steps: Check) -> Check:
         differences, unknown = followed.differences, followed.unknown
@@ -418,6 +423,9 @@ class EpisodePhysics:
             reason = "none of the states that it has pictures of is recorded"
             return self._check(_PICTURES, Verdict.NOT_CHECKABLE, reason)
         verdict, reason, figures = judged(differences, self._derived, "picture")
+        pictures = self._reader.frame_count - len(unknown)
+        if differences.rows < pictures:
+            reason += f", a sample of {pictures}: there are no videos of them"
         if verdict is not Verdict.PASS:
             place = differences.first if self._derived.is_exact else differences.worst
             assert place is not None

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ from ...simulation.snapshot_steps import (
 )
 from .differences import Differences, compared_columns
 from .step_checks import BLOCK_ROWS, allowed_substeps, substeps_between
+
+_FEW: Final = 24
 
 __all__ = ["FollowedSnapshots", "begun_snapshot", "follow_snapshots"]
 
@@ -77,6 +79,7 @@ def follow_snapshots(
     *,
     substeps: int,
     uneven: bool = False,
+    few: bool = False,
     begun: NDArray[np.float64] | None = None,
 ) -> FollowedSnapshots:
     """Take the snapshots of an episode again.
@@ -86,6 +89,7 @@ def follow_snapshots(
         model: as it was at the episode's beginning; not changed.
         substeps: the physics steps in a control step; 0 where there are no steps.
         uneven: as of `follow_steps`.
+        few: whether a few of them do, the first and the last included.
         begun: what `begun_snapshot` gave.
 
     Raises:
@@ -97,7 +101,10 @@ def follow_snapshots(
     taking = _Taking(reader, model, begun)
     result = FollowedSnapshots(Differences(column_names(layout)))
     unknown: set[int] = set()
-    for first, rows, frames in _blocks(reader):
+    chosen = np.arange(reader.frame_count)
+    if few and len(chosen) > _FEW:
+        chosen = np.linspace(0, len(chosen) - 1, _FEW).astype(int)
+    for first, rows, frames in _blocks(reader, chosen):
         times = rows[:, taking.clock]
         numbers = allowed_substeps(
             substeps_between(times, taking.steps.timestep),
@@ -105,7 +112,7 @@ def follow_snapshots(
             uneven=uneven,
             is_end=first + len(rows) == reader.row_count,
         )
-        wanted = numbers_of(layout, reader.snapshots(frames.start, frames.stop))
+        wanted = numbers_of(layout, _snapshots(reader, frames))
         compared: list[int] = []
         ours, theirs = np.empty_like(wanted), np.empty_like(wanted)
         for step, recorded in zip(
@@ -126,23 +133,33 @@ def follow_snapshots(
     return result
 
 
+def _snapshots(
+    reader: TrajectoryReader, frames: NDArray[np.int64]
+) -> NDArray[np.uint8]:
+    first, last = int(frames[0]), int(frames[-1])
+    if last - first + 1 == len(frames):
+        return reader.snapshots(first, last + 1)
+    return np.concatenate([reader.snapshots(f, f + 1) for f in frames.tolist()])
+
+
 def _blocks(
-    reader: TrajectoryReader,
-) -> Iterator[tuple[int, NDArray[np.float64], slice]]:
-    """Yield states, the number of the first of them, and the frames of all but it.
+    reader: TrajectoryReader, chosen: NDArray[np.int64]
+) -> Iterator[tuple[int, NDArray[np.float64], NDArray[np.int64]]]:
+    """Yield states, the number of the first, and the chosen frames of all but it.
 
     A state stands before the first that has a frame, but for the very first.
     """
     for start in range(0, reader.row_count, BLOCK_ROWS):
         stop = min(start + BLOCK_ROWS, reader.row_count)
-        begin, end = np.searchsorted(reader.frame_steps, [start, stop]).tolist()
+        steps = reader.frame_steps[chosen]
+        begin, end = np.searchsorted(steps, [start, stop]).tolist()
         if begin == end:
             continue
         first = max(start - 1, 0)
         rows = reader.states(first, stop)
         # There may be many frames of one state.
         for at in range(begin, end, BLOCK_ROWS):
-            yield first, rows, slice(at, min(at + BLOCK_ROWS, end))
+            yield first, rows, chosen[at : min(at + BLOCK_ROWS, end)]
 
 
 class _Taking:
