@@ -264,6 +264,28 @@ def name_another_gpu(bag: Path) -> None:
     )
 
 
+def call_it_live(bag: Path) -> None:
+    """Another video, which is said to be none that is drawn from states."""
+    path = episode(bag, 1)
+    forge_video(bag, 1, [255 - frame for frame in drawn(recordings(bag), 1)])
+    say(video(recordings(bag), 1), recording="live")
+    with open_trajectory(path) as reader:
+        promised = reader.header.facts["video"]
+    forge_episode(path, facts={"video": {**promised, "recording": "live"}})
+
+
+def take_the_hashes_out(bag: Path) -> None:
+    video(recordings(bag), 1).with_suffix(".framehash").unlink()
+
+
+def play_it_faster(bag: Path) -> None:
+    """The same frames and the same hashes of them."""
+    path = video(recordings(bag), 1)
+    said = metadata(path)
+    forge(path, drawn(recordings(bag), 1), fps=50, hashes=False)
+    say(path, length=said["length"], frame_steps=said["frame_steps"])
+
+
 def forge_video(bag: Path, number: int, frames: list[Any]) -> None:
     """Put other frames into a video; length and metadata stay the episode's."""
     path = video(recordings(bag), number)
@@ -324,6 +346,9 @@ CASES = (
     Case(rename_a_file, STATS, "what is inside says 1, its name 9"),
     Case(add_a_scheduled_episode, STATS, "3"),
     Case(name_another_schedule, STATS, "at:0,3"),
+    Case(call_it_live, PIXELS, "have other hashes: 0, 1, 2, 3"),
+    Case(take_the_hashes_out, FILES, "hashes of its frames is missing"),
+    Case(play_it_faster, PIXELS, "50 frames a second"),
     Case(add_a_note, FILES, "notes.txt"),
     Case(name_another_gpu, STATS, "RTX 4090"),
 )

@@ -408,13 +408,7 @@ def test_a_video_of_an_older_version_is_encoded_again(alone: Path) -> None:
 
 def test_a_live_video_that_is_counted_in_steps(tmp_path: Path) -> None:
     """It is of no episode, so it fits none."""
-    run = record(
-        tmp_path / "run",
-        mode="evaluation",
-        render="live",
-        episodes="none",
-        video_length=3,
-    )
+    run = record(tmp_path / "run", mode="evaluation", render="live", video_length=3)
     checks = found(run)
     assert checks[0, DRAWN].verdict is OPEN
     assert "counted in steps" in checks[0, DRAWN].reason
