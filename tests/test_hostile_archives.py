@@ -281,3 +281,14 @@ def test_archive_that_does_not_fit_on_the_disk_is_an_error(
     with pytest.raises(mjrec.Error, match=r"takes 1000 bytes, and 999 are free"):
         mjrec.verify(path, level="files")
     assert list(temporary.iterdir()) == []
+
+
+def test_words_about_a_bad_archive_say_what_to_do(tmp_path: Path) -> None:
+    """It is one file that somebody has sent."""
+    archive = tmp_path / "run.zip"
+    archive.write_bytes(b"PK")
+    with pytest.raises(mjrec.UnreadableArchive) as raised:
+        mjrec.verify(archive)
+    assert str(raised.value).startswith(f"Cannot verify {archive}: it is no zip file.")
+    assert "ask for the file" in str(raised.value)
+    assert "directory" not in str(raised.value)
