@@ -275,7 +275,7 @@ class EpisodePhysics:
         if self._is_of_this_mujoco() and model_digest(sources) == self._sha256():
             return self._check(_SOURCES, Verdict.PASS, f"bit for bit{suffix}")
         why = self._fit.why or (
-            "it holds where its files were"
+            "it holds the paths of its files; all below is of what the sources give"
             if keeps_paths(sources)
             else "it is of another MuJoCo"
             if not self._is_of_this_mujoco()
