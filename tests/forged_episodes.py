@@ -181,10 +181,7 @@ def unchecked(checks: list[Check]) -> list[Check]:
 
 
 def failed(checks: list[Check]) -> list[str]:
-    """Return what failed, by what it was checked of; but for what is drawn of it.
-
-    What is drawn follows from states: an edit of a state is seen there too.
-    """
+    """Return what failed, by what it was checked of."""
     claims = (
         ("the model", "model"),
         ("each recorded state", "steps"),
@@ -194,13 +191,14 @@ def failed(checks: list[Check]) -> list[str]:
         ("the environment ends", "ends"),
         ("the environment gives the recorded observations", "observations"),
         ("the episode's states", "file"),
+        ("what the pictures", "pictures"),
         ("the name", "name"),
     )
     short: Mapping[str, str] = dict(claims)
     return [
         next(name for claim, name in short.items() if check.claim.startswith(claim))
         for check in checks
-        if check.verdict is Verdict.FAIL and "drawn from" not in check.claim
+        if check.verdict is Verdict.FAIL
     ]
 
 
