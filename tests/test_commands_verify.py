@@ -90,4 +90,4 @@ def test_what_cannot_be_read_is_one_message(
     assert main(["verify", str(path)]) == 1
     said = capsys.readouterr()
     assert said.out == ""
-    assert said.err.startswith(f"mjrec: Cannot read {path}: it is no zip file")
+    assert said.err.startswith(f"mjrec: Cannot verify {path}: it is no zip file")
