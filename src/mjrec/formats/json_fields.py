@@ -8,7 +8,9 @@ FILE:"; the readers of the file formats turn it into `UnreadableFile`.
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable, Iterator, Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +28,7 @@ __all__ = [
     "mapping",
     "number",
     "optional",
+    "rate",
     "read_object",
     "text",
     "unreadable",
@@ -40,6 +43,8 @@ _LONGEST_FILE = 1 << 28
 _LARGEST_INTEGER = 2**63 - 1
 
 _LONGEST_NAME = 255
+
+_RATE = re.compile(r"\d{1,18}(/\d{1,18})?", re.ASCII)
 
 _KINDS = {
     bool: "true or false",
@@ -166,6 +171,16 @@ def number(value: Any) -> float:
         return float_from_json(value)
     except OverflowError as error:
         raise ValueError("a number is larger than a float can be") from error
+
+
+def rate(value: Any) -> Fraction:
+    """Check that `value` is a positive number as text, such as "60000/1001"."""
+    if not _RATE.fullmatch(text(value)):
+        raise ValueError(f"{value!r:.80} is no rate")
+    above, _, below = value.partition("/")
+    if not int(above) or not int(below or 1):
+        raise ValueError(f"{value!r:.80} is no rate")
+    return Fraction(value)
 
 
 def _checked(value: Any, kind: type[T]) -> T:

@@ -31,6 +31,7 @@ from .json_fields import (
     list_of,
     mapping,
     optional,
+    rate,
     read_object,
     text,
     unreadable,
@@ -47,7 +48,6 @@ __all__ = [
 ]
 
 _READ_SIZE = 1 << 20
-_RATE = re.compile(r"\d{1,18}(/\d{1,18})?", re.ASCII)
 _LARGEST_SIDE = 1 << 16
 _LONGEST_NOTE = 1 << 24
 
@@ -269,7 +269,7 @@ def _video(note: Path, values: Mapping[str, Any]) -> UnfinishedVideo:
         hashes=None if hashes is None else note.with_name(hashes),
         height=field(values, "height", _side),
         width=field(values, "width", _side),
-        fps=field(values, "fps", _rate),
+        fps=field(values, "fps", rate),
         codec=field(values, "codec", text),
         pixel_format=field(values, "pixel_format", text),
         encoder=field(values, "encoder", _encoder),
@@ -298,15 +298,6 @@ def _side(value: Any) -> int:
     return side
 
 
-def _rate(value: Any) -> Fraction:
-    if not _RATE.fullmatch(text(value)):
-        raise ValueError(f"{value!r:.80} is no rate")
-    number, _, divisor = value.partition("/")
-    if not int(number) or not int(divisor or 1):
-        raise ValueError(f"{value!r:.80} is no rate")
-    return Fraction(value)
-
-
 def _encoder(value: Any) -> Mapping[str, Any]:
     values = mapping(value)
     return {
@@ -320,7 +311,7 @@ def _encoder(value: Any) -> Mapping[str, Any]:
 def _timing(value: Any) -> Mapping[str, Any]:
     values = mapping(value)
     return {
-        "timestep": field(values, "timestep", optional(_rate)),
+        "timestep": field(values, "timestep", optional(rate)),
         "stride": field(values, "stride", _count),
         "frames_per_step": field(values, "frames_per_step", _count),
     }

@@ -21,6 +21,7 @@ from ...formats.json_fields import (
     list_of,
     mapping,
     optional,
+    rate,
     read_object,
     text,
     unreadable,
@@ -38,7 +39,6 @@ _MOST_FRAMES: Final = 10**8
 # Of a header, and of one frame of any size.
 _LONGEST_LINE: Final = 200
 _HEADER_LINES: Final = 16
-_RATE: Final = re.compile(r"\d{1,12}(/\d{1,12})?", re.ASCII)
 _SHA256: Final = re.compile(r"[0-9a-f]{64}", re.ASCII)
 
 
@@ -124,7 +124,7 @@ def read_shipped_video(path: Path) -> ShippedVideo:
             path=path,
             height=height,
             width=width,
-            fps=field(said, "fps", _rate),
+            fps=field(said, "fps", rate),
             frame_count=field(said, "frame_count", _frame_count),
             frame_steps=field(said, "frame_steps", list_of(list_of(integer))),
             stride=field(said, "stride", _stride, default=1),
@@ -176,15 +176,6 @@ def _hash(line: str, number: int, size: int) -> str:
     if not _SHA256.fullmatch(digest) or line != f"{begin}{digest}\n":
         raise ValueError(f"the line of frame {number} is {line!r:.120}")
     return digest
-
-
-def _rate(value: Any) -> Fraction:
-    if not _RATE.fullmatch(text(value)):
-        raise ValueError(f"{value!r:.80} is no rate")
-    above, _, below = value.partition("/")
-    if not int(above) or not int(below or 1):
-        raise ValueError(f"{value!r:.80} is no rate")
-    return Fraction(value)
 
 
 def _frame_count(value: Any) -> int:
