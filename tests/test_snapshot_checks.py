@@ -153,7 +153,7 @@ def test_some_pictures_are_asked_of_where_there_is_no_video(tmp_path: Path) -> N
     directory = record(tmp_path / "run", env, steps=60, **options)
     check = of_pictures(directory)
     assert check.verdict is Verdict.PASS
-    assert "8 pictures, a sample of 61" in check.reason
+    assert "3 pictures, a sample of 61" in check.reason
     changed("geom_xpos", 60, 1.0)(directory)
     assert of_pictures(directory).verdict is Verdict.FAIL
 

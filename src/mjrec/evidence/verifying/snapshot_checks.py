@@ -27,7 +27,7 @@ from .differences import Differences, compared_columns
 from .step_checks import BLOCK_ROWS, allowed_substeps, substeps_between
 
 # Most of the price is reading them: half a millisecond each.
-_FEW: Final = 8
+_FEW: Final = 3
 
 __all__ = ["FollowedSnapshots", "begun_snapshot", "follow_snapshots"]
 
