@@ -19,7 +19,7 @@ ROWS = (
     {
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
-        *("frame_grid", "annotation", "fingerprint", "surroundings"),
+        *("frame_grid", "annotation", "file_digests", "fingerprint", "surroundings"),
     },
     {"formats"},
     {"results"},

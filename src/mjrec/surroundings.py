@@ -23,7 +23,7 @@ from typing import Any
 from .fingerprint import cpu_flags, cpu_model, machine_fingerprint
 from .machine import usable_cpus
 
-__all__ = ["Surroundings", "file_sha256", "look_around"]
+__all__ = ["Surroundings", "look_around"]
 
 logger = logging.getLogger(__name__)
 
@@ -128,12 +128,6 @@ def look_around() -> Surroundings:
 
 # A child that is forked while the thread looks has no such thread.
 os.register_at_fork(after_in_child=look_around.cache_clear)
-
-
-def file_sha256(path: Path) -> str:
-    """Return the sha256 of a file, in hex."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _variables(environ: Mapping[str, str]) -> dict[str, str]:

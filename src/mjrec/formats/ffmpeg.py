@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import functools
-import hashlib
 import os
 import re
 import select
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import IO, Protocol
 
 from ..errors import EncoderError, Error, InvalidArgument, MissingDependency
+from ..file_digests import file_sha256
 from ..frames import Frame
 from ..patience import Patience
 
@@ -430,8 +430,7 @@ def _version(executable: str, size: int, modified: int) -> str:
 
 @functools.lru_cache
 def _sha256(executable: str, size: int, modified: int) -> str:
-    with Path(executable).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return file_sha256(Path(executable))
 
 
 @functools.lru_cache

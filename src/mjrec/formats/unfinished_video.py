@@ -22,6 +22,7 @@ from typing import Any
 
 from ..atomic_files import write_text
 from ..errors import DirectoryNotWritable
+from ..file_digests import file_sha256
 from ..json_text import dumps
 from .ffmpeg import FfmpegProcess, every_frame_arguments
 from .frame_hashes import cut_frame_hashes, frame_hash_path
@@ -147,7 +148,7 @@ class UnfinishedVideo:
             fps=self.fps,
             codec=self.codec,
             pixel_format=self.pixel_format,
-            file_sha256=_sha256_of_file(source),
+            file_sha256=file_sha256(source),
             decoded_sha256=digest,
             frame_hash_path=None if self.hashes is None else frame_hash_path(self.path),
             encoder=dict(self.encoder),
@@ -189,7 +190,7 @@ class UnfinishedVideo:
             self.temporary.replace(self.path)
         except FileNotFoundError:
             # An earlier call may have been interrupted just after it had done this.
-            if _sha256_of_file(self.path) != file.file_sha256:
+            if file_sha256(self.path) != file.file_sha256:
                 raise
 
 
@@ -353,11 +354,6 @@ def _decode(
         frame_bytes //= 2
     frame_count, rest = divmod(total, frame_bytes)
     return frame_count + bool(rest), digest.hexdigest()
-
-
-def _sha256_of_file(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def as_file(path: Path) -> str:

@@ -23,6 +23,7 @@ from ..errors import (
     NoPictures,
     PicturesDiffer,
 )
+from ..file_digests import file_sha256
 from ..fingerprint import machine_fingerprint
 from ..formats.manifest import Manifest, write_manifest
 from ..formats.monitor_directory import (
@@ -35,7 +36,7 @@ from ..formats.trajectory_log import RowBlocks
 from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
-from ..surroundings import file_sha256, look_around
+from ..surroundings import look_around
 from .clip_maker import ClipMaker
 from .clips import Clips
 from .deferred_video import DeferredVideo
