@@ -20,7 +20,9 @@ ROWS = (
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
         *("frame_grid", "annotation", "file_digests", "fingerprint", "surroundings"),
+        "child_python",
     },
+    {"engines"},
     {"formats"},
     {"results"},
     {"simulation"},
@@ -30,7 +32,8 @@ ROWS = (
     {"environments"},
     {"monitors"},
     {"sessions", "machine_report"},
-    {"evidence"},
+    {"evidence", "evaluation"},
+    {"reporting"},
     {"commands"},
 )
 
@@ -44,6 +47,8 @@ CONFINED = {
     "imageio_ffmpeg": {"formats"},
     "h5py": {"formats"},
     "tyro": {"commands"},
+    "scipy": {"evaluation"},
+    "matplotlib": {"reporting"},
     "rich": {"commands", "monitors"},
 }
 

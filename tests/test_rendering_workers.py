@@ -32,7 +32,7 @@ from mjrec.errors import (
 )
 from mjrec.rendering import worker_process, workers
 from mjrec.rendering.carried_errors import carried, unpacked
-from mjrec.rendering.child_python import environment_of_child
+from mjrec.child_python import environment_of_child
 from mjrec.rendering.views import View
 from mjrec.rendering.worker_process import WorkerProcess
 from mjrec.rendering.workers import DrawingWorkers

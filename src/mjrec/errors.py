@@ -12,6 +12,7 @@
     ├── DirectoryNotWritable (also OSError) it cannot be made or written to
     ├── FileNotWritten (also OSError)       a full disk, say
     ├── DifferentEnvironment                resume over another environment
+    ├── DifferentEvaluation                 resume of an evaluation that is another
     ├── EnvironmentNotMade                  it is known, and making it failed
     ├── NotPicklable (also TypeError)       a monitor, which belongs to a process
     ├── NoPictures                          the environment cannot be drawn
@@ -52,6 +53,7 @@ __all__ = [
     "BlankVideo",
     "ClosedError",
     "DifferentEnvironment",
+    "DifferentEvaluation",
     "DirectoryInUse",
     "DirectoryNotWritable",
     "EncoderError",
@@ -205,6 +207,30 @@ class DifferentEnvironment(Error):
             f"{directory} holds recordings of {recorded}, and this monitor is around "
             f"{asked}. Results of two environments in one directory cannot be told "
             "apart: use another directory."
+        )
+
+
+class DifferentEvaluation(Error):
+    """`resume=True` of an evaluation that was begun in another way.
+
+    Attributes:
+        directory: of the evaluation.
+        differences: what was begun and what is asked now, by what it is of.
+    """
+
+    def __init__(
+        self, directory: Path, differences: Mapping[str, tuple[object, object]]
+    ) -> None:
+        self.directory = directory
+        self.differences = dict(differences)
+        listed = "; ".join(
+            f"{name} was {begun!r} and is now {asked!r}"
+            for name, (begun, asked) in self.differences.items()
+        )
+        super().__init__(
+            f"The evaluation in {directory} was begun in another way: {listed}. Its "
+            "results and new ones do not belong together: ask for the same, or use "
+            "another directory."
         )
 
 

@@ -25,7 +25,7 @@ from ..errors import Error
 from ..formats.trajectory_file import finish_trajectory
 from ..patience import Patience
 from .carried_errors import carried, unpacked
-from .child_python import (
+from ..child_python import (
     environment_of_child,
     python_command,
     said_in,

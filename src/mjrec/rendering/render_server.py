@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any
 
 from ..patience import patience_s
-from .child_python import say_stacks_when_asked, take_standard_output
+from ..child_python import say_stacks_when_asked, take_standard_output
 from .finishing import EpisodeFinisher
 from .pending import RecordingKey, key_of
 from .progress import Progress

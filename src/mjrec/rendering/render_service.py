@@ -22,7 +22,7 @@ from typing import IO, Any
 
 from ..errors import Error
 from ..patience import Patience, patience_s
-from .child_python import (
+from ..child_python import (
     environment_of_child,
     python_command,
     said_in,

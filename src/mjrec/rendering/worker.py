@@ -34,7 +34,7 @@ from typing import IO, Any
 
 from ..gl import use_gl
 from .carried_errors import carried
-from .child_python import say_stacks_when_asked, take_standard_output
+from ..child_python import say_stacks_when_asked, take_standard_output
 from .frame_ring import FrameRing
 
 __all__ = ["main"]

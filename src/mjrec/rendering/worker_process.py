@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from typing import IO, Any
 
 from ..errors import Error
-from .child_python import (
+from ..child_python import (
     MOST_OF_STACKS,
     ask_for_stacks,
     environment_of_child,

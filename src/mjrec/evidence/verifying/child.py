@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from ... import json_text
-from ...rendering.child_python import (
+from ...child_python import (
     say_stacks_when_asked,
     take_standard_output,
 )

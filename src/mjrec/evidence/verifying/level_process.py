@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from ... import json_text
 from ...errors import Error
-from ...rendering.child_python import (
+from ...child_python import (
     environment_of_child,
     python_command,
     said_in,
