@@ -21,10 +21,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from ..errors import Error
-from ..formats.trajectory_file import finish_trajectory
-from ..patience import Patience
-from .carried_errors import carried, unpacked
 from ..child_python import (
     environment_of_child,
     python_command,
@@ -33,6 +29,10 @@ from ..child_python import (
     stacks_said_in,
     take_standard_output,
 )
+from ..errors import Error
+from ..formats.trajectory_file import finish_trajectory
+from ..patience import Patience
+from .carried_errors import carried, unpacked
 
 __all__ = ["finish_log", "main"]
 

@@ -33,8 +33,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..patience import patience_s
 from ..child_python import say_stacks_when_asked, take_standard_output
+from ..patience import patience_s
 from .finishing import EpisodeFinisher
 from .pending import RecordingKey, key_of
 from .progress import Progress

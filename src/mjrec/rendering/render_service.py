@@ -20,14 +20,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from ..errors import Error
-from ..patience import Patience, patience_s
 from ..child_python import (
     environment_of_child,
     python_command,
     said_in,
     stacks_said_in,
 )
+from ..errors import Error
+from ..patience import Patience, patience_s
 from .cpu_slots import check_workers
 from .progress import Progress
 

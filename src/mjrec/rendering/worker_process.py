@@ -14,7 +14,6 @@ import weakref
 from collections.abc import Mapping
 from typing import IO, Any
 
-from ..errors import Error
 from ..child_python import (
     MOST_OF_STACKS,
     ask_for_stacks,
@@ -23,6 +22,7 @@ from ..child_python import (
     said_in,
     stacks_in,
 )
+from ..errors import Error
 from .frame_ring import FrameRing
 
 __all__ = ["WorkerProcess"]

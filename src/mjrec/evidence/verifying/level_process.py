@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from ... import json_text
-from ...errors import Error
 from ...child_python import (
     environment_of_child,
     python_command,
     said_in,
     stacks_said_in,
 )
+from ...errors import Error
 from ..verification import Check, Level, Verdict
 from .carried_checks import check_from_json, task_to_json
 from .task import Task
