@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The results of an evaluation in its directory.
+
+::
+
+    directory/
+    ├── evaluation.json     the plan, written before anything is run
+    ├── results.json        plan, choice of videos, summaries, versions: written last
+    ├── results.csv         one row for each episode
+    ├── timing.csv          wall times and files of the same episodes
+    └── <folder>/           a monitor directory for each task
+
+`results.json` and `results.csv` follow from the plan and from what is installed: they
+are the same, byte for byte, whatever the number of workers, and however often the
+evaluation was killed and resumed. `result_tables` describes the tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+from ..atomic_files import replacing, write_text
+from ..errors import FileNotWritten, UnreadableFile
+from ..formats.json_fields import (
+    field,
+    integer,
+    list_of,
+    mapping,
+    optional,
+    read_object,
+    text,
+    unreadable,
+)
+from ..json_text import dumps
+from .episode_results import EpisodeResult
+from .plan import EvaluationPlan
+from .plan_json import plan_from_json, plan_to_json
+from .result_columns import ResultColumns
+from .result_tables import (
+    EpisodeFiles,
+    read_tables,
+    write_results_table,
+    write_timing_table,
+)
+from .summaries import AcrossTasks, Bootstrap, TaskSummary
+from .summaries_json import summary_from_json, summary_to_json
+
+__all__ = [
+    "FORMAT_VERSION",
+    "PLAN_NAME",
+    "RESULTS_NAME",
+    "ChosenEpisode",
+    "ReadResults",
+    "is_evaluation",
+    "read_results",
+    "write_results",
+]
+
+FORMAT_VERSION = 1
+PLAN_NAME = "evaluation.json"
+RESULTS_NAME = "results.json"
+_TABLE_NAME = "results.csv"
+_TIMING_NAME = "timing.csv"
+
+
+@dataclass(frozen=True)
+class ChosenEpisode:
+    """An episode that was chosen to get a video.
+
+    Attributes:
+        seed: of its run.
+        episode: its number in it.
+        role: why: `"best"`, `"median"`, `"worst"`, `"failure"`, `"cubic"`, `"all"`.
+    """
+
+    seed: int
+    episode: int
+    role: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadResults:
+    """The results of an evaluation, as they stand in its directory.
+
+    Attributes:
+        directory: of the evaluation.
+        plan: what was evaluated.
+        summaries: of the tasks, in the order of the plan.
+        across: what is said of all tasks together; None where nothing is.
+        bootstrap: how intervals were made.
+        selection: which episodes were chosen to get videos, by task.
+        versions: of what ran, by package.
+        columns: the episodes, by task, in the order of the plan.
+    """
+
+    directory: Path
+    plan: EvaluationPlan
+    summaries: tuple[TaskSummary, ...]
+    across: AcrossTasks | None
+    bootstrap: Bootstrap
+    selection: Mapping[str, Sequence[ChosenEpisode]]
+    versions: Mapping[str, str]
+    columns: Mapping[str, ResultColumns]
+
+    def folder(self, task: str) -> Path:
+        """Return a task's monitor directory."""
+        (name,) = (each.folder for each in self.plan.tasks if each.name == task)
+        return self.directory / name
+
+    def __iter__(self) -> Iterator[EpisodeResult]:
+        """Yield the episodes in the order of the plan, without their warnings."""
+        for columns in self.columns.values():
+            yield from columns
+
+
+def is_evaluation(directory: Path) -> bool:
+    """Tell whether a directory is that of an evaluation, finished or not."""
+    return any((directory / name).is_file() for name in (PLAN_NAME, RESULTS_NAME))
+
+
+def write_results(
+    directory: Path,
+    *,
+    plan: EvaluationPlan,
+    results: Sequence[EpisodeResult],
+    summaries: Sequence[TaskSummary],
+    across: AcrossTasks | None,
+    bootstrap: Bootstrap,
+    selection: Mapping[str, Sequence[ChosenEpisode]],
+    versions: Mapping[str, str],
+    files: Callable[[EpisodeResult], EpisodeFiles] = lambda _: EpisodeFiles(),
+) -> None:
+    """Write the results of an evaluation, `results.json` last.
+
+    Where there were results, those are gone until the new ones are complete: tables
+    and summaries of two plans are never found together.
+
+    Args:
+        directory: of the evaluation.
+        plan: what was evaluated.
+        results: of every episode of the plan, in its order.
+        summaries: of the tasks, in the plan's order.
+        across: what is said of all tasks.
+        bootstrap: how intervals were made.
+        selection: see `ReadResults`.
+        versions: see `ReadResults`.
+        files: tells which files are an episode's.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone or read-only.
+    """
+    value = {
+        "format_version": FORMAT_VERSION,
+        "plan": plan_to_json(plan),
+        "selection": {
+            "rule": plan.keep,
+            "by_task": {
+                task: [[each.seed, each.episode, each.role] for each in chosen]
+                for task, chosen in selection.items()
+            },
+        },
+        "bootstrap": summary_to_json(bootstrap),
+        "tasks": [summary_to_json(each) for each in summaries],
+        "across": None if across is None else summary_to_json(across),
+        "versions": dict(versions),
+    }
+    (directory / RESULTS_NAME).unlink(missing_ok=True)
+    _write(directory / _TABLE_NAME, lambda file: write_results_table(file, results))
+    _write(
+        directory / _TIMING_NAME, lambda file: write_timing_table(file, results, files)
+    )
+    write_text(directory / RESULTS_NAME, dumps(value, indent=2) + "\n")
+
+
+def read_results(directory: Path) -> ReadResults:
+    """Return the results that are in an evaluation's directory.
+
+    They may be anybody's: sizes, numbers, names and their order are checked, and no
+    file outside of the directory is opened.
+
+    Raises:
+        UnreadableFile: there are none, the evaluation is not finished, or a file is
+            damaged.
+    """
+    path = directory / RESULTS_NAME
+    if not path.exists():
+        raise UnreadableFile(path, _why_missing(directory))
+    with unreadable(path):
+        value = read_object(path)
+        version = field(value, "format_version", integer)
+        if version != FORMAT_VERSION:
+            raise ValueError(
+                f"its format is version {version}, and this mjrec reads "
+                f"{FORMAT_VERSION}"
+            )
+        plan = field(value, "plan", _plan)
+        tasks = [each.name for each in plan.tasks]
+        summaries = field(value, "tasks", list_of(_summary))
+        if [each.task for each in summaries] != tasks:
+            raise ValueError("its summaries are not those of the tasks of its plan")
+        across = field(value, "across", optional(_across))
+        bootstrap = field(value, "bootstrap", _bootstrap)
+        selection = field(value, "selection", _selection)
+        versions = field(value, "versions", _versions)
+    return ReadResults(
+        directory=directory,
+        plan=plan,
+        summaries=summaries,
+        across=across,
+        bootstrap=bootstrap,
+        selection=selection,
+        versions=versions,
+        columns=read_tables(directory / _TABLE_NAME, directory / _TIMING_NAME, plan),
+    )
+
+
+def _write(path: Path, write: Callable[[TextIO], None]) -> None:
+    try:
+        with (
+            replacing(path) as temporary,
+            temporary.open("w", encoding="utf-8", newline="") as file,
+        ):
+            write(file)
+    except OSError as error:
+        raise FileNotWritten(path, error.strerror) from error
+
+
+def _why_missing(directory: Path) -> str:
+    if (directory / PLAN_NAME).exists():
+        return (
+            "the evaluation is not finished; the command that began it goes on where "
+            "it was with --resume"
+        )
+    return "there is no evaluation in the directory"
+
+
+def _plan(value: Any) -> EvaluationPlan:
+    plan = plan_from_json(mapping(value))
+    for what, values in (
+        ("task", [each.name for each in plan.tasks]),
+        ("folder", [each.folder for each in plan.tasks]),
+        ("seed", plan.seeds),
+    ):
+        if len(set(values)) < len(values):
+            raise ValueError(f"a {what} is there twice")
+    return plan
+
+
+def _summary(value: Any) -> TaskSummary:
+    return summary_from_json(TaskSummary, value)
+
+
+def _across(value: Any) -> AcrossTasks:
+    return summary_from_json(AcrossTasks, value)
+
+
+def _bootstrap(value: Any) -> Bootstrap:
+    return summary_from_json(Bootstrap, value)
+
+
+def _versions(value: Any) -> Mapping[str, str]:
+    return {text(name): text(version) for name, version in mapping(value).items()}
+
+
+def _selection(value: Any) -> Mapping[str, Sequence[ChosenEpisode]]:
+    by_task = field(mapping(value), "by_task", mapping)
+    read = list_of(_chosen)
+    return {text(task): read(chosen) for task, chosen in by_task.items()}
+
+
+def _chosen(value: Any) -> ChosenEpisode:
+    if not isinstance(value, list) or len(value) != 3:
+        raise ValueError("a chosen episode is seed, number and role")
+    seed, episode, role = value
+    return ChosenEpisode(integer(seed), integer(episode), text(role))

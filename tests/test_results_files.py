@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+import math
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mjrec import UnreadableFile
+from mjrec.evaluation.episode_results import EpisodeResult
+from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
+from mjrec.evaluation.result_columns import ResultVideo
+from mjrec.evaluation.result_tables import EpisodeFiles
+from mjrec.evaluation.results_files import (
+    ChosenEpisode,
+    ReadResults,
+    is_evaluation,
+    read_results,
+    write_results,
+)
+from mjrec.evaluation.summaries import (
+    AcrossTasks,
+    Bootstrap,
+    Interval,
+    Profile,
+    TaskSummary,
+)
+
+SHA = "ab" * 32
+VIDEO = "openaigym.video.0.w.video000000.mp4"
+SUMMARY = TaskSummary(
+    task="a,b-v0",
+    runs=2,
+    episodes=3,
+    failed=1,
+    mean=1.5,
+    mean_interval=Interval(-1.0, math.inf),
+    warnings={"BADQACC": 2},
+    score_range=(0.0, 10.0),
+)
+ACROSS = AcrossTasks(
+    tasks=("a,b-v0",),
+    left_out={"c": "no scale"},
+    iqm=0.5,
+    profile=Profile(thresholds=(0.0, 1.0), shares=(1.0, 0.0), low=(1, 0), high=(1, 0)),
+)
+PLAN = EvaluationPlan(
+    tasks=(EvaluatedTask("a,b-v0", "ab"),), policy="random", seeds=(7, 3), episodes=2
+)
+
+
+def result(seed: int, episode: int, total: float | None, **more: Any) -> EpisodeResult:
+    return EpisodeResult(
+        task="a,b-v0",
+        seed=seed,
+        episode=episode,
+        total_reward=total,
+        length=5,
+        terminated=None if total is None else False,
+        truncated=None if total is None else True,
+        **more,
+    )
+
+
+RESULTS = [
+    result(
+        *(7, 0, 0.1 + 0.2),
+        success=True,
+        monitor="0.w",
+        episode_id=0,
+        start_time=1.25,
+        seconds=0.5,
+    ),
+    result(7, 1, math.nan),
+    result(3, 0, None, failure='it said "no",\nand\0 went =1+1 \udc80'),
+    result(3, 1, -math.inf),
+]
+
+
+def written(directory: Path, **changed: Any) -> Path:
+    facts: dict[str, Any] = {
+        "plan": PLAN,
+        "results": RESULTS,
+        "summaries": [SUMMARY],
+        "across": ACROSS,
+        "bootstrap": Bootstrap(resamples=10),
+        "selection": {"a,b-v0": [ChosenEpisode(7, 0, "best")]},
+        "versions": {"mujoco": "3.4"},
+        "files": files,
+    }
+    write_results(directory, **{**facts, **changed})
+    return directory
+
+
+def files(result: EpisodeResult) -> EpisodeFiles:
+    if result.monitor is None:
+        return EpisodeFiles()
+    return EpisodeFiles(
+        "openaigym.trajectory.0.w.episode000000.h5", ResultVideo(VIDEO, SHA)
+    )
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    """Plan, summaries, choice, versions, and each number bit for bit."""
+    read = read_results(written(tmp_path))
+    assert read.plan == PLAN
+    assert read.summaries == (SUMMARY,)
+    assert read.across == ACROSS
+    assert read.bootstrap == Bootstrap(resamples=10)
+    assert read.selection == {"a,b-v0": (ChosenEpisode(7, 0, "best"),)}
+    assert read.versions == {"mujoco": "3.4"}
+    first, nan, failed, infinite = read
+    assert first == RESULTS[0]
+    assert nan.total_reward is not None
+    assert math.isnan(nan.total_reward)
+    assert failed.total_reward is None
+    assert failed.failure == 'it said "no", and went =1+1 \\udc80'
+    assert infinite == RESULTS[3]
+
+
+def test_columns_know_the_files_of_an_episode(tmp_path: Path) -> None:
+    """Trajectory and video are named where there are any."""
+    columns = read_results(written(tmp_path)).columns["a,b-v0"]
+    assert columns.videos == {0: ResultVideo(VIDEO, SHA)}
+    assert columns.trajectory_prefix(0) == "openaigym.trajectory.0.w.episode000000"
+    assert columns.trajectory_prefix(1) is None
+    assert columns.failed.tolist() == [False, False, True, False]
+
+
+def test_results_csv_is_what_the_documentation_says(tmp_path: Path) -> None:
+    """Header, order, truth, and one line for each episode."""
+    assert (written(tmp_path) / "results.csv").read_text().splitlines() == [
+        "task,seed,episode,return,length,terminated,truncated,success,failure",
+        '"a,b-v0",7,0,0.30000000000000004,5,false,true,true,',
+        '"a,b-v0",7,1,nan,5,false,true,,',
+        '"a,b-v0",3,0,,5,,,,"it said ""no"", and went =1+1 \\udc80"',
+        '"a,b-v0",3,1,-inf,5,false,true,,',
+    ]
+
+
+def test_results_without_timing_are_read(tmp_path: Path) -> None:
+    """Whoever publishes the results alone leaves the times away."""
+    (written(tmp_path) / "timing.csv").unlink()
+    first, *_ = read_results(tmp_path)
+    assert first.total_reward == 0.1 + 0.2
+    assert first.start_time is None
+    assert first.monitor is None
+
+
+def test_an_unfinished_evaluation_is_told_from_none(tmp_path: Path) -> None:
+    """The way on is to resume it; where there is none, it says so."""
+    with pytest.raises(UnreadableFile, match="there is no evaluation"):
+        read_results(tmp_path)
+    assert not is_evaluation(tmp_path)
+    (tmp_path / "evaluation.json").write_text("{}")
+    assert is_evaluation(tmp_path)
+    with pytest.raises(UnreadableFile, match="--resume"):
+        read_results(tmp_path)
+
+
+def test_results_are_gone_while_they_are_rewritten(tmp_path: Path) -> None:
+    """Tables of one plan never stand beside the summaries of another."""
+    written(tmp_path)
+    with pytest.raises(ZeroDivisionError):
+        written(tmp_path, files=lambda _: 1 / 0)
+    assert not (tmp_path / "results.json").exists()
+    assert not list(tmp_path.glob(".*"))
+
+
+DAMAGE = {
+    "another header": ("results.csv", b"task,seed", b"task,sed"),
+    "a missing row": ("results.csv", b'"a,b-v0",3,1,-inf,5,false,true,,\n', b""),
+    "half a row": ("results.csv", b",5,false,true,,\n", b""),
+    "one more row": ("results.csv", b"true,true,\n", b"true,true,\n\n"),
+    "a row twice": ("results.csv", b'"a,b-v0",7,1', b'"a,b-v0",7,0'),
+    "a huge number": ("results.csv", b",5,", b"," + b"9" * 5000 + b","),
+    "a number in other words": ("results.csv", b"nan", b"NaN()"),
+    "a huge line": ("results.csv", b"nan", b"1" * 100_000),
+    "an open quote": ("results.csv", b'"it', b'""it'),
+    "a row over two lines": ("results.csv", b"said ", b"said\n"),
+    "no UTF-8": ("results.csv", b"said", b"\xff"),
+    "another truth": ("results.csv", b"false", b"0"),
+    "a return and a failure": ("results.csv", b"3,0,,", b"3,0,1.0,"),
+    "a NUL": ("results.csv", b"said", b"\0"),
+    "a path as a video": ("timing.csv", VIDEO.encode(), b"../../etc/passwd.mp4"),
+    "a video of another": ("timing.csv", b"video000000", b"video000001"),
+    "no digest": ("timing.csv", SHA.encode(), b"<script>"),
+    "a bad infix": ("timing.csv", b",0.w,", b",../0.w,"),
+    "another version": ("results.json", b'"format_version": 1', b'"format_version": 2'),
+    "no JSON": ("results.json", b"{", b"["),
+    "a text for a number": ("results.json", b'"mean": 1.5', b'"mean": "1.5"'),
+    "another task": ("results.json", b'"task": "a,b-v0"', b'"task": "c"'),
+    "many episodes": ("results.json", b'"episodes": 2', b'"episodes": 999999999'),
+    "a strange choice": ("results.json", b'"best"', b'"best", 2'),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damage_is_told_and_names_the_file(tmp_path: Path, damage: str) -> None:
+    """Whatever is wrong is one error of ours."""
+    name, good, bad = DAMAGE[damage]
+    path = written(tmp_path) / name
+    data = path.read_bytes()
+    assert good in data
+    path.write_bytes(data.replace(good, bad, 1))
+    with pytest.raises(UnreadableFile) as caught:
+        read_results(tmp_path)
+    # A plan of other episodes is not that of the table, which may be the wrong one.
+    assert caught.value.path.name in {name, "results.csv"}
+
+
+def test_a_link_out_of_the_directory_is_not_followed(tmp_path: Path) -> None:
+    """Results of strangers do not read the reader's files."""
+    (tmp_path / "there").mkdir()
+    path = written(tmp_path / "there") / "results.csv"
+    path.rename(tmp_path / "results.csv")
+    path.symlink_to(tmp_path / "results.csv")
+    with pytest.raises(UnreadableFile, match="leads out"):
+        read_results(tmp_path / "there")
+
+
+def many(directory: Path, count: int) -> ReadResults:
+    plan = EvaluationPlan(
+        tasks=(EvaluatedTask("T-v0", "T"),), policy="zero", seeds=(0,), episodes=count
+    )
+    written(
+        directory,
+        plan=plan,
+        results=[],
+        summaries=[TaskSummary(task="T-v0", runs=1, episodes=count)],
+        selection={},
+    )
+    with (
+        (directory / "results.csv").open("a") as results,
+        (directory / "timing.csv").open("a") as timing,
+    ):
+        for n in range(count):
+            results.write(f"T-v0,0,{n},{n / 7!r},1000,false,true,,\n")
+            timing.write(f"T-v0,0,{n},1790000000.{n},0.5,0.worker,{n},,,\n")
+    return read_results(directory)
+
+
+def test_many_episodes_need_little_memory(tmp_path: Path) -> None:
+    """A hundred bytes each at most, so that a million fit into 100 MB."""
+    tracemalloc.start()
+    try:
+        read = many(tmp_path, 20_000)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(read.columns["T-v0"]) == 20_000
+    # 1 MB for what does not grow.
+    assert most < 20_000 * 150 + 1_000_000
+
+
+def test_the_results_are_json_that_every_reader_accepts(tmp_path: Path) -> None:
+    """No NaN, no Infinity."""
+
+    def refused(token: str) -> None:
+        raise AssertionError(token)
+
+    text = (written(tmp_path) / "results.json").read_text()
+    json.loads(text, parse_constant=refused)
