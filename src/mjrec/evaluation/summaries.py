@@ -66,6 +66,10 @@ class TaskSummary:
         warnings: how often MuJoCo warned, by kind.
         score_range: the returns that count as 0 and as 1; None where the task has no
             scale.
+        not_finite: how many of the returns are NaN or infinite. Where any is, there
+            are no figures of the returns: without it they would say too much, and
+            with it nothing.
+        interval_method: how the intervals of mean and interquartile mean were made.
     """
 
     task: str
@@ -88,6 +92,8 @@ class TaskSummary:
     success_interval: Interval | None = None
     warnings: Mapping[str, int] = field(default_factory=dict)
     score_range: tuple[float, float] | None = None
+    not_finite: int = 0
+    interval_method: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,8 +103,8 @@ class Profile:
     Attributes:
         thresholds: rising.
         shares: for each threshold the share of scores above it, averaged over tasks.
-        low: the pointwise interval's lower end.
-        high: its upper end.
+        low: the pointwise interval's lower end; empty where there is no interval.
+        high: its upper end; likewise.
     """
 
     thresholds: tuple[float, ...]
@@ -121,6 +127,8 @@ class AcrossTasks:
         optimality_gap: by how much scores fall short of 1, on average.
         optimality_gap_interval: of that.
         profile: of all scores.
+        interval_method: how the intervals were made; None where there are none,
+            because a task has a single episode.
     """
 
     tasks: tuple[str, ...]
@@ -132,3 +140,4 @@ class AcrossTasks:
     optimality_gap: float | None = None
     optimality_gap_interval: Interval | None = None
     profile: Profile | None = None
+    interval_method: str | None = None
