@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tasks that a person names: environments, sets of them, and patterns.
+
+======================  ==============================================================
+`HalfCheetah-v5`        an environment as in `mjrec record`: an id of Gymnasium's,
+                        `dm_control/<domain>-<task>`, or the path of an MJCF file
+`dm_control:all`        a set, see `TASK_SETS`
+`dm_control/walker-*`   a pattern of `*`, `?` and `[...]`, matched against the tasks of
+                        the dm_control suite and the ids in Gymnasium's registry
+`module:Fetch*-v4`      likewise, after importing a module that registers environments
+======================  ==============================================================
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+from ..environments.known_names import gymnasium_ids, mujoco_ids, suite_tasks
+from ..environments.names import parse_environment_name
+from ..errors import InvalidArgument, MissingDependency, UnknownName
+
+__all__ = ["TASK_SETS", "tasks_from"]
+
+TASK_SETS: Mapping[str, Callable[[], Sequence[str]]] = {
+    "dm_control:all": partial(suite_tasks, "all"),
+    "dm_control:benchmarking": partial(suite_tasks, "benchmarking"),
+    "dm_control:easy": partial(suite_tasks, "easy"),
+    "dm_control:extra": partial(suite_tasks, "extra"),
+    "dm_control:hard": partial(suite_tasks, "hard"),
+    "gymnasium:mujoco": mujoco_ids,
+}
+
+_SUITE = "dm_control/"
+_WILD = re.compile(r"[*?\[]")
+_VERSION = re.compile(r"-v[0-9]+$", re.ASCII)
+
+
+def tasks_from(texts: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the environments that `texts` name, each once, in order.
+
+    Raises:
+        UnknownName: there is no such set or file, or nothing matches a pattern.
+        InvalidArgument: nothing is named, or a name cannot be one.
+        MissingDependency, EnvironmentNotMade: the framework of a set is not
+            installed, or cannot be imported.
+    """
+    if isinstance(texts, str):
+        texts = [texts]
+    tasks = dict.fromkeys(name for text in texts for name in _named(text))
+    if not tasks:
+        raise InvalidArgument(
+            "An evaluation needs a task: an environment as in `mjrec record` "
+            f"(dm_control/walker-walk), or a set: {', '.join(TASK_SETS)}."
+        )
+    return tuple(tasks)
+
+
+def _named(text: str) -> Sequence[str]:
+    if text in TASK_SETS:
+        return TASK_SETS[text]()
+    if _is_set(text):
+        raise UnknownName(
+            "set of tasks",
+            text,
+            TASK_SETS,
+            hint="A task of the suite is named dm_control/<domain>-<task>.",
+        )
+    # A file may have brackets in its name.
+    if _WILD.search(text) and not Path(text).expanduser().is_file():
+        return _matching(text)
+    parse_environment_name(text)
+    return [text]
+
+
+def _is_set(text: str) -> bool:
+    """Tell whether it can only have been meant as a set."""
+    framework, colon, name = text.partition(":")
+    if not colon or _WILD.search(name):
+        return False
+    # `gymnasium:Ant-v5` is an environment of a module that registers some.
+    return framework == "dm_control" or (
+        framework == "gymnasium" and not _VERSION.search(name)
+    )
+
+
+def _matching(pattern: str) -> Sequence[str]:
+    known = list(_candidates(pattern))
+    matching = [name for name in known if fnmatch.fnmatchcase(name, pattern)]
+    if not matching:
+        raise UnknownName(
+            "task that matches",
+            pattern,
+            known,
+            hint="Looked through the tasks of the dm_control suite, where it is "
+            "installed, and the ids in Gymnasium's registry. Sets are "
+            f"{', '.join(TASK_SETS)}.",
+        )
+    return matching
+
+
+def _candidates(pattern: str) -> Iterator[str]:
+    module, colon, _ = pattern.rpartition(":")
+    if colon:
+        for env_id in gymnasium_ids(module):
+            yield f"{module}:{env_id}"
+        return
+    beginning = _WILD.split(pattern, maxsplit=1)[0]
+    if beginning.startswith(_SUITE):
+        yield from suite_tasks("all")
+        return
+    if _SUITE.startswith(beginning):
+        yield from _suite_if_installed()
+    yield from gymnasium_ids()
+
+
+def _suite_if_installed() -> Sequence[str]:
+    try:
+        return suite_tasks("all")
+    except MissingDependency:
+        # Nothing was said of it: the pattern may mean others.
+        return ()

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+from mjrec import EnvironmentNotMade, InvalidArgument, MissingDependency, UnknownName
+from mjrec.environments import known_names
+from mjrec.evaluation.task_sets import TASK_SETS, tasks_from
+
+
+def test_environments_stay_as_they_are_each_once_in_order() -> None:
+    """What is named twice is evaluated once, where it was named first."""
+    names = ["Hopper-v5", "dm_control/walker-walk", "Ant-v5", "Hopper-v5"]
+    assert tasks_from(names) == ("Hopper-v5", "dm_control/walker-walk", "Ant-v5")
+    assert tasks_from("Ant-v5") == ("Ant-v5",)
+
+
+def test_gymnasium_mujoco_is_the_newest_version_of_each() -> None:
+    """Eleven environments, all v5 as of Gymnasium 1."""
+    tasks = tasks_from(["gymnasium:mujoco"])
+    assert len(tasks) == 11
+    assert "HalfCheetah-v5" in tasks
+    assert "HalfCheetah-v4" not in tasks
+    assert set(tasks) <= set(gymnasium.registry)
+
+
+@pytest.mark.dm_control
+def test_sets_of_the_suite_are_the_suites_own() -> None:
+    """Sorted, so that no version of dm_control gives them in another order."""
+    from dm_control import suite
+
+    for tag in ("benchmarking", "easy", "hard", "extra"):
+        expected = [f"dm_control/{d}-{t}" for d, t in getattr(suite, tag.upper())]
+        assert tasks_from([f"dm_control:{tag}"]) == tuple(sorted(expected))
+    everything = tasks_from(["dm_control:all"])
+    assert len(everything) == len(suite.ALL_TASKS)
+
+
+@pytest.mark.dm_control
+def test_patterns_are_matched_against_both_frameworks() -> None:
+    """With `*`, `?` and brackets."""
+    assert tasks_from(["dm_control/walker-*", "HalfCheetah-v[45]"]) == (
+        *("dm_control/walker-run", "dm_control/walker-stand"),
+        *("dm_control/walker-walk", "HalfCheetah-v4", "HalfCheetah-v5"),
+    )
+    assert "dm_control/acrobot-swingup" in tasks_from(["*swingup"])
+
+
+def test_a_pattern_may_name_a_module_that_registers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may lie in the working directory, and is not imported here."""
+    (tmp_path / "my_environments.py").write_text(
+        "import gymnasium\n"
+        "for n in (0, 1):\n"
+        "    gymnasium.register(f'Mine-v{n}', 'gymnasium.envs.mujoco:HopperEnv')\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    assert tasks_from(["my_environments:Mine-v*"]) == (
+        *("my_environments:Mine-v0", "my_environments:Mine-v1"),
+    )
+    assert "my_environments" not in sys.modules
+    with pytest.raises(EnvironmentNotMade, match="No module named 'no_such'"):
+        tasks_from(["no_such:Mine-v*"])
+
+
+@pytest.mark.parametrize("text", ["dm_control:bench", "gymnasium:atari"])
+def test_an_unknown_set_lists_the_sets(text: str) -> None:
+    """Also one of Gymnasium's, whose own module could be meant by a colon."""
+    with pytest.raises(UnknownName) as caught:
+        tasks_from([text])
+    assert all(name in str(caught.value) for name in TASK_SETS)
+    assert tasks_from(["gymnasium:Ant-v5"]) == ("gymnasium:Ant-v5",)
+
+
+def test_a_pattern_that_matches_nothing_says_where_it_looked() -> None:
+    """And names what is like it."""
+    with pytest.raises(UnknownName, match=r"Looked through .*dm_control:all"):
+        tasks_from(["HalfChetah-v*"])
+
+
+@pytest.mark.parametrize("texts", [[], [""], ["dm_control/walker"]])
+def test_what_can_be_no_name_is_refused(texts: list[str]) -> None:
+    """By the words of `mjrec record`."""
+    with pytest.raises(InvalidArgument):
+        tasks_from(texts)
+
+
+def test_a_set_without_its_framework_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The line for pip, and a pattern that may mean others goes without it."""
+    (tmp_path / "dm_control.py").write_text(
+        "raise ModuleNotFoundError('No dm_control', name='dm_control')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(MissingDependency, match=r'pip install "mjrec\[dm-control\]"'):
+        tasks_from(["dm_control:easy"])
+    assert "HalfCheetah-v5" in tasks_from(["*-v5"])
+
+
+def test_asking_for_names_loads_no_framework_here() -> None:
+    """A process that only hands out work stays without a simulator."""
+    code = (
+        "import sys; from mjrec.evaluation.task_sets import tasks_from\n"
+        "tasks_from(['gymnasium:mujoco'])\n"
+        "print({'mujoco', 'gymnasium', 'dm_control'} & set(sys.modules))"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert said.stdout.strip() == "set()"
+
+
+def test_a_process_that_dies_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its last words, whatever killed it."""
+    monkeypatch.setattr(known_names, "__name__", "mjrec.no_such_module")
+    with pytest.raises(EnvironmentNotMade, match="no_such_module"):
+        known_names.gymnasium_ids()
