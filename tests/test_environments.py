@@ -482,3 +482,16 @@ def test_a_module_that_registers_lies_in_the_working_directory(
     with pytest.raises(mjrec.EnvironmentNotMade, match="no_such_module"):
         make_gymnasium("no_such_module:Local-v0", EnvironmentOptions())
     assert sys.path == path
+
+
+def test_a_stream_is_seeded_once() -> None:
+    """As Gymnasium's users do: `reset(seed=...)`, then `reset()` and `reset()`."""
+    options = EnvironmentOptions(pictures=False)
+    named = environment_from_name("InvertedPendulum-v5", options)
+    theirs = gymnasium.make("InvertedPendulum-v5")
+    expected = [theirs.reset(seed=4)[0], theirs.reset()[0]]
+    env, seeds = named.environment, episode_seeds(4, 0)
+    found = [named.begin_stream(env, 4, seeds), named.next_episode(env, seeds)]
+    assert np.array_equal(found, expected)
+    theirs.close()
+    env.close()

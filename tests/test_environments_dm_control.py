@@ -278,3 +278,44 @@ def test_a_recording_says_with_what_its_task_was_made() -> None:
     assert recorded["kwargs"] == {"task_kwargs": {"random": 5, "time_limit": 2}}
     other = suite.load("cartpole", "swingup")
     assert arguments_of(other) is None
+
+
+@pytest.mark.parametrize("task", ["lqr-lqr_2_1", "pendulum-swingup"])
+def test_a_stream_is_what_the_suites_users_have(task: str) -> None:
+    """Seeded once when it is loaded, then reset and reset, as `suite.load` is used."""
+    domain, _, name = task.partition("-")
+    theirs = suite.load(domain, name, task_kwargs={"random": 7})
+    options = EnvironmentOptions(seed=7, pictures=False)
+    named = environment_from_name(f"dm_control/{task}", options)
+    ours = named.environment
+    for episode in range(3):
+        seeds = episode_seeds(7, episode)
+        if episode:
+            first = named.next_episode(ours, seeds)
+        else:
+            first = named.begin_stream(ours, 7, seeds)
+        expected = theirs.reset().observation
+        assert {k: v.tolist() for k, v in first.items()} == {
+            k: v.tolist() for k, v in expected.items()
+        }
+
+
+def test_a_stream_of_another_seed_is_begun_anew() -> None:
+    """What the environment was made with does not matter then, nor what it drew."""
+    options = EnvironmentOptions(seed=7, pictures=False)
+    name = "dm_control/pendulum-swingup"
+    fresh, used = (environment_from_name(name, options) for _ in range(2))
+    used.environment.reset()
+    seeds = episode_seeds(9, 0)
+    one = fresh.begin_stream(fresh.environment, 9, seeds)
+    other = used.begin_stream(used.environment, 9, seeds)
+    assert one["orientation"].tolist() == other["orientation"].tolist()
+
+
+def test_the_limit_of_a_task_is_known() -> None:
+    """Its own, or the one that was asked for."""
+    name = "dm_control/pendulum-swingup"
+    own = environment_from_name(name, EnvironmentOptions(pictures=False))
+    options = EnvironmentOptions(max_steps=5, pictures=False)
+    assert own.step_limit == 1000
+    assert environment_from_name(name, options).step_limit == 5

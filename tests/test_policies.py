@@ -17,7 +17,7 @@ from gymnasium import spaces
 import mjrec
 from mjrec.environments.episode_seeds import EpisodeSeeds, episode_seeds
 from mjrec.environments.gymnasium_actions import GymnasiumActions
-from mjrec.environments.policies import Policy, load_policy
+from mjrec.environments.policies import Policy, load_policy, policy_from
 
 SEEDS = EpisodeSeeds(environment=1, actions=2, policy=3)
 
@@ -392,3 +392,30 @@ def test_what_is_no_policy_is_refused(write: Write) -> None:
         load("make()")
     with pytest.raises(mjrec.PolicyError, match="Leave the parentheses away"):
         load("number()")
+
+
+def test_an_object_is_a_policy_as_what_a_name_names() -> None:
+    """Functions, objects with `predict` and classes need no module to be found in."""
+
+    class Still:
+        def __init__(self, environment: Any) -> None:
+            self.shape = environment.action_space.shape
+
+        def predict(self, observation: Any) -> Any:
+            return np.zeros(self.shape, np.float32), None
+
+    half = np.full(2, 0.5, np.float32)
+    assert (
+        policy_from(lambda observation: half, "half", BOX)(None).tolist() == [0.5] * 2
+    )
+    assert policy_from(Still, "Still", BOX)(None).tolist() == [0, 0]
+    assert policy_from(Still(BOX), "Still", BOX)(None).tolist() == [0, 0]
+
+
+def test_an_object_that_is_no_policy_is_named() -> None:
+    """What it is called stands in what is said of it."""
+    with pytest.raises(mjrec.PolicyError, match="mine gives 3"):
+        policy_from(3, "mine", BOX)
+    broken = policy_from(lambda observation: 1 / 0, "mine", BOX)
+    with pytest.raises(mjrec.PolicyError, match="The policy mine raised ZeroDiv"):
+        broken(None)

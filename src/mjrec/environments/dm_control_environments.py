@@ -18,7 +18,15 @@ from .dm_env_episodes import StepLimit
 from .episode_seeds import EpisodeSeeds
 from .options import EnvironmentOptions
 
-__all__ = ["arguments_of", "begin_episode", "make_dm_control", "step"]
+__all__ = [
+    "arguments_of",
+    "begin_episode",
+    "begin_stream",
+    "make_dm_control",
+    "next_episode",
+    "step",
+    "step_limit",
+]
 
 _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
@@ -92,6 +100,51 @@ def begin_episode(env: dm_env.Environment, seeds: EpisodeSeeds) -> Any:
     if not callable(getattr(env, "seed", print)):
         env.seed = seeds.environment
     return env.reset().observation
+
+
+def begin_stream(env: dm_env.Environment, seed: int, seeds: EpisodeSeeds) -> Any:
+    """Reset the environment, seeded for all episodes that follow.
+
+    An environment that was made with this seed and never reset is not seeded again:
+    it is as `suite.load(..., task_kwargs={"random": seed})` made it, and what it drew
+    while it was made stays drawn. Any other begins the seed's sequence anew.
+
+    Args:
+        env: the environment, or a wrapper of it.
+        seed: of the environment's randomness from here on.
+        seeds: of this episode; nothing of dm_env takes one.
+
+    Returns:
+        The first observation.
+
+    Raises:
+        InvalidArgument: the environment has no random state.
+    """
+    made = arguments_of(env) or {}
+    if made.get("task_kwargs", {}).get("random") != seed:
+        _random_state(env).seed(seed)
+    return next_episode(env, seeds)
+
+
+def next_episode(env: dm_env.Environment, seeds: EpisodeSeeds) -> Any:
+    """Reset the environment, whose randomness goes on where it is.
+
+    A monitor says of such an episode that it had no seed.
+
+    Returns:
+        The first observation.
+    """
+    if not callable(getattr(env, "seed", print)):
+        env.seed = None
+    return env.reset().observation
+
+
+def step_limit(env: dm_env.Environment) -> int:
+    """Return after how many steps the episodes of what was made here end."""
+    if isinstance(env, StepLimit):
+        return env.max_steps
+    # Nothing public tells it, and what is not limited by us has one.
+    return int(env._step_limit)
 
 
 def step(env: dm_env.Environment, action: Any) -> tuple[Any, bool]:

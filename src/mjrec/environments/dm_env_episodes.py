@@ -42,6 +42,11 @@ class StepLimit(dm_env.Environment):  # type: ignore[misc]  # untyped
         self._steps = 0
         self._ended = True
 
+    @property
+    def max_steps(self) -> int:
+        """How many steps an episode has at most."""
+        return self._max_steps
+
     def reset(self) -> dm_env.TimeStep:
         """Begin an episode."""
         self._steps = 0

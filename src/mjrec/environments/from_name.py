@@ -31,10 +31,14 @@ class NamedEnvironment:
         env_id: its name in recordings.
         begin_episode: resets the environment, or a wrapper of it such as a monitor, to
             an episode's seeds and returns the first observation.
+        begin_stream: resets the same, seeded with a number for all episodes that
+            follow, and returns the first observation. The episode's own seeds are for
+            the actions.
+        next_episode: resets the same without seeding it: its randomness goes on.
         step: takes the same and an action, and returns the next observation and
             whether it is the episode's last.
-        has_deferrable_pictures: tells whether what it shows can be drawn from its
-            states.
+        scenes: returns what is known of its pictures and its states.
+        step_limit: after how many steps its episodes end.
         view: `camera`, `height` and `width` as far as the monitor is to be given
             them; empty where the environment itself shows what was asked for.
     """
@@ -42,9 +46,17 @@ class NamedEnvironment:
     environment: Any
     env_id: str
     begin_episode: Callable[[Any, EpisodeSeeds], Any]
+    begin_stream: Callable[[Any, int, EpisodeSeeds], Any]
+    next_episode: Callable[[Any, EpisodeSeeds], Any]
     step: Callable[[Any, Any], tuple[Any, bool]]
-    has_deferrable_pictures: Callable[[], bool]
+    scenes: Callable[[], Scenes]
+    step_limit: int
     view: dict[str, Any] = field(default_factory=dict)
+
+    def has_deferrable_pictures(self) -> bool:
+        """Tell whether what it shows can be drawn from its states."""
+        scenes = self.scenes()
+        return scenes.states is not None and scenes.obstacle is None
 
 
 def environment_from_name(
@@ -89,8 +101,11 @@ def _gymnasium(env_id: str, options: EnvironmentOptions) -> NamedEnvironment:
         environment=environment,
         env_id=_id_of(environment),
         begin_episode=module.begin_episode,
+        begin_stream=module.begin_stream,
+        next_episode=module.next_episode,
         step=module.step,
-        has_deferrable_pictures=lambda: _are_deferrable(gymnasium_scenes(environment)),
+        scenes=lambda: gymnasium_scenes(environment),
+        step_limit=_step_limit(environment),
     )
 
 
@@ -104,8 +119,11 @@ def _mjcf(name: MjcfName, options: EnvironmentOptions) -> NamedEnvironment:
         environment=environment,
         env_id=_id_of(environment),
         begin_episode=module.begin_episode,
+        begin_stream=module.begin_stream,
+        next_episode=module.next_episode,
         step=module.step,
-        has_deferrable_pictures=lambda: _are_deferrable(gymnasium_scenes(environment)),
+        scenes=lambda: gymnasium_scenes(environment),
+        step_limit=_step_limit(environment),
     )
 
 
@@ -121,18 +139,22 @@ def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnviro
         environment=environment,
         env_id=str(name),
         begin_episode=module.begin_episode,
+        begin_stream=module.begin_stream,
+        next_episode=module.next_episode,
         step=module.step,
-        has_deferrable_pictures=lambda: _are_deferrable(dm_control_scenes(environment)),
+        scenes=lambda: dm_control_scenes(environment),
+        step_limit=module.step_limit(environment),
         view=_dm_control_view(environment, options),
     )
 
 
-def _are_deferrable(scenes: Scenes) -> bool:
-    return scenes.states is not None and scenes.obstacle is None
-
-
 def _id_of(environment: Any) -> str:
     return str(environment.spec.id)
+
+
+def _step_limit(environment: Any) -> int:
+    # Environments that are made from names always have one.
+    return int(environment.spec.max_episode_steps)
 
 
 def _dm_control_view(environment: Any, options: EnvironmentOptions) -> dict[str, Any]:

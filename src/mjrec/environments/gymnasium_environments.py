@@ -27,7 +27,13 @@ from .episode_seeds import EpisodeSeeds
 from .options import EnvironmentOptions
 from .working_directory import working_directory_importable
 
-__all__ = ["begin_episode", "make_gymnasium", "step"]
+__all__ = [
+    "begin_episode",
+    "begin_stream",
+    "make_gymnasium",
+    "next_episode",
+    "step",
+]
 
 # What records as a video, before what records as text.
 _PREFERRED_MODES = ("rgb_array", "ansi")
@@ -80,6 +86,37 @@ def begin_episode(env: gymnasium.Env[Any, Any], seeds: EpisodeSeeds) -> Any:
     """
     env.action_space.seed(seeds.actions)
     observation, _ = env.reset(seed=seeds.environment)
+    return observation
+
+
+def begin_stream(env: gymnasium.Env[Any, Any], seed: int, seeds: EpisodeSeeds) -> Any:
+    """Reset the environment, seeded for all episodes that follow.
+
+    Args:
+        env: the environment, or a wrapper of it.
+        seed: of the environment's randomness from here on.
+        seeds: of this episode; only the action space takes one.
+
+    Returns:
+        The first observation.
+    """
+    env.action_space.seed(seeds.actions)
+    observation, _ = env.reset(seed=seed)
+    return observation
+
+
+def next_episode(env: gymnasium.Env[Any, Any], seeds: EpisodeSeeds) -> Any:
+    """Reset the environment, whose randomness goes on where it is.
+
+    Args:
+        env: the environment, or a wrapper of it.
+        seeds: of this episode; only the action space takes one.
+
+    Returns:
+        The first observation.
+    """
+    env.action_space.seed(seeds.actions)
+    observation, _ = env.reset()
     return observation
 
 

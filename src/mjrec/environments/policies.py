@@ -37,6 +37,7 @@ __all__ = [
     "Policy",
     "load_policy",
     "policy_file",
+    "policy_from",
     "working_directory_importable",
 ]
 
@@ -100,6 +101,24 @@ def load_policy(text: str, environment: Any) -> Policy:
     with working_directory_importable():
         chosen = _chosen(text, environment)
     return _ForeignPolicy(text, _chooser(text, chosen), actions)
+
+
+def policy_from(chosen: Any, name: str, environment: Any) -> Policy:
+    """Return the policy that an object is, as `load_policy` treats `module:name`.
+
+    Args:
+        chosen: an object with `predict`, a function, or a class, which is built with
+            the environment and then is one of these.
+        name: what messages call it.
+        environment: the Gymnasium or dm_env environment that is to be acted in.
+
+    Raises:
+        PolicyError: building it raised, which is kept as the cause, or it is no
+            policy.
+    """
+    if inspect.isclass(chosen):
+        chosen = _built(chosen, name, environment)
+    return _ForeignPolicy(name, _chooser(name, chosen), _actions(environment))
 
 
 def policy_file(text: str) -> Path | None:
@@ -241,8 +260,12 @@ def _chosen(text: str, environment: Any) -> Any:
             f"The policy {text} is to be called, and {name} is {found!r}, which cannot "
             f"be. Leave the parentheses away: {module_name}:{name}."
         )
-    with _failures_named(f"Building the policy {text} with the environment"):
-        return found(environment)
+    return _built(found, text, environment)
+
+
+def _built(make: Callable[[Any], Any], name: str, environment: Any) -> Any:
+    with _failures_named(f"Building the policy {name} with the environment"):
+        return make(environment)
 
 
 def _import(module_name: str, text: str) -> ModuleType:
