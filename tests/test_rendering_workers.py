@@ -22,6 +22,7 @@ from processes import children
 from rides import FRAMES, HEIGHT, WIDTH, Ride, record
 
 import mjrec
+from mjrec.carried_errors import carried, unpacked
 from mjrec.child_python import environment_of_child
 from mjrec.errors import (
     ClosedError,
@@ -32,7 +33,6 @@ from mjrec.errors import (
     UnreadableFile,
 )
 from mjrec.rendering import worker_process, workers
-from mjrec.rendering.carried_errors import carried, unpacked
 from mjrec.rendering.views import View
 from mjrec.rendering.worker_process import WorkerProcess
 from mjrec.rendering.workers import DrawingWorkers

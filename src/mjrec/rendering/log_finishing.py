@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from ..carried_errors import carried, unpacked
 from ..child_python import (
     environment_of_child,
     python_command,
@@ -32,7 +33,6 @@ from ..child_python import (
 from ..errors import Error
 from ..formats.trajectory_file import finish_trajectory
 from ..patience import Patience
-from .carried_errors import carried, unpacked
 
 __all__ = ["finish_log", "main"]
 

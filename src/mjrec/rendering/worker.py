@@ -32,9 +32,9 @@ import threading
 from collections.abc import Mapping
 from typing import IO, Any
 
+from ..carried_errors import carried
 from ..child_python import say_stacks_when_asked, take_standard_output
 from ..gl import use_gl
-from .carried_errors import carried
 from .frame_ring import FrameRing
 
 __all__ = ["main"]

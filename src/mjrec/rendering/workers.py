@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from ..carried_errors import unpacked
 from ..errors import ClosedError, Error, GLError, InvalidArgument
 from ..frames import Frame
 from ..gl.backends import (
@@ -21,7 +22,6 @@ from ..gl.backends import (
 )
 from ..patience import Patience
 from ..simulation.model_trust import with_all_models_trusted
-from .carried_errors import unpacked
 from .frame_ring import SLOTS, FrameRing
 from .views import PlainCamera, View, plain_camera
 from .worker_process import WorkerProcess

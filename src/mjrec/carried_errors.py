@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .. import errors
-from ..errors import Error
+from . import errors
+from .errors import Error
 
 __all__ = ["carried", "unpacked"]
 
