@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work in processes of this machine."""
+
+from __future__ import annotations
+
+import collections
+import json
+import logging
+import os
+import selectors
+import time
+import weakref
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+from ..carried_errors import unpacked
+from ..child_python import environment_of_child
+from ..errors import ClosedError, Error, InvalidArgument
+from ..machine import usable_cpus
+from .local_process import WorkerProcess
+from .local_worker import SECONDS_TO_CLOSE
+from .work import Job, JobOutcome, Work
+
+__all__ = ["LocalEngine", "LocalRun"]
+
+logger = logging.getLogger(__name__)
+
+# Once may be chance, such as the system's killer of processes that need much memory;
+# so may twice, on a machine that has too little of it. Three times is the job.
+_TRIES = 3
+_ENDS_AT_ONCE = 2
+
+
+class LocalEngine:
+    """Runs work in processes of this machine.
+
+    Args:
+        workers: how many at most; None is one for each CPU that may be used.
+
+    Raises:
+        InvalidArgument: `workers` is not a whole number of at least 1.
+    """
+
+    def __init__(self, workers: int | None = None) -> None:
+        if workers is None:
+            workers = usable_cpus()
+        if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
+            raise InvalidArgument(
+                f"workers must be a whole number of at least 1, got {workers!r}."
+            )
+        self.workers = workers
+
+    def __repr__(self) -> str:
+        return f"LocalEngine(workers={self.workers})"
+
+    def begin(self, work: Work) -> LocalRun:
+        """Begin a run. Workers are started when there are jobs.
+
+        Raises:
+            InvalidArgument: the settings are no JSON.
+            Error: the system grants no memory for the payload.
+        """
+        return LocalRun(work, self.workers)
+
+
+class LocalRun:
+    """Work that has been begun.
+
+    Workers start, take jobs and are heard while `results` is iterated over. Each is
+    given one job at a time, and stays for the next until the end of the run. What they
+    print is passed on to this process's standard error.
+
+    A job whose worker dies is put behind the others and begun again, three times in
+    all; then its failure says what the last worker died of.
+
+    For one thread at a time, and for the process that began it.
+
+    Args:
+        work: what the workers do.
+        workers: how many at most.
+
+    Raises:
+        InvalidArgument: the settings are no JSON.
+        Error: the system grants no memory for the payload.
+    """
+
+    def __init__(self, work: Work, workers: int) -> None:
+        self._most = workers
+        self._environ = environment_of_child({**os.environ, **work.environ})
+        self._work = _written(work)
+        self._forget_work = weakref.finalize(self, os.close, self._work)
+        self._selector = selectors.DefaultSelector()
+        self._workers: list[_Worker] = []
+        self._keys: set[str] = set()
+        self._given_out = 0
+        self._waiting: collections.deque[_Task] = collections.deque()
+        self._outcomes: collections.deque[JobOutcome] = collections.deque()
+        self._ends_at_once = 0
+        self._cancelled = False
+        self._process_id = os.getpid()
+
+    def submit(self, job: Job) -> None:
+        """Hand out a job; also while results come.
+
+        Raises:
+            InvalidArgument: there was one with that key, or its arguments are no JSON.
+            ClosedError: the run is cancelled, or another process's.
+        """
+        self._check_usable()
+        if job.key in self._keys:
+            raise InvalidArgument(f"There was a job {job.key!r} in this run already.")
+        line = _as_json(
+            {"key": job.key, "arguments": dict(job.arguments)},
+            what=f"The arguments of the job {job.key!r}",
+        )
+        self._keys.add(job.key)
+        self._waiting.append(_Task(job.key, line))
+
+    @property
+    def unfinished(self) -> int:
+        """How many jobs have been submitted whose outcome has not been given out."""
+        return len(self._keys) - self._given_out
+
+    def results(
+        self, *, patience_s: float | None = None
+    ) -> Iterator[JobOutcome | None]:
+        """Yield outcomes as they come, until none is outstanding or all is cancelled.
+
+        Args:
+            patience_s: None is yielded whenever no outcome has come for so long; never,
+                if it is None.
+
+        Raises:
+            InvalidArgument: `patience_s` is no positive number.
+            ClosedError: the run is cancelled, or another process's.
+            Error: no worker can be started, each ends as soon as it begins, or what
+                makes the handler raised. What it raised, if that is one of ours.
+        """
+        self._check_usable()
+        if patience_s is not None and not patience_s > 0:
+            raise InvalidArgument(
+                f"patience_s must be a positive number of seconds, got {patience_s!r}."
+            )
+        return self._results(patience_s)
+
+    def cancel(self) -> None:
+        """End all workers; jobs that are not done stay so. Idempotent.
+
+        Workers are told to end (SIGTERM), so that what they are at can close its
+        files, and are killed where they have not done so after ten seconds.
+        """
+        if self._cancelled or os.getpid() != self._process_id:
+            return
+        self._cancelled = True
+        try:
+            self._let_workers_end()
+        finally:
+            # Also where Ctrl-C has cut the waiting short.
+            for worker in list(self._workers):
+                self._dismiss(worker)
+            self._selector.close()
+            self._forget_work()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.cancel()
+
+    def _check_usable(self) -> None:
+        if os.getpid() != self._process_id:
+            raise ClosedError(
+                f"The run belongs to process {self._process_id}: begin one in the "
+                "process that uses it."
+            )
+        if self._cancelled:
+            raise ClosedError("The run is cancelled.")
+
+    def _results(self, patience_s: float | None) -> Iterator[JobOutcome | None]:
+        last = time.monotonic()
+        while self.unfinished and not self._cancelled:
+            self._hand_out()
+            rest = None if patience_s is None else last + patience_s - time.monotonic()
+            # Also where there are outcomes: the workers shall not wait for the caller.
+            self._listen(
+                0 if self._outcomes or (rest is not None and rest <= 0) else rest
+            )
+            self._hand_out()
+            if self._outcomes:
+                self._given_out += 1
+                yield self._outcomes.popleft()
+            elif rest is not None and rest <= 0:
+                yield None
+            else:
+                continue
+            last = time.monotonic()
+
+    def _hand_out(self) -> None:
+        """Give jobs to whoever is idle; start no more workers than there are jobs."""
+        idle = [worker for worker in self._workers if worker.is_idle]
+        while self._waiting and idle:
+            idle.pop().begin(self._waiting.popleft())
+        starting = sum(not worker.is_ready for worker in self._workers)
+        while len(self._waiting) > starting and len(self._workers) < self._most:
+            self._start()
+            starting += 1
+
+    def _start(self) -> None:
+        worker = _Worker(WorkerProcess(self._work, self._environ))
+        self._workers.append(worker)
+        for end in (worker.process.answers, worker.process.words):
+            self._selector.register(end, selectors.EVENT_READ, worker)
+
+    def _listen(self, seconds: float | None) -> None:
+        """Take in what the workers say, waiting so long for it; for ever if None."""
+        for key, _ in self._selector.select(seconds):
+            worker: _Worker = key.data
+            # Another event may have ended it.
+            if worker not in self._workers:
+                continue
+            if key.fileobj is worker.process.answers:
+                self._take_in(worker, worker.process.receive())
+            elif not worker.process.listen():
+                self._selector.unregister(key.fileobj)
+
+    def _take_in(self, worker: _Worker, answers: list[dict[str, Any]] | None) -> None:
+        if answers is None:
+            self._replace(worker)
+            return
+        for answer in answers:
+            if "log" in answer:
+                name, level, text = answer["log"]
+                logging.getLogger(name).log(level, "%s", text)
+            elif "ready" in answer:
+                worker.is_ready = True
+                self._ends_at_once = 0
+            elif "error" in answer:
+                self._dismiss(worker)
+                raise unpacked(answer["error"])
+            else:
+                self._outcomes.append(worker.finish(answer))
+
+    def _replace(self, worker: _Worker) -> None:
+        """See what is to be done about one that has ended."""
+        how = worker.process.last_words()
+        self._dismiss(worker)
+        if self._cancelled:
+            return
+        if not worker.is_ready:
+            self._ends_at_once += 1
+            if self._ends_at_once >= _ENDS_AT_ONCE:
+                raise Error(f"No worker can begin. The last one {how}")
+            logger.warning("A worker could not begin, and is replaced. It %s", how)
+        elif worker.task is not None:
+            self._begin_again(worker.task, how)
+
+    def _begin_again(self, task: _Task, how: str) -> None:
+        """Put a job whose worker has died behind the others, or give it up."""
+        if task.tries < _TRIES:
+            logger.warning(
+                "A worker died at the job %s, which is begun again. It %s",
+                task.key,
+                how,
+            )
+            self._waiting.append(task)
+            return
+        failure = f"Its worker died, which was try {task.tries} of {_TRIES}: it {how}"
+        self._outcomes.append(
+            JobOutcome(key=task.key, value=None, failure=failure, tries=task.tries)
+        )
+
+    def _let_workers_end(self) -> None:
+        for worker in self._workers:
+            worker.process.ask_to_end()
+        deadline = time.monotonic() + SECONDS_TO_CLOSE
+        while self._workers and (rest := deadline - time.monotonic()) > 0:
+            # What they say is heard: who cannot print does not come to its end.
+            self._listen(rest)
+        if self._workers:
+            logger.warning(
+                "%d workers have not ended %g seconds after they were told to, and "
+                "are killed.",
+                len(self._workers),
+                SECONDS_TO_CLOSE,
+            )
+
+    def _dismiss(self, worker: _Worker) -> None:
+        self._workers.remove(worker)
+        for end in (worker.process.answers, worker.process.words):
+            # That of the words is let go of when it ends.
+            if end in self._selector.get_map():
+                self._selector.unregister(end)
+        worker.process.end()
+
+
+@dataclass
+class _Task:
+    """A job that has no outcome yet."""
+
+    key: str
+    line: bytes
+    tries: int = 0
+
+
+@dataclass(eq=False)
+class _Worker:
+    """A process, and what it is at."""
+
+    process: WorkerProcess
+    is_ready: bool = False
+    task: _Task | None = None
+
+    @property
+    def is_idle(self) -> bool:
+        return self.is_ready and self.task is None
+
+    def begin(self, task: _Task) -> None:
+        task.tries += 1
+        self.task = task
+        # Its last words shall be about this job.
+        self.process.listen()
+        self.process.forget_words()
+        self.process.send(task.line)
+
+    def finish(self, answer: dict[str, Any]) -> JobOutcome:
+        task, self.task = self.task, None
+        assert task is not None
+        return JobOutcome(
+            key=task.key,
+            value=answer.get("value"),
+            failure=answer.get("failure"),
+            tries=task.tries,
+        )
+
+
+def _written(work: Work) -> int:
+    """Write work for all workers, once; return the file's descriptor."""
+    payload = work.payload
+    facts = {
+        "entry": work.entry,
+        "settings": dict(work.settings),
+        "payload": None if payload is None else len(payload),
+    }
+    line = _as_json(facts, what="The settings of the work")
+    try:
+        # It has no name: nothing has to be removed, and nobody else can read it.
+        descriptor = os.memfd_create("mjrec-work")
+        try:
+            for part in (line + b"\n", payload or b""):
+                _write_whole(descriptor, part)
+        except BaseException:
+            os.close(descriptor)
+            raise
+    except OSError as error:
+        raise Error(f"No memory for what the workers are given: {error}.") from error
+    return descriptor
+
+
+def _write_whole(descriptor: int, data: bytes) -> None:
+    rest = memoryview(data)
+    while rest:
+        rest = rest[os.write(descriptor, rest) :]
+
+
+def _as_json(said: dict[str, Any], *, what: str) -> bytes:
+    try:
+        return json.dumps(said).encode()
+    except (TypeError, ValueError) as error:
+        raise InvalidArgument(f"{what} cannot be written as JSON: {error}.") from error

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A process that does jobs: `python -m mjrec.engines.local_worker SOCKET WORK`.
+
+Both are file descriptors. WORK is a file: a line of JSON with `entry` and `settings` of
+the `Work` and the size of its `payload`, or null, then that payload. On the socket both
+sides say one JSON object a line. It is told one job after the other::
+
+    {"key": "a", "arguments": {...}}
+
+and says::
+
+    {"ready": true}                       there is a handler; before anything else
+    {"error": {...}}                      instead of it: none could be made
+    {"key": "a", "value": {...}}          a job is done
+    {"key": "b", "failure": "..."}        or failed, with what the handler raised
+    {"log": ["mjrec.x", 30, "..."]}       for the parent's log
+
+Whatever it prints is passed on by the parent. On SIGTERM the handler is closed and the
+process ends; so it does when the socket ends because the parent has died, in mid-job
+too.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import importlib
+import io
+import json
+import logging
+import mmap
+import operator
+import os
+import queue
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Mapping
+from typing import Any, cast
+
+from ..carried_errors import carried
+from ..child_python import say_stacks_when_asked
+from ..signals import Terminated, exiting_on_signals, received
+from .work import Handler
+
+__all__ = ["SECONDS_TO_CLOSE", "main"]
+
+# Not `__name__`, which is `__main__`.
+logger = logging.getLogger("mjrec.engines.local_worker")
+
+# A monitor is closed in well under a second, on a slow network disk in a few; Slurm
+# kills 30 seconds after its SIGTERM, Kubernetes too, docker after 10.
+SECONDS_TO_CLOSE = 10.0
+
+
+def main() -> None:
+    """Do jobs until told to end."""
+    say_stacks_when_asked()
+    # As in a terminal: what is printed is there when the process dies.
+    cast("io.TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
+    _hear_sigterm()
+    parent = _Parent(socket.socket(fileno=int(sys.argv[1])))
+    logging.getLogger().addHandler(_ToParent(parent))
+    with exiting_on_signals():
+        handler = _handler(int(sys.argv[2]), parent)
+        try:
+            parent.say(ready=True)
+            while True:
+                _do(handler, parent.next_job(), parent)
+        finally:
+            _close(handler)
+
+
+class _Parent:
+    """Who gives the jobs. Its words are read on a thread, to notice its end."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._one_at_a_time = threading.Lock()
+        self._jobs: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        # The connection ends with this process, whatever a policy has started.
+        connection.set_inheritable(False)
+        os.register_at_fork(after_in_child=connection.close)
+        threading.Thread(target=self._read, name="mjrec-jobs", daemon=True).start()
+
+    def next_job(self) -> dict[str, Any]:
+        """Return the next job, waiting for it."""
+        return self._jobs.get()
+
+    def say(self, **said: Any) -> None:
+        """Say something, from any thread."""
+        self.say_line(json.dumps(said))
+
+    def say_line(self, line: str) -> None:
+        """Say what is JSON already."""
+        try:
+            with self._one_at_a_time:
+                self._connection.sendall(line.encode() + b"\n")
+        except OSError:
+            # It has died; the thread sees to it.
+            return
+
+    def _read(self) -> None:
+        try:
+            with self._connection.makefile("rb") as lines:
+                for line in lines:
+                    self._jobs.put(json.loads(line))
+        except OSError:
+            # Reset, because it died before it had read everything.
+            pass
+        _end_without_parent()
+
+
+class _ToParent(logging.Handler):
+    """Lets the parent log what is worth a warning here, under the same name."""
+
+    def __init__(self, parent: _Parent) -> None:
+        super().__init__(logging.WARNING)
+        self._parent = parent
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            self._parent.say(log=[record.name, record.levelno, self.format(record)])
+        except Exception:
+            # As all handlers: who logs is not disturbed by it.
+            self.handleError(record)
+
+
+def _hear_sigterm() -> None:
+    """Undo what the parent may have done to its own signals."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
+
+
+def _end_without_parent() -> None:
+    """Do what SIGTERM does, and make sure that it is the end."""
+    # Nobody reads what is printed from now on; that must not disturb the closing.
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in (1, 2):
+        os.dup2(nowhere, descriptor)
+    # Needs no interpreter, which may be held by what hangs.
+    faulthandler.dump_traceback_later(SECONDS_TO_CLOSE, exit=True)
+    if received() is None:
+        # To the thread that has to wake up.
+        main_thread = threading.main_thread().ident
+        assert main_thread is not None
+        signal.pthread_kill(main_thread, signal.SIGTERM)
+
+
+def _handler(work: int, parent: _Parent) -> Handler:
+    """Make the handler; tell the parent why there is none."""
+    try:
+        facts, payload = _read_work(work)
+        module, _, name = facts["entry"].partition(":")
+        make = operator.attrgetter(name)(importlib.import_module(module))
+        handler: Handler = make(facts["settings"], payload)
+    except Exception as error:
+        parent.say(error=carried(error))
+        raise SystemExit(1) from error
+    return handler
+
+
+def _read_work(descriptor: int) -> tuple[dict[str, Any], bytes | None]:
+    # Mapped, because all workers share the descriptor's position.
+    with mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ) as work:
+        facts = json.loads(work.readline())
+        payload = None if facts["payload"] is None else work.read(facts["payload"])
+    os.close(descriptor)
+    return facts, payload
+
+
+def _do(handler: Handler, job: Mapping[str, Any], parent: _Parent) -> None:
+    try:
+        value = dict(handler(job["arguments"]))
+        done = json.dumps({"key": job["key"], "value": value})
+    except Terminated:
+        raise
+    # A policy that calls sys.exit() ends its job, and not the worker.
+    except (Exception, SystemExit) as error:
+        logger.warning("The job %s failed.", job["key"], exc_info=True)
+        parent.say(key=job["key"], failure=_in_one_line(error))
+    else:
+        parent.say_line(done)
+
+
+def _in_one_line(error: BaseException) -> str:
+    kind, text = type(error).__name__, " ".join(str(error).split())
+    return f"{kind}: {text}" if text else kind
+
+
+def _close(handler: Handler) -> None:
+    # What has begun to close is not interrupted once more; SIGKILL is still there.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        handler.close()
+    except Exception:
+        logger.exception("A worker could not close what it held.")
+
+
+if __name__ == "__main__":
+    main()
