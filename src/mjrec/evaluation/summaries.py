@@ -6,7 +6,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from ..errors import InvalidArgument
+
 __all__ = ["AcrossTasks", "Bootstrap", "Interval", "Profile", "TaskSummary"]
+
+_MOST_RESAMPLES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -31,12 +35,31 @@ class Bootstrap:
         seed: of the generator that draws them.
         confidence: the share of the intervals that hold the true value.
         method: in words, for reports.
+
+    Raises:
+        InvalidArgument: there are no such intervals.
     """
 
     resamples: int = 10_000
     seed: int = 0
     confidence: float = 0.95
     method: str = "percentile bootstrap over episodes, stratified by task"
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.resamples <= _MOST_RESAMPLES:
+            raise InvalidArgument(
+                f"Intervals are made from 1 to {_MOST_RESAMPLES} resamples (10000 is "
+                f"usual), got {self.resamples}."
+            )
+        if not 0 < self.confidence < 1:
+            raise InvalidArgument(
+                "The confidence of an interval lies between 0 and 1 (0.95 is usual), "
+                f"got {self.confidence}."
+            )
+        if not 0 <= self.seed < 2**64:
+            raise InvalidArgument(
+                f"A seed is a whole number from 0 to 2^64 - 1, got {self.seed}."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
