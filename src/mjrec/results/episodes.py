@@ -17,7 +17,7 @@ from .monitor_files import MonitorFiles, monitors_of
 from .numbering import NumberedEpisode, number_episodes
 from .sources import MonitorResults
 
-__all__ = ["Episode", "iter_episodes"]
+__all__ = ["Episode", "episodes_of", "iter_episodes"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class Episode:
             monitor was killed, a finished trajectory without a video counts as a
             promise, though its monitor may have recorded no videos: that stands inside
             the file, which is not opened here.
+        success: what the environment said of it; None also where nobody wrote it down.
     """
 
     episode_id: int
@@ -65,6 +66,7 @@ class Episode:
     metadata: Path | None
     trajectory: Path | None = None
     pending: bool = False
+    success: bool | None = None
 
 
 def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
@@ -96,13 +98,21 @@ def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:
 
 def _iter_monitors(monitors: Iterable[MonitorFiles]) -> Iterator[Episode]:
     for files in monitors:
-        results = MonitorResults(files)
-        if files.journal is None and not results.details:
-            yield from _from_gym(results)
-        elif results.journal_count >= max(results.saved_count, 0):
-            yield from _from_journal(results)
-        else:
-            yield from _from_stats(results)
+        yield from episodes_of(MonitorResults(files))
+
+
+def episodes_of(results: MonitorResults) -> Iterator[Episode]:
+    """Yield the completed episodes of one monitor, as `iter_episodes` does.
+
+    Raises:
+        UnreadableFile: its files are damaged, and no other has the same episodes.
+    """
+    if results.files.journal is None and not results.details:
+        yield from _from_gym(results)
+    elif results.journal_count >= max(results.saved_count, 0):
+        yield from _from_journal(results)
+    else:
+        yield from _from_stats(results)
 
 
 def _from_journal(results: MonitorResults) -> Iterator[Episode]:
@@ -129,6 +139,7 @@ def _journaled(results: MonitorResults, entry: JournalEntry) -> Episode:
         metadata=files.metadata.get(entry.episode_id),
         trajectory=files.trajectories.get(entry.episode_id),
         pending=_is_pending(results, entry.episode_id),
+        success=entry.success if isinstance(entry.success, bool) else None,
     )
 
 
