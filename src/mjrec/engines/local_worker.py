@@ -80,7 +80,8 @@ class _Parent:
         self._jobs: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         # The connection ends with this process, whatever a policy has started.
         connection.set_inheritable(False)
-        os.register_at_fork(after_in_child=connection.close)
+        # Detached, because the file that is read from would keep it open.
+        os.register_at_fork(after_in_child=lambda: os.close(connection.detach()))
         threading.Thread(target=self._read, name="mjrec-jobs", daemon=True).start()
 
     def next_job(self) -> dict[str, Any]:
