@@ -1,0 +1,430 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec evaluate`: a policy in many environments, and what came of it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import rich.box
+import rich.console
+import rich.markup
+import rich.progress
+import rich.table
+import tyro
+
+from .. import json_text
+from ..errors import InvalidArgument, UnknownName
+from ..evaluation.evaluating import evaluate as evaluate_policy
+from ..evaluation.evaluation import Evaluation, EvaluationProgress
+from ..evaluation.summaries import Interval, TaskSummary
+from ..evaluation.summaries_json import summary_to_json
+from ..evaluation.task_sets import tasks_from
+from .help_text import flowing_help
+from .view_options import camera_of, size_of
+
+__all__ = ["evaluate"]
+
+T = TypeVar("T")
+
+_FAILED = 1
+_INTERRUPTED = 130
+_LOG_WIDTH = 160
+_SHOWN = 10
+
+
+@dataclass(frozen=True)
+class _Shortfall:
+    """A task that is not as good as it has to be.
+
+    Attributes:
+        task: its name.
+        reason: why.
+    """
+
+    task: str
+    reason: str
+
+
+@flowing_help
+def evaluate(
+    tasks: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK...")
+    ],
+    /,
+    *,
+    policy: str,
+    out: Path,
+    episodes: int = 10,
+    seeds: str | None = None,
+    num_seeds: int | None = None,
+    workers: int | None = None,
+    keep: str = "best,median,worst",
+    protocol: Literal["seeded", "suite"] = "seeded",
+    resume: bool = False,
+    max_steps: int | None = None,
+    camera: str | None = None,
+    size: str | None = None,
+    max_fps: float = 60,
+    quality: Literal["full", "draft"] = "full",
+    env_kwargs: str = "{}",
+    score_range: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    fail_under: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """Evaluate a policy: so many episodes of each task, and what came of them.
+
+    The exit status is 1 where an episode failed (the policy raised, or gave NaN or the
+    wrong shape, or the environment raised) or a task fell short of --fail-under; the
+    results are written all the same. What was interrupted goes on with --resume.
+
+    Args:
+        tasks: environments as in mjrec record, sets (dm_control:benchmarking,
+            dm_control:all, dm_control:easy, dm_control:hard, dm_control:extra,
+            gymnasium:mujoco), or patterns in quotes ('dm_control/walker-*').
+        policy: random, zero, module:name or module:name(), as in mjrec record.
+        out: the directory of the evaluation, empty or new.
+        episodes: how many of each task and seed.
+        seeds: of the runs, such as 0,1,2.
+        num_seeds: how many, from 0 on, instead of --seeds; 5, if neither is given.
+        workers: how many processes; one for each CPU, if it is not given. The results
+            do not depend on it.
+        keep: which episodes of each task get a video: best, best:N, median, worst,
+            worst:N, failures and failures:N, separated by commas; or cubic, all or
+            none.
+        protocol: seeded: episode i of seed s starts from NumPy's SeedSequence([s, i]).
+            suite: each task and seed has one random stream, seeded with s.
+        resume: go on with the evaluation in the directory, and repeat nothing that is
+            finished. More tasks, seeds or episodes may be asked for.
+        max_steps: ends an episode as truncated; 1000 where the environment itself has
+            no limit.
+        camera: name or number; the model's tracking camera, where there is one, if it
+            is not given.
+        size: of the videos, WIDTHxHEIGHT in pixels.
+        max_fps: the most frames for a second of simulated time.
+        quality: full, or draft: several times faster, with coarser edges and shadows.
+        env_kwargs: more arguments for each environment, as a JSON object.
+        score_range: TASK=LOW:HIGH, the returns that count as 0 and as 1 in what is said
+            over all tasks. Those of dm_control have theirs. May be given several
+            times.
+        fail_under: TASK=VALUE. The exit status is 1 where the mean return of this task
+            is below, or an episode of it failed. May be given several times.
+        as_json: print one JSON object at the end, and nothing else.
+    """
+    height, width = size_of(size)
+    ranges = _by_task("--score-range", score_range, _range_of, "TASK=LOW:HIGH")
+    least = _by_task("--fail-under", fail_under, float, "TASK=VALUE")
+    names = tasks_from(tasks)
+    for task in least:
+        if task not in names:
+            raise UnknownName("task for --fail-under in this evaluation", task, names)
+    console = rich.console.Console(stderr=True, quiet=as_json)
+    try:
+        with _Progress(console) as progress:
+            evaluation = evaluate_policy(
+                names,
+                policy=policy,
+                directory=out,
+                episodes=episodes,
+                seeds=_seeds_of(seeds),
+                num_seeds=num_seeds,
+                workers=workers,
+                keep=keep,
+                protocol=protocol,
+                resume=resume,
+                max_steps=max_steps,
+                camera=camera_of(camera),
+                height=height,
+                width=width,
+                max_fps=max_fps,
+                quality=quality,
+                env_kwargs=_kwargs_of(env_kwargs),
+                score_ranges=ranges,
+                on_progress=progress.show,
+            )
+    except KeyboardInterrupt:
+        console.print(
+            f"Interrupted. What was finished is in {out}: the same command with "
+            "--resume goes on, and repeats none of it.",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+        return _INTERRUPTED
+    short = _shortfalls(evaluation, least)
+    if as_json:
+        sys.stdout.write(json_text.dumps(_fields(evaluation, short)) + "\n")
+    else:
+        _show(evaluation, short)
+    return _FAILED if evaluation.failed or short else 0
+
+
+@dataclass
+class _Progress:
+    """Shows how far an evaluation is: a bar on a terminal, some lines elsewhere."""
+
+    console: rich.console.Console
+    _said: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self._bar = rich.progress.Progress(
+            rich.progress.TextColumn("{task.description}"),
+            rich.progress.BarColumn(bar_width=30),
+            rich.progress.TextColumn("{task.completed}/{task.total} {task.fields[of]}"),
+            rich.progress.TimeElapsedColumn(),
+            rich.progress.TextColumn("left:"),
+            rich.progress.TimeRemainingColumn(),
+            console=self.console,
+            disable=not self.console.is_terminal,
+            transient=True,
+        )
+        self._run = self._bar.add_task("running", total=None, of="episodes")
+        self._draw: rich.progress.TaskID | None = None
+
+    def __enter__(self) -> _Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, progress: EvaluationProgress) -> None:
+        """Show how far it is."""
+        failed = (
+            f"episodes, {progress.failed} failed" if progress.failed else "episodes"
+        )
+        self._bar.update(
+            self._run, completed=progress.done, total=progress.total, of=failed
+        )
+        if progress.videos:
+            if self._draw is None:
+                self._draw = self._bar.add_task("drawing", of="videos")
+            self._bar.update(
+                self._draw, completed=progress.videos_done, total=progress.videos
+            )
+        if not self.console.is_terminal:
+            self._say(progress)
+
+    def _say(self, progress: EvaluationProgress) -> None:
+        """Say each tenth once, for the logs of machines."""
+        tenth = 10 * progress.done // max(1, progress.total)
+        if tenth > self._said:
+            self._said = tenth
+            self.console.print(
+                f"{progress.done}/{progress.total} episodes", highlight=False
+            )
+
+
+def _by_task(
+    option: str, given: Sequence[str], read: Callable[[str], T], form: str
+) -> dict[str, T]:
+    """Return what TASK=... options say, by task."""
+    said: dict[str, T] = {}
+    for text in given:
+        # A path may have one in it.
+        task, equals, value = text.rpartition("=")
+        try:
+            if not (task and equals):
+                raise ValueError
+            said[task] = _finite(read(value))
+        except ValueError:
+            raise InvalidArgument(f"{option} is {form}, got {text!r}.") from None
+    return said
+
+
+def _finite(value: T) -> T:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(value)
+    return value
+
+
+def _range_of(text: str) -> tuple[float, float]:
+    low, _, high = text.partition(":")
+    return float(low), float(high)
+
+
+def _seeds_of(text: str | None) -> list[int] | None:
+    if text is None:
+        return None
+    if not re.fullmatch(r"[0-9]{1,18}(,[0-9]{1,18})*", text, re.ASCII):
+        raise InvalidArgument(
+            f"--seeds are whole numbers with commas between, such as 0,1,2, got "
+            f"{text!r}."
+        )
+    return [int(number) for number in text.split(",")]
+
+
+def _kwargs_of(text: str) -> dict[str, Any]:
+    try:
+        kwargs = json.loads(text)
+    except ValueError as error:
+        raise InvalidArgument(
+            f"--env-kwargs must be a JSON object, got {text!r}: {error}."
+        ) from None
+    if not isinstance(kwargs, dict):
+        raise InvalidArgument(f"--env-kwargs must be a JSON object, got {text!r}.")
+    return kwargs
+
+
+def _shortfalls(evaluation: Evaluation, least: Mapping[str, float]) -> list[_Shortfall]:
+    found = []
+    for task, value in least.items():
+        summary = evaluation.summary(task)
+        if summary.failed:
+            found.append(
+                _Shortfall(task, f"{_count(summary.failed, 'episode')} failed")
+            )
+        elif summary.mean is None:
+            found.append(_Shortfall(task, "it has no mean return"))
+        elif summary.mean < value:
+            found.append(
+                _Shortfall(
+                    task, f"its mean return {summary.mean:.6g} is below {value:g}"
+                )
+            )
+    return found
+
+
+def _show(evaluation: Evaluation, short: Sequence[_Shortfall]) -> None:
+    console = rich.console.Console()
+    if not console.is_terminal:
+        # A log has no width, and a folded name cannot be copied.
+        console = rich.console.Console(width=_LOG_WIDTH)
+    console.print(_table(evaluation))
+    for line in _lines(evaluation, short):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _table(evaluation: Evaluation) -> rich.table.Table:
+    table = rich.table.Table(box=rich.box.SIMPLE_HEAD, pad_edge=False)
+    percent = f"{100 * evaluation.bootstrap.confidence:g} %"
+    table.add_column("task", overflow="fold")
+    for name in (
+        *("episodes", "mean", percent, "IQM", "median", "min..max", "success"),
+        "failed",
+    ):
+        table.add_column(name, justify="right")
+    for summary in evaluation.summaries:
+        style = "bold red" if summary.failed else ""
+        table.add_row(
+            rich.markup.escape(summary.task),
+            str(summary.episodes),
+            _number(summary.mean),
+            _interval(summary.mean_interval),
+            _number(summary.iqm),
+            _number(summary.median),
+            _extent(summary),
+            _share(summary.success_rate),
+            f"[{style}]{summary.failed}[/]" if style else "0",
+        )
+    return table
+
+
+def _lines(evaluation: Evaluation, short: Sequence[_Shortfall]) -> list[str]:
+    return [
+        *_across_lines(evaluation),
+        *_failure_lines(evaluation),
+        *(f"{each.task} falls short: {each.reason}." for each in short),
+        *_video_lines(evaluation),
+        f"The results are in {evaluation.directory.absolute()}",
+    ]
+
+
+def _across_lines(evaluation: Evaluation) -> list[str]:
+    across = evaluation.across
+    if len(across.tasks) < 2:
+        return []
+    return [
+        f"Over {_count(len(across.tasks), 'task')}, as scores from 0 to 1: "
+        f"IQM {_number(across.iqm)} {_interval(across.iqm_interval)}, "
+        f"mean {_number(across.mean)}, median {_number(across.median)}, "
+        f"optimality gap {_number(across.optimality_gap)} "
+        f"{_interval(across.optimality_gap_interval)}"
+    ]
+
+
+def _failure_lines(evaluation: Evaluation) -> list[str]:
+    failed = evaluation.failed
+    if not failed:
+        return []
+    count = f"{len(failed)} of {_count(len(evaluation.results), 'episode')} failed:"
+    by_reason: dict[str, list[str]] = {}
+    for each in failed:
+        name = f"{each.task} seed {each.seed} episode {each.episode}"
+        by_reason.setdefault(str(each.failure), []).append(name)
+    lines = [
+        f"  {_printable(names[0])}{_and_more(len(names) - 1)}: {_printable(reason)}"
+        for reason, names in by_reason.items()
+    ]
+    rest = len(lines) - _SHOWN
+    more = [f"  and {rest} more reasons, in results.csv"] if rest > 0 else []
+    return [count, *lines[:_SHOWN], *more]
+
+
+def _video_lines(evaluation: Evaluation) -> list[str]:
+    lines = []
+    if evaluation.videos:
+        lines.append(f"{_count(len(evaluation.videos), 'video')}:")
+        lines += [f"  {path}" for path in evaluation.videos[:_SHOWN]]
+        rest = len(evaluation.videos) - _SHOWN
+        lines += [f"  and {rest} more"] if rest > 0 else []
+    if evaluation.pending:
+        lines.append(
+            f"{_count(len(evaluation.pending), 'video')} could not be drawn here; on a "
+            "machine with OpenGL:"
+        )
+        folders = dict.fromkeys(path.parent for path in evaluation.pending)
+        lines += [f"  mjrec render {folder}" for folder in folders]
+    return lines
+
+
+def _fields(evaluation: Evaluation, short: Sequence[_Shortfall]) -> dict[str, Any]:
+    return {
+        "directory": str(evaluation.directory.absolute()),
+        "episodes": len(evaluation.results),
+        "failed": len(evaluation.failed),
+        "tasks": [summary_to_json(each) for each in evaluation.summaries],
+        "across": summary_to_json(evaluation.across),
+        "videos": [str(path) for path in evaluation.videos],
+        "pending": {str(path): why for path, why in evaluation.pending.items()},
+        "below": {each.task: each.reason for each in short},
+    }
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
+
+
+def _interval(interval: Interval | None) -> str:
+    if interval is None:
+        return ""
+    return f"({_number(interval.low)} to {_number(interval.high)})"
+
+
+def _extent(summary: TaskSummary) -> str:
+    if summary.minimum is None:
+        return ""
+    return f"{_number(summary.minimum)}..{_number(summary.maximum)}"
+
+
+def _share(value: float | None) -> str:
+    return "" if value is None else f"{100 * value:.0f} %"
+
+
+def _and_more(number: int) -> str:
+    return f" and {number} more" if number else ""
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _printable(text: str) -> str:
+    """Return a text of foreign code without what a terminal would take for orders."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drawing the videos of the episodes of an evaluation that were chosen."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ..formats.monitor_directory import Infix
+from ..rendering.finishing import finish_pending
+from ..rendering.pending import EpisodeKey
+from ..rendering.progress import Progress
+from .evaluation import EvaluationProgress
+from .following import TaskRun
+
+__all__ = ["ChosenVideos", "render_chosen"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class ChosenVideos:
+    """The videos of the chosen episodes.
+
+    Attributes:
+        there: those that are there.
+        pending: why the others are not, by the path that they will have.
+    """
+
+    there: list[Path] = field(default_factory=list)
+    pending: dict[Path, str] = field(default_factory=dict)
+
+
+def render_chosen(
+    directory: Path,
+    runs: Sequence[TaskRun],
+    *,
+    workers: int,
+    over: EvaluationProgress,
+    tell: Callable[[EvaluationProgress], object],
+) -> ChosenVideos:
+    """Draw what is pending of the chosen episodes. What cannot be drawn stays pending.
+
+    Args:
+        directory: of the evaluation.
+        runs: its tasks, settled.
+        workers: how many processes draw.
+        over: how far the evaluation is without the videos.
+        tell: is told how far it is.
+    """
+    videos = ChosenVideos()
+    keys = {of.task.folder: _keys(of) for of in runs}
+    total = sum(map(len, keys.values()))
+    before = 0
+    for of in runs:
+        folder = directory / of.task.folder
+
+        def show(progress: Progress, before: int = before) -> None:
+            tell(
+                replace(
+                    over,
+                    videos_done=before + progress.videos_done,
+                    videos=total,
+                    frames_done=progress.frames_done,
+                    frames=progress.frames,
+                )
+            )
+
+        if keys[of.task.folder]:
+            reasons = _render(folder, keys[of.task.folder], workers, show)
+            _sort(videos, folder, keys[of.task.folder], reasons, of.problem)
+        before += len(keys[of.task.folder])
+    return videos
+
+
+def _keys(of: TaskRun) -> list[EpisodeKey]:
+    """Return the chosen episodes of a task, each once."""
+    keys: dict[EpisodeKey, None] = {}
+    for result, _ in of.chosen:
+        infix = Infix.parse(result.monitor or "")
+        if infix is not None and result.episode_id is not None:
+            keys[EpisodeKey(infix, result.episode_id)] = None
+    return list(keys)
+
+
+def _render(
+    folder: Path,
+    keys: Sequence[EpisodeKey],
+    workers: int,
+    show: Callable[[Progress], object],
+) -> dict[str, str]:
+    """Return why videos are not there, or show nothing, by their names."""
+    outcomes = finish_pending(folder, keys, workers=workers, on_progress=show)
+    reasons = {
+        outcome.name: outcome.failure or "another process is drawing it"
+        for outcome in outcomes
+        if outcome.failure is not None or outcome.is_elsewhere
+    }
+    for reason in dict.fromkeys(reasons.values()):
+        names = [name for name in reasons if reasons[name] == reason]
+        logger.warning(
+            "%s in %s: %s To try again: mjrec render %s",
+            ", ".join(names),
+            folder,
+            reason,
+            folder,
+        )
+    return reasons
+
+
+def _sort(
+    videos: ChosenVideos,
+    folder: Path,
+    keys: Sequence[EpisodeKey],
+    reasons: dict[str, str],
+    problem: str | None,
+) -> None:
+    for key in keys:
+        path = folder / key.video_name
+        # Text is recorded as such.
+        there = [each for each in (path, path.with_suffix(".json")) if each.exists()]
+        if there:
+            videos.there.append(there[0])
+        else:
+            videos.pending[path] = (
+                reasons.get(path.name) or problem or _not_promised(folder, key)
+            )
+
+
+def _not_promised(folder: Path, key: EpisodeKey) -> str:
+    return (
+        "it was not among the chosen when its recording was settled, in an earlier "
+        f"part of the evaluation; mjrec render {folder / key.trajectory_name}.h5 "
+        "--out VIDEO.mp4 draws it"
+    )

@@ -1,0 +1,399 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evaluating a policy: the one who hands out the work, and writes down what came of it.
+
+The unit of work is an episode, told by task, seed and number; with the protocol
+`"suite"` all episodes of a task and seed. Workers write down each as it ends, in the
+task's folder. This process simulates nothing and, until videos are drawn, needs no
+OpenGL: it may be killed at any time, and whoever goes on repeats nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..engines.local import LocalEngine
+from ..engines.work import Engine, Work
+from ..errors import (
+    DirectoryInUse,
+    DirectoryNotWritable,
+    InvalidArgument,
+    MissingDependency,
+)
+from ..formats.locks import try_lock
+from ..recorder.versions import versions
+from .chosen_videos import ChosenVideos, render_chosen
+from .evaluation import Evaluation, EvaluationProgress
+from .following import TaskRun, check_tasks, run_tasks
+from .ledger import read_ledgers
+from .plan import SEEDED, EvaluationPlan
+from .plan_file import check_continues, read_plan, write_plan
+from .plan_json import plan_to_json
+from .planning import check_score_ranges, plan_from
+from .policy_objects import SentPolicy, sent_policy
+from .recorded_files import RecordedFiles
+from .results_files import PLAN_NAME, ChosenEpisode, write_results
+from .summaries import AcrossTasks, Bootstrap, TaskSummary
+
+__all__ = ["evaluate"]
+
+logger = logging.getLogger(__name__)
+
+_WORKER = "mjrec.evaluation.worker:EvaluationWorker"
+_LOCK_NAME = ".mjrec.evaluation.lock"
+
+# Sums in another order are other numbers, and how many threads a library takes depends
+# on the machine; and so many processes keep all CPUs busy.
+_ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+_Tell = Callable[[EvaluationProgress], object]
+
+
+def evaluate(
+    tasks: str | Sequence[str],
+    *,
+    policy: Any,
+    directory: str | os.PathLike[str],
+    episodes: int = 10,
+    seeds: Iterable[int] | None = None,
+    num_seeds: int | None = None,
+    workers: int | None = None,
+    keep: str = "best,median,worst",
+    protocol: str = SEEDED,
+    resume: bool = False,
+    max_steps: int | None = None,
+    camera: str | int | None = None,
+    height: int | None = None,
+    width: int | None = None,
+    max_fps: float | None = 60,
+    quality: str = "full",
+    env_kwargs: Mapping[str, Any] | None = None,
+    score_ranges: Mapping[str, tuple[float, float]] | None = None,
+    bootstrap: Bootstrap | None = None,
+    on_progress: _Tell | None = None,
+    engine: Engine | None = None,
+) -> Evaluation:
+    """Run so many episodes of each task, and write down what came of them.
+
+    Every episode keeps its trajectory, so that any of them can be drawn later. An
+    episode in which the policy raises, or gives NaN or the wrong shape, or the
+    environment raises, has failed; the others go on. An episode whose worker dies is
+    begun again, and has failed when three workers have died of it.
+
+    Ctrl-C and other exceptions end the workers; what was finished stays, and the same
+    call with `resume=True` goes on.
+
+    Args:
+        tasks: environments as in `mjrec record`, sets (`dm_control:benchmarking`,
+            `dm_control:all`, `dm_control:easy`, `dm_control:hard`, `dm_control:extra`,
+            `gymnasium:mujoco`), or patterns (`dm_control/walker-*`).
+        policy: a text as in `mjrec record` (`random`, `zero`, `module:name`,
+            `module:name()`); or a function of the observation, an object with
+            `predict`, or a class that is built with each environment, which is
+            pickled and sent to each worker.
+        directory: of the evaluation; empty or new, unless `resume`.
+        episodes: how many of each task and seed.
+        seeds: of the runs.
+        num_seeds: how many, from 0 on, instead; 5 if neither is given.
+        workers: how many processes run, and later draw; one for each usable CPU, if
+            None. The results do not depend on it.
+        keep: which episodes of each task get a video: `best[:N]`, `median`,
+            `worst[:N]` and `failures[:N]`, separated by commas; or `cubic`, `all` or
+            `none`. See `evaluation.kept_episodes`.
+        protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
+            `"suite"`: each task and seed has one random stream, seeded with s, that
+            goes on from episode to episode.
+        resume: go on with the evaluation in the directory. Other tasks, seeds and
+            episodes may be asked for (with the protocol `"suite"` not episodes); what
+            is done already is not repeated. An episode whose worker had died is.
+        max_steps: ends an episode as truncated; None is the environment's own limit,
+            and 1000 where it has none.
+        camera: of the videos; None is the model's tracking camera where there is one.
+        height: of the videos, in pixels; None is the environment's own.
+        width: likewise.
+        max_fps: the most frames per second of simulated time; None is every step.
+        quality: `"full"` or `"draft"`.
+        env_kwargs: more arguments for each environment.
+        score_ranges: the returns that count as 0 and as 1, by task, for what is said
+            over all tasks. Those of the dm_control suite have theirs.
+        bootstrap: how confidence intervals are made.
+        on_progress: called several times a second with how far it is.
+        engine: where the work runs, instead of `workers` processes of this machine.
+
+    Returns:
+        What came of it, which stands in the directory too: `results.json`,
+        `results.csv` and `timing.csv`.
+
+    Raises:
+        MissingDependency: scipy, or the framework of a task, is not installed.
+        DifferentEvaluation: what is resumed was begun in another way.
+        DirectoryInUse: another evaluation writes into the directory.
+        PolicyError: the policy cannot be built, or not be sent to other processes.
+        Error: an argument, a task or the policy cannot be. All of these are told
+            before anything is run or written.
+    """
+    _check_scipy()
+    local = LocalEngine(workers)
+    place = Path(directory)
+    begun = _begun(place, resume=resume)
+    sent = sent_policy(policy)
+    plan = plan_from(
+        tasks,
+        policy=sent.name,
+        is_object=sent.is_object,
+        episodes=episodes,
+        seeds=seeds,
+        num_seeds=num_seeds,
+        protocol=protocol,
+        keep=keep,
+        max_steps=max_steps,
+        camera=camera,
+        height=height,
+        width=width,
+        max_fps=max_fps,
+        quality=quality,
+        env_kwargs=env_kwargs,
+        folders={} if begun is None else _folders(begun),
+    )
+    ranges = check_score_ranges(score_ranges, [task.name for task in plan.tasks])
+    if begun is not None:
+        check_continues(place, begun, plan)
+    tell = on_progress or (lambda _: None)
+    with contextlib.ExitStack() as stack:
+        runs = _run(
+            engine or local,
+            plan,
+            sent,
+            place,
+            is_begun=begun is not None,
+            workers=local.workers,
+            tell=tell,
+            stack=stack,
+        )
+        return _written(
+            plan,
+            place,
+            runs,
+            ranges=ranges,
+            bootstrap=bootstrap or Bootstrap(),
+            workers=local.workers,
+            tell=tell,
+        )
+
+
+def _check_scipy() -> None:
+    if importlib.util.find_spec("scipy") is None:
+        raise MissingDependency(
+            "scipy",
+            purpose="What is said of an evaluation",
+            install='pip install "mjrec[evaluation]"',
+        )
+
+
+def _begun(directory: Path, *, resume: bool) -> EvaluationPlan | None:
+    """Return the plan of the evaluation that goes on; None where a new one begins.
+
+    Raises:
+        InvalidArgument: there is something in the directory, which is not to go on or
+            is no evaluation.
+    """
+    there = (directory / PLAN_NAME).exists()
+    if resume and there:
+        return read_plan(directory)
+    if not directory.exists():
+        return None
+    if not directory.is_dir():
+        raise InvalidArgument(f"{directory} is a file: an evaluation is a directory.")
+    if there:
+        raise InvalidArgument(
+            f"{directory} holds an evaluation already. To go on with it, or to ask for "
+            "more seeds or episodes: resume=True (--resume). For another one, use a "
+            "directory of its own."
+        )
+    names = sorted(path.name for path in directory.iterdir())
+    if names and names != [_LOCK_NAME]:
+        raise InvalidArgument(
+            f"{directory} holds something that is no evaluation ({names[0]} "
+            f"{'and others' if len(names) > 1 else 'only'}). An evaluation needs a "
+            "directory of its own, which is empty or new."
+        )
+    return None
+
+
+def _folders(plan: EvaluationPlan) -> dict[str, str]:
+    return {task.name: task.folder for task in plan.tasks}
+
+
+def _run(
+    engine: Engine,
+    plan: EvaluationPlan,
+    sent: SentPolicy,
+    directory: Path,
+    *,
+    is_begun: bool,
+    workers: int,
+    tell: _Tell,
+    stack: contextlib.ExitStack,
+) -> list[TaskRun]:
+    """Run all tasks; the directory is held until `stack` ends."""
+    if is_begun:
+        stack.enter_context(_held(directory))
+    done = {
+        task.name: read_ledgers(directory / task.folder) if is_begun else {}
+        for task in plan.tasks
+    }
+    work = Work(
+        entry=_WORKER,
+        settings={"directory": str(directory.absolute()), "plan": plan_to_json(plan)},
+        payload=sent.payload,
+        environ={name: "1" for name in _ONE_THREAD_EACH if name not in os.environ},
+    )
+    with engine.begin(work) as run:
+        left = [task for task in plan.tasks if _is_left(plan, done[task.name])]
+        check_tasks(run, plan, left)
+        if not is_begun:
+            _make(directory)
+            stack.enter_context(_held(directory))
+        write_plan(directory, plan)
+        return run_tasks(run, plan, directory, done=done, workers=workers, tell=tell)
+
+
+def _is_left(plan: EvaluationPlan, done: Mapping[tuple[int, int], object]) -> bool:
+    return any(
+        (seed, number) not in done
+        for seed in plan.seeds
+        for number in range(plan.episodes)
+    )
+
+
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DirectoryNotWritable(directory, error.strerror) from error
+
+
+@contextlib.contextmanager
+def _held(directory: Path) -> Iterator[None]:
+    """Keep other evaluations out of the directory."""
+    try:
+        lock = try_lock(directory / _LOCK_NAME, f"{os.getpid()}\n")
+    except OSError as error:
+        raise DirectoryNotWritable(directory, error.strerror) from error
+    if lock is None:
+        raise DirectoryInUse(
+            f"Another evaluation writes into {directory}. Wait for its end, or use "
+            "another directory."
+        )
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _written(
+    plan: EvaluationPlan,
+    directory: Path,
+    runs: Sequence[TaskRun],
+    *,
+    ranges: Mapping[str, tuple[float, float]],
+    bootstrap: Bootstrap,
+    workers: int,
+    tell: _Tell,
+) -> Evaluation:
+    """Write down the results, draw the videos, and write down which those are."""
+    summaries, across = _summarized(plan, runs, ranges, bootstrap)
+    results = [result for of in runs for result in of.results]
+    selection = {
+        of.task.name: [
+            ChosenEpisode(result.seed, result.episode, role)
+            for result, role in of.chosen
+        ]
+        for of in runs
+    }
+
+    def write() -> None:
+        files = {
+            of.task.name: RecordedFiles(
+                directory / of.task.folder, {result.unit for result, _ in of.chosen}
+            )
+            for of in runs
+        }
+        write_results(
+            directory,
+            plan=plan,
+            results=results,
+            summaries=summaries,
+            across=across,
+            bootstrap=bootstrap,
+            selection=selection,
+            versions=versions(),
+            files=lambda result: files[result.task].of(result),
+        )
+
+    # Before the videos, which take long, and may not be possible here.
+    write()
+    videos = ChosenVideos()
+    if any(of.chosen for of in runs):
+        over = EvaluationProgress(
+            done=len(results),
+            failed=sum(each.failure is not None for each in results),
+            total=len(results),
+        )
+        videos = render_chosen(directory, runs, workers=workers, over=over, tell=tell)
+        write()
+    return Evaluation(
+        directory=directory,
+        plan=plan,
+        results=results,
+        summaries=summaries,
+        across=across,
+        bootstrap=bootstrap,
+        selection=selection,
+        videos=videos.there,
+        pending=videos.pending,
+    )
+
+
+def _summarized(
+    plan: EvaluationPlan,
+    runs: Sequence[TaskRun],
+    ranges: Mapping[str, tuple[float, float]],
+    bootstrap: Bootstrap,
+) -> tuple[list[TaskSummary], AcrossTasks]:
+    # Not at the top: scipy is an extra, and takes a while to import.
+    from .summarizing import (
+        default_score_range,
+        split_by_scale,
+        summarize_across,
+        summarize_results,
+    )
+
+    scales = {
+        task.name: ranges.get(task.name)
+        or default_score_range(task.name, plan.max_steps)
+        for task in plan.tasks
+    }
+    summaries = [
+        summarize_results(
+            of.task.name,
+            of.results,
+            score_range=scales[of.task.name],
+            bootstrap=bootstrap,
+        )
+        for of in runs
+    ]
+    returns = {
+        of.task.name: [
+            each.total_reward for each in of.results if each.total_reward is not None
+        ]
+        for of in runs
+    }
+    scores, left_out = split_by_scale(returns, scales)
+    across = summarize_across(scores, left_out=left_out, bootstrap=bootstrap)
+    return summaries, across

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Handing out an evaluation, and following it until every episode is over.
+
+Tasks are checked first: who names one that cannot be made shall know before anything is
+written. Then batches of episodes are handed out, and as soon as all episodes of a task
+are over, those that get a video are chosen, and its recordings are settled, while other
+tasks still run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .. import errors
+from ..carried_errors import unpacked
+from ..engines.work import Job, JobOutcome, Run
+from ..errors import EnvironmentNotMade, Error, PicturesDiffer
+from .episode_results import EpisodeResult
+from .evaluation import EvaluationProgress
+from .kept_episodes import Chosen, KeepRule, keep_rule
+from .ledger import read_ledgers
+from .plan import Batch, EvaluatedTask, EvaluationPlan
+from .progress_counts import LedgerCounts
+from .splitting import batches_of
+
+__all__ = ["TaskRun", "check_tasks", "run_tasks"]
+
+logger = logging.getLogger(__name__)
+
+# How often somebody who waits is told how far it is.
+_PATIENCE_S = 0.25
+
+_Tell = Callable[[EvaluationProgress], object]
+_Done = Mapping[str, Mapping[tuple[int, int], EpisodeResult]]
+
+
+@dataclass
+class TaskRun:
+    """A task while it is evaluated, and then what came of it.
+
+    Attributes:
+        task: which one.
+        unfinished: how many of its batches are not over.
+        reasons: why episodes are not in any ledger, by seed and number.
+        results: of all its episodes, in the order of the plan, when they are over.
+        chosen: of those, which get a video, each with its role.
+        problem: why its recordings could not be settled; None where they were.
+    """
+
+    task: EvaluatedTask
+    unfinished: int = 0
+    reasons: dict[tuple[int, int], str] = field(default_factory=dict)
+    results: list[EpisodeResult] = field(default_factory=list)
+    chosen: list[Chosen] = field(default_factory=list)
+    problem: str | None = None
+
+
+def check_tasks(run: Run, plan: EvaluationPlan, tasks: Iterable[EvaluatedTask]) -> None:
+    """Let workers make the environment and the policy of each task, and no step.
+
+    Raises:
+        Error: the one that making them raised, such as an `UnknownName`.
+        PicturesDiffer: the rule chooses by returns, and the pictures of a task can only
+            be drawn while it runs.
+    """
+    names = {f"check/{task.folder}": task.name for task in tasks}
+    for key, name in names.items():
+        run.submit(Job(key=key, arguments={"kind": "check", "task": name}))
+    rule = keep_rule(plan.keep)
+    for outcome in run.results():
+        # Without patience there is always one.
+        assert outcome is not None
+        _check(names[outcome.key], outcome, rule)
+
+
+def run_tasks(
+    run: Run,
+    plan: EvaluationPlan,
+    directory: Path,
+    *,
+    done: _Done,
+    workers: int,
+    tell: _Tell,
+) -> list[TaskRun]:
+    """Run all that is not done, and return what came of each task.
+
+    Args:
+        run: whose workers are those of `evaluation.worker`.
+        plan: what is evaluated.
+        directory: of the evaluation.
+        done: the results of what was done before, by task.
+        workers: how many processes it is for.
+        tell: is told how far it is.
+
+    Raises:
+        Error: workers cannot be started, or a ledger is damaged.
+    """
+    return _Runner(run, plan, directory, tell).run(done, workers)
+
+
+def _check(task: str, outcome: JobOutcome, rule: KeepRule) -> None:
+    if outcome.failure is not None:
+        raise _named_error(task, outcome.failure)
+    said = outcome.value or {}
+    if "error" in said:
+        raise unpacked(said["error"])
+    if rule.needs_returns and said.get("deferrable") is False:
+        raise PicturesDiffer(
+            f"keep={rule.name!r} chooses the videos of {task} by what has come of its "
+            "episodes, and its pictures can only be drawn while it runs: "
+            f"{said.get('reason')} Use keep='cubic', 'all' or 'none' (--keep cubic), "
+            "which are known beforehand."
+        )
+
+
+def _named_error(task: str, failure: str) -> Error:
+    """Return the error that a job failed with, by the name that stands before it."""
+    name, _, message = failure.partition(": ")
+    if name in errors.__all__:
+        return unpacked({"type": name, "message": message})
+    return EnvironmentNotMade(task, failure)
+
+
+class _Runner:
+    """Runs one evaluation.
+
+    Args:
+        run: see `run_tasks`; so with all of these.
+        plan: likewise.
+        directory: likewise.
+        tell: likewise.
+    """
+
+    def __init__(
+        self, run: Run, plan: EvaluationPlan, directory: Path, tell: _Tell
+    ) -> None:
+        self._run = run
+        self._plan = plan
+        self._directory = directory
+        self._tell = tell
+        self._rule = keep_rule(plan.keep)
+        self._tasks = {task.folder: TaskRun(task) for task in plan.tasks}
+        self._batches: dict[str, Batch] = {}
+        self._counts = LedgerCounts(directory / task.folder for task in plan.tasks)
+
+    def run(self, done: _Done, workers: int) -> list[TaskRun]:
+        for batch in batches_of(self._plan, done, workers=workers):
+            self._submit_batch(batch)
+        for of in self._tasks.values():
+            if not of.unfinished:
+                self._complete(of)
+        for outcome in self._run.results(patience_s=_PATIENCE_S):
+            if outcome is not None:
+                self._take(outcome)
+            self._tell(self._progress())
+        return list(self._tasks.values())
+
+    def _submit_batch(self, batch: Batch) -> None:
+        key = f"run/{batch.folder}/{batch.seed}/{batch.episodes[0]}"
+        self._batches[key] = batch
+        self._tasks[batch.folder].unfinished += 1
+        self._submit(key, asdict(batch))
+
+    def _submit(self, key: str, arguments: Mapping[str, Any]) -> None:
+        kind = key.partition("/")[0]
+        self._run.submit(Job(key=key, arguments={"kind": kind, **arguments}))
+
+    def _take(self, outcome: JobOutcome) -> None:
+        kind, folder, *_ = outcome.key.split("/")
+        of = self._tasks[folder]
+        match kind:
+            case "run":
+                self._take_batch(of, outcome)
+            case "recover":
+                self._take_recovered(of, outcome)
+            case "settle":
+                _note_problem(of, outcome)
+
+    def _take_batch(self, of: TaskRun, outcome: JobOutcome) -> None:
+        batch = self._batches[outcome.key]
+        if outcome.failure is not None:
+            units = [(batch.seed, number) for number in batch.episodes]
+            of.reasons.update(dict.fromkeys(units, outcome.failure))
+        of.unfinished -= 1
+        if not of.unfinished:
+            self._complete(of)
+
+    def _complete(self, of: TaskRun) -> None:
+        """Choose among the episodes of a task, which are all over, and settle it."""
+        folder = self._directory / of.task.folder
+        done = read_ledgers(folder)
+        of.results = [
+            done.get((seed, number)) or _lost(of, seed, number)
+            for seed in self._plan.seeds
+            for number in range(self._plan.episodes)
+        ]
+        of.chosen = self._rule.choose(of.results)
+        if folder.is_dir():
+            name = of.task.folder
+            self._submit(f"recover/{name}", {"folder": name})
+
+    def _take_recovered(self, of: TaskRun, outcome: JobOutcome) -> None:
+        _note_problem(of, outcome)
+        facts = _facts_by_monitor(of)
+        for monitor in (outcome.value or {}).get("monitors", ()):
+            name = of.task.folder
+            chosen = facts.get(monitor, [])
+            self._submit(
+                f"settle/{name}/{monitor}",
+                {"folder": name, "monitor": monitor, "chosen": chosen},
+            )
+
+    def _progress(self) -> EvaluationProgress:
+        plan = self._plan
+        total = len(plan.tasks) * len(plan.seeds) * plan.episodes
+        done, failed = 0, 0
+        with contextlib.suppress(OSError):
+            done, failed = self._counts.look()
+        # An episode that was run twice is still one.
+        return EvaluationProgress(
+            done=min(done, total), failed=min(failed, total), total=total
+        )
+
+
+def _note_problem(of: TaskRun, outcome: JobOutcome) -> None:
+    if outcome.failure is not None:
+        of.problem = outcome.failure
+        logger.warning(
+            "The recordings of %s could not be settled, and stay as they are: %s The "
+            "same evaluation with resume=True (--resume) tries again.",
+            of.task.name,
+            outcome.failure,
+        )
+
+
+def _lost(of: TaskRun, seed: int, number: int) -> EpisodeResult:
+    """Return the result of an episode that was begun, and that nothing came of."""
+    return EpisodeResult(
+        task=of.task.name,
+        seed=seed,
+        episode=number,
+        total_reward=None,
+        length=0,
+        terminated=None,
+        truncated=None,
+        failure=of.reasons.get((seed, number), "nothing is known of it"),
+    )
+
+
+def _facts_by_monitor(of: TaskRun) -> dict[str, list[list[Any]]]:
+    """Return the numbers of chosen episodes, each with what is said of the choice."""
+    roles: dict[tuple[str, int], list[str]] = {}
+    for result, role in of.chosen:
+        if result.monitor is not None and result.episode_id is not None:
+            roles.setdefault((result.monitor, result.episode_id), []).append(role)
+    facts: dict[str, list[list[Any]]] = {}
+    for (monitor, number), of_episode in roles.items():
+        said = {"finished": len(of.results), "roles": of_episode}
+        facts.setdefault(monitor, []).append([number, said])
+    return facts

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`evaluation.json`: what was asked for, written before anything is run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from .. import atomic_files
+from ..errors import DifferentEvaluation, UnreadableFile
+from ..formats.json_fields import field, integer, mapping, read_object, unreadable
+from ..json_text import dumps
+from .plan import SUITE, EvaluationPlan
+from .plan_json import plan_from_json, plan_to_json
+from .results_files import FORMAT_VERSION, PLAN_NAME
+
+__all__ = ["check_continues", "read_plan", "write_plan"]
+
+# What may be asked for anew: each task, seed and episode stands for itself.
+_MAY_GROW = ("tasks", "seeds", "episodes")
+
+
+def write_plan(directory: Path, plan: EvaluationPlan) -> None:
+    """Write the plan into an evaluation's directory.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone or read-only.
+    """
+    value = {"format_version": FORMAT_VERSION, "plan": plan_to_json(plan)}
+    atomic_files.write_text(directory / PLAN_NAME, dumps(value, indent=2) + "\n")
+
+
+def read_plan(directory: Path) -> EvaluationPlan:
+    """Return the plan of the evaluation in a directory.
+
+    Raises:
+        UnreadableFile: it is missing, damaged, or of a newer format.
+    """
+    path = directory / PLAN_NAME
+    with unreadable(path):
+        value = read_object(path)
+        version = field(value, "format_version", integer)
+        if version != FORMAT_VERSION:
+            raise UnreadableFile(
+                path,
+                f"its format is version {version}, and this mjrec reads "
+                f"{FORMAT_VERSION}",
+            )
+        return field(value, "plan", lambda plan: plan_from_json(mapping(plan)))
+
+
+def check_continues(
+    directory: Path, begun: EvaluationPlan, asked: EvaluationPlan
+) -> None:
+    """Check that what is asked for goes on with what was begun.
+
+    Other tasks, seeds and episodes may be asked for, more or fewer; with the protocol
+    `"suite"` not episodes, whose number belongs to the unit of work. All else makes
+    other results, or other videos.
+
+    Raises:
+        DifferentEvaluation: it does not.
+    """
+    was, now = plan_to_json(begun), plan_to_json(asked)
+    differences = {
+        name: (was[name], now[name])
+        for name in now
+        if was[name] != now[name] and not _may_differ(name, asked)
+    }
+    if differences:
+        raise DifferentEvaluation(directory, _named(differences))
+
+
+def _may_differ(name: str, asked: EvaluationPlan) -> bool:
+    if name == "episodes" and asked.protocol == SUITE:
+        return False
+    return name in _MAY_GROW
+
+
+def _named(differences: dict[str, Any]) -> dict[str, Any]:
+    if "is_object" in differences:
+        policies = ("named by a text", "an object")
+        was, now = differences.pop("is_object")
+        differences.setdefault("policy", (policies[was], policies[now]))
+    return differences

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which files of a task's monitor directory show an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from pathlib import Path
+
+from ..formats.json_fields import field, read_object, text
+from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
+from ..formats.video_metadata import metadata_path
+from .episode_results import EpisodeResult
+from .result_columns import ResultVideo
+from .result_tables import EpisodeFiles
+
+__all__ = ["RecordedFiles"]
+
+_TRAJECTORIES = (".h5", ".log")
+# Also text recordings.
+_VIDEOS = (".mp4", ".json")
+
+
+class RecordedFiles:
+    """The files of a task, as they are when this is made.
+
+    Args:
+        folder: the task's monitor directory.
+        chosen: seed and number of the episodes that are to get videos.
+    """
+
+    def __init__(self, folder: Path, chosen: Container[tuple[int, int]]) -> None:
+        self._folder = folder
+        self._chosen = chosen
+        paths = folder.iterdir() if folder.is_dir() else ()
+        self._names = frozenset(path.name for path in paths)
+
+    def of(self, result: EpisodeResult) -> EpisodeFiles:
+        """Return the files of an episode."""
+        infix = Infix.parse(result.monitor or "")
+        if infix is None or result.episode_id is None:
+            return EpisodeFiles()
+        trajectory = trajectory_prefix(infix, result.episode_id)
+        return EpisodeFiles(
+            trajectory=self._first(trajectory, _TRAJECTORIES),
+            video=self._video(result, video_prefix(infix, result.episode_id)),
+        )
+
+    def _video(self, result: EpisodeResult, prefix: str) -> ResultVideo | None:
+        name = self._first(prefix, _VIDEOS)
+        if name is not None:
+            return ResultVideo(name, _sha256(self._folder / name))
+        return ResultVideo(f"{prefix}.mp4", None) if self._is_chosen(result) else None
+
+    def _is_chosen(self, result: EpisodeResult) -> bool:
+        return result.unit in self._chosen
+
+    def _first(self, prefix: str, suffixes: tuple[str, ...]) -> str | None:
+        names = (prefix + suffix for suffix in suffixes)
+        return next((name for name in names if name in self._names), None)
+
+
+def _sha256(video: Path) -> str | None:
+    """Return what a video's metadata says, which is written with it."""
+    try:
+        return field(read_object(metadata_path(video)), "file_sha256", text)
+    except (OSError, ValueError):
+        return None
