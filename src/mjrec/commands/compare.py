@@ -154,8 +154,10 @@ def _sentence(comparison: Comparison) -> str:
             f"{scores.iqm_b:.3f} in B, difference "
             f"{_share(scores.difference, scores.interval, digits=3)}"
         )
-        if len(scores.tasks) < len(compared):
-            text += f" ({len(scores.tasks)} of the tasks have a scale)"
+        count = len(scores.tasks)
+        if count < len(compared):
+            verb = "has" if count == 1 else "have"
+            text += f" ({count} of the tasks {verb} a scale)"
     return f"{text}."
 
 

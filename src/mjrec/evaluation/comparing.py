@@ -263,6 +263,8 @@ class _Pair:
                 return (
                     f"{wrong} of {len(returns)} returns of {name} are NaN or infinite"
                 )
+            if np.abs(returns).max() > _LARGEST:
+                return f"returns of {name} are too large to be added up"
         return None
 
     def differences(self) -> FloatArray:

@@ -119,10 +119,7 @@ def performance_profile(samples: Samples, thresholds: FloatArray) -> FloatArray:
 
 def placements(x: FloatArray, y: FloatArray) -> FloatArray:
     """Return for each value of `x` the share of `y` below it; equal ones count half."""
-    ordered = np.sort(y)
-    below = np.searchsorted(ordered, x, side="left")
-    not_above = np.searchsorted(ordered, x, side="right")
-    return (below + not_above) / (2 * len(y))
+    return _doubled_placements(x, y) / (2 * len(y))
 
 
 def probability_of_improvement(x: FloatArray, y: FloatArray) -> float:
@@ -131,7 +128,14 @@ def probability_of_improvement(x: FloatArray, y: FloatArray) -> float:
     #{(i, j) : x_i > y_j} / (n_x n_y), where equal ones count half: the Mann-Whitney
     statistic U of `x`, divided by the number of pairs; Agarwal et al. (section 4.3).
     """
-    return float(placements(x, y).mean())
+    # Whole numbers until here, so that it is 1/2 where it should be.
+    return int(_doubled_placements(x, y).sum()) / (2 * len(x) * len(y))
+
+
+def _doubled_placements(x: FloatArray, y: FloatArray) -> npt.NDArray[np.intp]:
+    ordered = np.sort(y)
+    below = np.searchsorted(ordered, x, side="left")
+    return below + np.searchsorted(ordered, x, side="right")
 
 
 def mean_probability_of_improvement(x: Samples, y: Samples) -> float:

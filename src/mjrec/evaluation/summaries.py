@@ -126,7 +126,8 @@ class Profile:
     Attributes:
         thresholds: rising.
         shares: for each threshold the share of scores above it, averaged over tasks.
-        low: the pointwise interval's lower end; empty where there is no interval.
+        low: the pointwise interval's lower end; the share itself where there are no
+            intervals, as `AcrossTasks.interval_method` tells.
         high: its upper end; likewise.
     """
 

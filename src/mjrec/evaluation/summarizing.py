@@ -203,8 +203,8 @@ def summarize_across(
         profile=Profile(
             thresholds=PROFILE_THRESHOLDS,
             shares=tuple(shares.tolist()),
-            low=tuple(found.profile_low.tolist()) if found else (),
-            high=tuple(found.profile_high.tolist()) if found else (),
+            low=tuple((found.profile_low if found else shares).tolist()),
+            high=tuple((found.profile_high if found else shares).tolist()),
         ),
         interval_method=intervals.interval_method(
             {task: len(values) for task, values in samples.items()}
