@@ -19,6 +19,7 @@ from .trajectory_reader import TrajectoryReader, added_up
 
 __all__ = [
     "TrajectoryReader",
+    "amend_trajectory",
     "find_trajectory",
     "finish_trajectory",
     "open_trajectory",
@@ -94,6 +95,25 @@ def finish_trajectory(log: Path, *, facts: Mapping[str, Any] | None = None) -> P
     except OSError as error:
         raise DirectoryNotWritable(log.parent, error) from error
     return finished
+
+
+def amend_trajectory(finished: Path, facts: Mapping[str, Any]) -> None:
+    """Add to the facts of a finished trajectory; of a key, the new value counts.
+
+    The file is written anew, whole or not at all: for what is seldom done.
+
+    Args:
+        finished: the HDF5 file.
+        facts: what to add.
+
+    Raises:
+        UnreadableFile: there is no such file, or it is damaged.
+        FileNotWritten: the disk is full; the file is as before.
+    """
+    with TrajectoryHdf5Reader(finished) as reader:
+        known = {**reader.header.facts, **facts}
+        reader.header = dataclasses.replace(reader.header, facts=known)
+        write_hdf5(reader, finished)
 
 
 def _convert(log: Path, finished: Path, facts: Mapping[str, Any]) -> None:

@@ -21,9 +21,10 @@ def append_facts(log: Path, facts: Mapping[str, Any]) -> None:
     """Add to the facts of a log that is closed; of a key, the newest counts.
 
     Only the process that wrote the log may do this, as long as nobody else takes it
-    for theirs. Where the log ends in half a record, that is cut off first: readers
-    would look no further. Like all that is written to a log it is with the operating
-    system when this returns, whole or not at all.
+    for theirs; or who holds the episode's lock, once that process is done with it.
+    Where the log ends in half a record, that is cut off first: readers would look no
+    further. Like all that is written to a log it is with the operating system when
+    this returns, whole or not at all.
 
     Args:
         log: the file.

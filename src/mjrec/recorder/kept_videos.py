@@ -85,6 +85,11 @@ class KeptVideos:
         """The numbers of the episodes that get a video, as far as that is known."""
         return self._left or self._selection.chosen
 
+    @property
+    def is_left_open(self) -> bool:
+        """Whether somebody else decides, when the monitor is gone."""
+        return self._selection.is_left_open
+
     def facts(self) -> dict[str, Any]:
         """Return what is said of a video by which it may be known as hand-picked."""
         return {"rule": self._selection.name, "decided": False}
@@ -104,6 +109,7 @@ class KeptVideos:
             standing = Standing.DROPPED
             if episode is not None:
                 self._selection.add(episode)
+            if episode is not None or self.is_left_open:
                 standing = self._selection.standing(episode_id)
             if standing is Standing.CANDIDATE:
                 # Also where the disk was too full for anything of it.
@@ -168,6 +174,9 @@ class KeptVideos:
     def decide(self) -> None:
         """Decide about all that is held: there are no more episodes. Idempotent.
 
+        Where that is left to somebody else, all that is held stays as it is, and its
+        videos are pending.
+
         Raises:
             InvalidArgument: the user's function could not choose. All episodes that
                 are held stay, and their videos are pending, or there.
@@ -175,6 +184,9 @@ class KeptVideos:
             FileNotWritten: as of `settle`, or the disk is too full to say that a video
                 is chosen. It is pending all the same.
         """
+        if self.is_left_open:
+            self._leave_all()
+            return
         if self._failure is None:
             try:
                 self._selection.close()
@@ -198,6 +210,7 @@ class KeptVideos:
             "chosen": self._selection.chosen,
             "finished": self._selection.finished,
             "most_bytes_held": self._most_bytes_held,
+            **({"left_open": True} if self.is_left_open else {}),
             **failure,
         }
 

@@ -509,7 +509,8 @@ class Recorder:
         self._journal.close()
         self._place.lock.release()
         pending = len(self._videos.pending())
-        if pending:
+        is_left_open = self._kept is not None and self._kept.is_left_open
+        if pending and not is_left_open:
             # Said aloud: nobody else will render them.
             logger.warning(
                 "%d %s pending: mjrec render %s",

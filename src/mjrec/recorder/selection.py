@@ -19,9 +19,19 @@ from ..errors import InvalidArgument, UnknownName
 from ..schedules import check_takes_one, schedule_name
 from .tracking import FinishedEpisode
 
-__all__ = ["RULES", "Keep", "Selection", "Standing", "selection_from"]
+__all__ = ["RULES", "UNDECIDED", "Keep", "Selection", "Standing", "selection_from"]
 
 Keep: TypeAlias = str | Callable[[Sequence[FinishedEpisode]], Iterable[int]]
+
+
+class _Sentinel(str):
+    """A text that is equal to others, and the same as none of them."""
+
+
+# For what mjrec itself records and chooses among later, over several monitors: all
+# recordings, also of episodes that were not completed, are left as candidates when the
+# monitor closes, and logs stay logs. No text that a user gives means this.
+UNDECIDED = _Sentinel("undecided")
 
 RULES = ("best:N", "worst:N", "failures", "failures:N", "median")
 
@@ -52,9 +62,12 @@ class Selection(ABC):
     Attributes:
         name: of the rule, as the manifest has it.
         holds_all: every episode is a candidate until `close`.
+        is_left_open: every episode stays a candidate, of whatever end: somebody else
+            decides, when the monitor is gone.
     """
 
     holds_all = False
+    is_left_open = False
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -129,6 +142,8 @@ def selection_from(keep: object) -> Selection:
         UnknownName: there is no such rule.
         InvalidArgument: it is neither text nor a function, or N is not 1 or more.
     """
+    if keep is UNDECIDED:
+        return _LeftOpen(UNDECIDED)
     if callable(keep):
         check_takes_one(keep, "keep", "the sequence of finished episodes")
         return _ByFunction(schedule_name(keep), keep)
@@ -244,6 +259,28 @@ def _has_failed(episode: FinishedEpisode) -> bool:
     That is right for tasks that end when the robot falls.
     """
     return episode.terminated if episode.success is None else not episode.success
+
+
+class _LeftOpen(Selection):
+    """Nobody here."""
+
+    holds_all = True
+    is_left_open = True
+
+    def _take(self, episode: FinishedEpisode) -> None: ...
+
+    def standing(self, episode_id: int) -> Standing:
+        return Standing.CANDIDATE
+
+    @property
+    def undecided(self) -> int:
+        return self.finished
+
+    @property
+    def chosen(self) -> list[int]:
+        return []
+
+    def close(self) -> None: ...
 
 
 class _ByFunction(Selection):

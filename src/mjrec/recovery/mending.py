@@ -24,7 +24,13 @@ from .clips import remove_empty_parts
 from .known_episodes import KnownEpisodes
 from .live_videos import finish_video
 from .manifests import write_results
-from .remains import Remains, lacks_results, look_through, model_leftovers
+from .remains import (
+    Remains,
+    lacks_results,
+    look_through,
+    model_leftovers,
+    unfinished_logs,
+)
 from .report import RecoveredFile
 from .text_recordings import finish_text
 from .unfinished_logs import finish_log_of_dead
@@ -82,7 +88,7 @@ class Mending:
 
     def _mend(self, remains: Remains) -> None:
         known = KnownEpisodes(remains)
-        for log in remains.logs:
+        for log in unfinished_logs(remains):
             with self._noting_failure(log.name), self._claimed(log) as is_ours:
                 if is_ours:
                     self._note(finish_log_of_dead(log, known))

@@ -8,11 +8,13 @@ each `resume`, in the process of the simulation.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
+from ..formats.manifest import read_manifest
 from ..formats.monitor_directory import (
     ClipPart,
     Infix,
@@ -35,6 +37,7 @@ __all__ = [
     "look_through",
     "model_leftovers",
     "remains_of",
+    "unfinished_logs",
 ]
 
 # A note is rewritten as every file is: an unfinished one has both endings.
@@ -202,8 +205,26 @@ def is_open(remains: Remains) -> bool:
 
 def has_work(remains: Remains) -> bool:
     """Tell whether anything is to be put in order, of a monitor that is not open."""
-    unfinished = remains.notes or remains.leftovers or remains.logs
+    unfinished = remains.notes or remains.leftovers or unfinished_logs(remains)
     return bool(unfinished or lacks_results(remains))
+
+
+def unfinished_logs(remains: Remains) -> list[Path]:
+    """Return the logs of episodes that are to get their final form.
+
+    Those of a monitor that closed and left the choice among them to somebody else
+    wait for that.
+    """
+    logs = remains.logs
+    if not logs or remains.lock in remains.paths or remains.files.manifest is None:
+        return logs
+    try:
+        details = read_manifest(remains.files.manifest).mjrec or {}
+    except UnreadableFile:
+        return logs
+    keep = details.get("keep")
+    is_left = isinstance(keep, Mapping) and keep.get("left_open") is True
+    return [] if is_left else logs
 
 
 def lacks_results(remains: Remains) -> bool:

@@ -29,7 +29,8 @@ def choice_of(
     """
     said = old_details.get("keep")
     old = said if isinstance(said, Mapping) else {}
-    if old.get("decided") is True or "failure" in old:
+    is_final = old.get("decided") is True or "failure" in old
+    if is_final or old.get("left_open") is True:
         return old
     found = dict(_selections(remains, known))
     rule = old.get("rule") or next((s.get("rule") for s in found.values()), None)

@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settling which episodes of an evaluation get a video, after all of them.
+
+The monitors of an evaluation record every episode as a candidate and decide nothing
+(`recorder.selection.UNDECIDED`): the best of a task may be in any of them. When all
+episodes of a task are there, somebody chooses, and what was chosen is written down
+here, into trajectories and manifests, as if each monitor had done it when it closed:
+logs become trajectories, of which the chosen ones promise a video and the others none,
+and manifests say by which rule, and what is pending. `mjrec render` does the rest.
+
+All of it may be killed at any point and done again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..errors import DirectoryNotWritable, Error
+from ..formats.locks import is_locked, wait_for_lock
+from ..formats.manifest import Manifest, read_manifest, write_manifest
+from ..formats.monitor_directory import (
+    Infix,
+    episode_of,
+    lock_name,
+    manifest_lock_name,
+    manifest_name,
+    trajectory_prefix,
+    video_prefix,
+)
+from ..formats.pending_videos import pending_video
+from ..formats.trajectory_file import amend_trajectory
+from ..formats.trajectory_log_facts import append_facts
+from ..formats.video_metadata import is_done
+from ..recovery import recover
+from ..rendering.log_finishing import finish_log
+from ..rendering.pending import EpisodeKey, claim, recorded_episodes
+from ..rendering.recorded_facts import open_for_rendering
+from ..rendering.rendered_manifests import update_manifest
+
+__all__ = [
+    "EVALUATION",
+    "finish_logs",
+    "settle",
+    "settle_monitor",
+    "unsettled_monitors",
+]
+
+# Under `scope`, in a manifest: the choice was made over all monitors of one.
+EVALUATION = "evaluation"
+
+_SECONDS = 60.0
+_MOMENT = 0.05
+
+
+def settle(
+    folder: Path,
+    chosen: Mapping[tuple[str, int], Mapping[str, Any]],
+    *,
+    rule: str,
+) -> None:
+    """Settle all monitors of a task that are closed.
+
+    What killed workers have left is put in order first.
+
+    Args:
+        folder: the monitor directory.
+        chosen: by infix and number of the episodes that get a video, what is said of
+            how they were chosen, such as `{"finished": 50}`.
+        rule: by which they were.
+
+    Raises:
+        Error: see `settle_monitor`, and `mjrec.recover`.
+    """
+    recover(folder)
+    for infix in unsettled_monitors(folder):
+        own = {number: facts for (of, number), facts in chosen.items() if of == infix}
+        settle_monitor(folder, infix, own, rule=rule)
+
+
+def unsettled_monitors(folder: Path) -> list[str]:
+    """Return the infixes of those of an evaluation's monitors that are left to settle.
+
+    Monitors that are open are not among them; nor are those that were killed, before
+    `recover` has put them in order.
+
+    Raises:
+        UnreadableFile: a manifest is damaged.
+    """
+    infixes = {str(key.infix): key.infix for key in recorded_episodes(folder)}
+    return [name for name, infix in infixes.items() if _is_unsettled(folder, infix)]
+
+
+def settle_monitor(
+    folder: Path,
+    monitor: str,
+    chosen: Mapping[int, Mapping[str, Any]],
+    *,
+    rule: str,
+) -> None:
+    """Write down which episodes of a monitor get a video. Idempotent.
+
+    Nothing is done about a monitor that is open, or whose choice is settled. An episode
+    of which there is a video already, because somebody rendered it meanwhile, keeps it.
+
+    Args:
+        folder: the monitor directory.
+        monitor: the monitor's infix.
+        chosen: as of `settle`, by number.
+        rule: likewise.
+
+    Raises:
+        UnreadableFile: a trajectory or the manifest is damaged.
+        FileNotWritten: the disk is full.
+        DirectoryNotWritable: there can be no lock in the directory.
+        Error: somebody else was at an episode for too long.
+    """
+    infix = Infix.parse(monitor)
+    if infix is None or not _is_unsettled(folder, infix):
+        return
+    verdicts = _Verdicts(folder, infix, chosen, rule)
+    promised: list[int] = []
+    for key in recorded_episodes(folder):
+        if key.infix == infix:
+            with _claimed(folder, key):
+                if _settle_episode(folder, key, verdicts):
+                    promised.append(key.episode_id)
+    _settle_manifest(verdicts, promised)
+    # Videos that were there before are no longer pending.
+    update_manifest(folder, infix)
+
+
+def finish_logs(folder: Path, monitor: str) -> None:
+    """Give the logs of a closed monitor's episodes their final form.
+
+    Raises:
+        Error: as `settle_monitor`.
+    """
+    for key in recorded_episodes(folder):
+        log = folder / f"{key.trajectory_name}.log"
+        if str(key.infix) == monitor and log.exists():
+            with _claimed(folder, key):
+                finish_log(log)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Verdicts:
+    """What is said of the episodes of a monitor."""
+
+    folder: Path
+    infix: Infix
+    chosen: Mapping[int, Mapping[str, Any]]
+    rule: str
+
+    def facts(self, episode_id: int, promise: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the trajectory of a candidate is to say."""
+        if self.has_video(episode_id):
+            return {"candidate": False}
+        if episode_id not in self.chosen:
+            return {"candidate": False, "video": None}
+        selection = {
+            **self.chosen[episode_id],
+            "rule": self.rule,
+            "decided": True,
+            "scope": EVALUATION,
+        }
+        return {"candidate": False, "video": {**promise, "selection": selection}}
+
+    def pending(self, episode_id: int) -> dict[str, Any]:
+        """Return how a manifest names the video of an episode."""
+        return pending_video(
+            episode_id,
+            trajectory=trajectory_prefix(self.infix, episode_id),
+            video=f"{video_prefix(self.infix, episode_id)}.mp4",
+        )
+
+    def has_video(self, episode_id: int) -> bool:
+        """Tell whether there is a video of an episode already."""
+        return is_done(self.folder / f"{video_prefix(self.infix, episode_id)}.mp4")
+
+
+def _settle_episode(folder: Path, key: EpisodeKey, verdicts: _Verdicts) -> bool:
+    """Settle an episode, and return whether it has a video, or will have."""
+    log, finished = (folder / f"{key.trajectory_name}{end}" for end in (".log", ".h5"))
+    # Where both are there, somebody was killed between making one and removing the
+    # other, and the finished one counts.
+    path = finished if finished.exists() else log
+    with open_for_rendering(path) as reader:
+        facts = dict(reader.header.facts)
+    if facts.get("candidate") is True:
+        verdict = verdicts.facts(key.episode_id, facts.get("video") or {})
+        amend: Callable[[Path, Mapping[str, Any]], None]
+        amend = amend_trajectory if path is finished else append_facts
+        amend(path, verdict)
+        facts.update(verdict)
+    if log.exists():
+        finish_log(log)
+    return bool(facts.get("video"))
+
+
+def _settle_manifest(verdicts: _Verdicts, promised: Sequence[int]) -> None:
+    folder, infix = verdicts.folder, verdicts.infix
+    try:
+        lock = wait_for_lock(folder / manifest_lock_name(infix), f"{os.getpid()}\n")
+    except OSError as error:
+        raise DirectoryNotWritable(folder, error.strerror) from error
+    try:
+        path = folder / manifest_name(infix)
+        write_manifest(path, _settled(read_manifest(path), verdicts, promised))
+    finally:
+        lock.release()
+
+
+def _settled(
+    manifest: Manifest, verdicts: _Verdicts, promised: Sequence[int]
+) -> Manifest:
+    details = dict(manifest.mjrec or {})
+    keep = {**details.get("keep", {}), "rule": verdicts.rule, "decided": True}
+    keep.pop("left_open", None)
+    broken = details.get("broken") or ()
+    names = [*(video for video, _ in manifest.videos), *broken]
+    listed = set(map(episode_of, names))
+    details.update(
+        schedule={"name": f"keep:{verdicts.rule}", "recorded": list(promised)},
+        keep={**keep, "scope": EVALUATION, "chosen": list(promised)},
+        # Also those that are there, but not listed: `update_manifest` lists them.
+        pending=[verdicts.pending(n) for n in promised if n not in listed],
+    )
+    return dataclasses.replace(manifest, mjrec=details)
+
+
+def _is_unsettled(folder: Path, infix: Infix) -> bool:
+    path = folder / manifest_name(infix)
+    if is_locked(folder / lock_name(infix)) or not path.exists():
+        return False
+    keep = (read_manifest(path).mjrec or {}).get("keep")
+    return isinstance(keep, Mapping) and keep.get("decided") is not True
+
+
+@contextlib.contextmanager
+def _claimed(folder: Path, key: EpisodeKey) -> Iterator[None]:
+    """Hold the lock of an episode, once whoever renders it is done."""
+    end = time.monotonic() + _SECONDS
+    while (lock := claim(folder, key)) is None:
+        if time.monotonic() > end:
+            raise Error(
+                f"Another process has been at {folder / key.trajectory_name} for "
+                f"{_SECONDS:g} seconds, rendering it perhaps. When it has ended, do "
+                "this again: nothing is lost."
+            )
+        time.sleep(_MOMENT)
+    try:
+        yield
+    finally:
+        lock.release()

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a worker process of an evaluation does.
+
+Settings: `{"directory": DIR, "plan": <the plan as JSON>}`; payload: the pickled policy,
+where it is an object. Jobs, by their `kind`, each of which may be done again:
+
+`check`    `{"task"}`: makes the environment and the policy, and takes no step. Returns
+           `{"env_id", "step_limit", "deferrable", "reason"}`.
+`run`      `{"task", "folder", "seed", "episodes"}`: runs those episodes of a batch
+           that no ledger has. Returns `{"episodes": how many it ran}`.
+`recover`  `{"folder"}`: puts in order what killed workers left. Returns
+           `{"monitors": infixes of those that are left to settle}`.
+`settle`   `{"folder", "monitor", "chosen": [[number, facts], ...]}`, see `settling`.
+           Returns `{}`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..recorder.options import DEFERRED
+from .plan import Batch
+from .plan_json import plan_from_json
+from .running import Evaluation, make_acting, rendering_of, run_batch
+
+__all__ = ["EvaluationWorker"]
+
+logger = logging.getLogger(__name__)
+
+
+class EvaluationWorker:
+    """Does the jobs of an evaluation; an `engines.work.Handler`.
+
+    Args:
+        settings: see the module.
+        payload: likewise.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], payload: bytes | None) -> None:
+        self._evaluation = Evaluation(
+            directory=Path(settings["directory"]),
+            plan=plan_from_json(settings["plan"]),
+            policy=payload,
+        )
+        self._by_kind: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+            "check": self._check,
+            "run": self._run,
+            "recover": self._recover,
+            "settle": self._settle,
+        }
+
+    def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Do a job.
+
+        Raises:
+            Error: of what the job is about; the module says which job is which.
+        """
+        return self._by_kind[arguments["kind"]](arguments)
+
+    def close(self) -> None:
+        """Do nothing: nothing is held between jobs."""
+
+    def _check(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        seed = self._evaluation.plan.seeds[0]
+        named = make_acting(self._evaluation, arguments["task"], seed).named
+        with contextlib.closing(named.environment):
+            choice = rendering_of(named) if self._evaluation.draws else None
+        return {
+            "env_id": named.env_id,
+            "step_limit": named.step_limit,
+            "deferrable": choice is None or choice.mode == DEFERRED,
+            "reason": None if choice is None else choice.reason,
+        }
+
+    def _run(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        batch = Batch(
+            task=arguments["task"],
+            folder=arguments["folder"],
+            seed=arguments["seed"],
+            episodes=tuple(arguments["episodes"]),
+        )
+        return {"episodes": run_batch(self._evaluation, batch)}
+
+    # What is imported below loads HDF5, which stepping has no use for.
+
+    def _recover(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        from ..recovery import recover
+        from .settling import unsettled_monitors
+
+        folder = self._folder(arguments)
+        if not folder.is_dir():
+            return {"monitors": []}
+        recovery = recover(folder)
+        if recovery.failures:
+            logger.warning("%s", recovery)
+        return {"monitors": unsettled_monitors(folder)}
+
+    def _settle(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        from .settling import settle_monitor
+
+        settle_monitor(
+            self._folder(arguments),
+            arguments["monitor"],
+            dict(arguments["chosen"]),
+            rule=self._evaluation.plan.keep,
+        )
+        return {}
+
+    def _folder(self, arguments: Mapping[str, Any]) -> Path:
+        return self._evaluation.directory / str(arguments["folder"])
