@@ -10,7 +10,6 @@ costs; it is needed only where the compiled model cannot be used.
 
 from __future__ import annotations
 
-import json
 import os
 import resource
 import signal
@@ -22,16 +21,11 @@ from pathlib import Path
 
 import mujoco
 
+from ..child_python import environment_of_child, python_command
 from ..errors import UnreadableFile
 from .authored_model import read_authored
 
 __all__ = ["compile_within"]
-
-# The child finds the modules that this process finds, by whatever means.
-_PROGRAM = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    f"from {__name__} import main; sys.exit(main(sys.argv[2:]))"
-)
 
 _MODEL = "model.mjb"
 _REASON = "reason.txt"
@@ -66,17 +60,10 @@ def compile_within(
         arguments = [str(path.absolute()), directory, str(limit), str(memory)]
         try:
             done = subprocess.run(
-                [
-                    sys.executable,
-                    "-P",
-                    "-c",
-                    _PROGRAM,
-                    json.dumps(sys.path),
-                    *arguments,
-                ],
+                [*python_command("mjrec.simulation.source_compiler"), *arguments],
                 # Where what it leaves behind is removed, MuJoCo's own log included.
                 cwd=directory,
-                env={**os.environ, "TMPDIR": directory},
+                env=environment_of_child({**os.environ, "TMPDIR": directory}),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
@@ -123,3 +110,7 @@ def _reason(said: Path, returncode: int, memory: int) -> str:
         f"the process that compiled it ended ({how}); it may use "
         f"{memory / 2**30:.1f} GiB of memory"
     )
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
