@@ -63,6 +63,7 @@ _MOST_POINTS: Final = 160
 _MOST_COLUMNS: Final = 40
 # A window of more episodes than this is told from as many of it, evenly spread.
 _WIDEST_WINDOW: Final = 1000
+_LARGEST: Final = 1e300
 
 
 def learning_curve(task: ReportTask, *, key: str) -> str:
@@ -79,22 +80,18 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
         MissingDependency: there is no matplotlib.
     """
     returns = _returns_in_time(task.episodes)
+    count, window = len(returns), _window(len(returns))
     figure = _Drawing()
-    panel = _Panel(
-        figure,
-        left=46,
-        right=8,
-        x=_span(np.array([1.0, len(returns)])),
-        y=_span(returns),
-    )
+    middle, low, mean, high = _running(returns, window)
+    # What is not drawn needs no room.
+    seen = returns if count <= _MOST_DOTS else np.append(low, high)
+    episodes = _span(np.array([1.0, count]), margin=0.01)
+    panel = _Panel(figure, left=46, right=14, x=episodes, y=_span(seen))
     panel.grid()
-    window = _window(len(returns))
-    if len(returns) <= _MOST_DOTS:
-        panel.dots(np.arange(1.0, len(returns) + 1), returns, "accent", opacity=0.35)
-    if len(returns) > window:
-        middle, low, mean, high = _running(returns, window)
-        panel.band(middle, low, high, "accent")
-        panel.line(middle, mean, "accent")
+    if count <= _MOST_DOTS:
+        panel.dots(np.arange(1.0, count + 1), returns, "accent", opacity=0.4)
+    panel.band(middle, low, high, "accent")
+    panel.line(middle, mean, "accent")
     panel.label_y("Return")
     panel.label_x("Episode", [(tick, _short(tick)) for tick in _whole(panel.ticks_x)])
     said = (
@@ -120,13 +117,12 @@ def evaluation_curve(task: ReportTask, *, key: str) -> str:
     """
     columns = task.episodes
     known = np.isfinite(columns.total_reward)
-    returns, runs = columns.total_reward[known], columns.run[known]
+    returns, runs = _drawable(columns.total_reward[known]), columns.run[known]
     seeds, place = np.unique(runs, return_inverse=True)
     figure = _Drawing()
     reach = _span(np.append(returns, _ends(task.summary)))
-    dots = _Panel(figure, left=46, right=112, x=(-0.6, len(seeds) - 0.4), y=reach)
-    shares = _Panel(figure, left=46 + 112 + 80, right=10, x=(0.0, 1.0), y=reach)
-    shares.move(left=_WIDTH - 100)
+    dots = _Panel(figure, left=46, right=128, x=(-0.6, len(seeds) - 0.4), y=reach)
+    shares = _Panel(figure, left=_WIDTH - 112, right=22, x=(0.0, 1.0), y=reach)
     dots.grid()
     shares.grid(labels=False)
     if task.summary.mean is not None and len(returns):
@@ -188,10 +184,15 @@ def profile_curve(across: Mapping[str, AcrossTasks], *, key: str) -> str:
 
 def _returns_in_time(columns: EpisodeColumns) -> _Floats:
     known = np.isfinite(columns.total_reward)
-    returns, times = columns.total_reward[known], columns.end_time[known]
+    returns, times = _drawable(columns.total_reward[known]), columns.end_time[known]
     if len(returns) and np.isfinite(times).all():
         returns = returns[np.argsort(times, kind="stable")]
     return returns
+
+
+def _drawable(returns: _Floats) -> _Floats:
+    """Return returns whose sums are numbers, too."""
+    return np.clip(returns, -_LARGEST, _LARGEST)
 
 
 def _window(count: int) -> int:
@@ -203,7 +204,9 @@ def _running(
     returns: _Floats, window: int
 ) -> tuple[_Floats, _Floats, _Floats, _Floats]:
     """Return episodes' numbers, and the 10 %, the mean and the 90 % around them."""
-    count = len(returns) - window + 1
+    count = max(0, len(returns) - window + 1)
+    if not count:
+        return (np.empty(0),) * 4
     starts = _spread(count, _MOST_POINTS)
     inside = _spread(window, _WIDEST_WINDOW)
     windows = returns[starts[:, None] + inside[None, :]]
@@ -390,10 +393,6 @@ class _Panel:
         self.ticks_x = _ticks(x)
         self.ticks_y = _ticks(y)
 
-    def move(self, *, left: float) -> None:
-        """Begin further right or left."""
-        self._left = left
-
     def grid(
         self,
         *,
@@ -499,7 +498,7 @@ class _Panel:
 def _ticks(span: tuple[float, float]) -> list[float]:
     """Return a few round values inside of a span."""
     low, high = span
-    step = (high - low) / 4
+    step = (high - low) / 5
     size = 10.0 ** math.floor(math.log10(step))
     step = next(s * size for s in (1, 2, 2.5, 5, 10) if s * size >= step * 0.999)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 from typing import Final
 
-__all__ = ["NOTHING", "decimals_for", "number"]
+__all__ = ["NOTHING", "decimals_for", "number", "whole_number"]
 
 # What stands where there is no number.
 NOTHING: Final = "\N{EN DASH}"
@@ -24,12 +24,27 @@ def decimals_for(values: Iterable[float | None]) -> int:
 
 
 def number(value: float | None, decimals: int) -> str:
-    """Return a number with its thousands apart by narrow spaces, or a dash."""
+    """Return a number, from 10 000 on with its thousands apart, or a dash."""
     if value is None or math.isnan(value):
         return NOTHING
     if math.isinf(value):
         return "∞" if value > 0 else "-∞"
     if abs(value) >= 1e15:
         return f"{value:.4g}"
-    text = f"{value:,.{decimals}f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
-    return text.removeprefix("-") if float(f"{value:.{decimals}f}") == 0 else text
+    text = f"{value:.{decimals}f}"
+    if float(text) == 0:
+        return text.removeprefix("-")
+    # Four figures in a row are still seen at once.
+    return _grouped(text) if abs(value) >= 10_000 else text
+
+
+def whole_number(value: int) -> str:
+    """Return a whole number likewise."""
+    return _grouped(str(value)) if abs(value) >= 10_000 else str(value)
+
+
+def _grouped(text: str) -> str:
+    whole, point, decimals = text.partition(".")
+    return (
+        f"{int(whole):,}".replace(",", "\N{NARROW NO-BREAK SPACE}") + point + decimals
+    )

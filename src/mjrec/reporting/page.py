@@ -17,6 +17,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
+from html import escape
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from urllib.parse import quote
@@ -28,7 +29,7 @@ from ..errors import MissingDependency
 from ..evaluation.summaries import AcrossTasks, Bootstrap, Interval, TaskSummary
 from .contents import EpisodeColumns, ReportContents, ReportTask, ReportVideo, Verdict
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
-from .numbers import NOTHING, decimals_for, number
+from .numbers import NOTHING, decimals_for, number, whole_number
 
 __all__ = ["page_of"]
 
@@ -130,6 +131,8 @@ def _template() -> Any:
         finalize=_shown,
     )
     environment.filters["name"] = lambda text: _spelled_out(text, _LONGEST_NAME)
+    environment.filters["broken"] = _broken
+    environment.filters["grouped"] = whole_number
     environment.filters["command"] = lambda text: _spelled_out(text, _LONGEST_COMMAND)
     return environment.get_template("report.html.j2")
 
@@ -158,6 +161,11 @@ def _spelled_out(text: str, longest: int) -> _Cut:
     return _Cut("".join(c if _is_seen(c) else f"\\u{ord(c):04x}" for c in text))
 
 
+def _broken(name: str) -> _Own:
+    """Return a name that may go on in the next line after each `/`."""
+    return _Own(escape(_spelled_out(name, _LONGEST_NAME)).replace("/", "/<wbr>"))
+
+
 def _is_seen(character: str) -> bool:
     return character.isprintable() or character in _SEEN
 
@@ -178,7 +186,6 @@ def _page(contents: ReportContents, *, curves: bool) -> dict[str, Any]:
         "has_successes": any(task.summary.success_known for task in tasks),
         "has_warnings": any(task.summary.warnings for task in tasks),
         "intervals": _intervals(contents.bootstrap),
-        "confidence": f"{contents.bootstrap.confidence:.4g}",
         "percent": f"{contents.bootstrap.confidence * 100:.4g}\N{NO-BREAK SPACE}%",
         "across": [
             _across(name, told, i)
@@ -186,6 +193,11 @@ def _page(contents: ReportContents, *, curves: bool) -> dict[str, Any]:
         ],
         "profile": _profile(contents) if curves else None,
         "figures": list(_figures(tasks)) if curves else [],
+        "words_of_figures": [
+            _WORDS_OF_FIGURES[kind]
+            for kind in (True, False)
+            if any(task.is_evaluation is kind for task in tasks)
+        ],
         "figures_left_out": len(tasks[_MOST_FIGURES:]) if curves else 0,
         "cards": cards,
         "players_left_out": len(contents.videos) - players,
@@ -193,7 +205,7 @@ def _page(contents: ReportContents, *, curves: bool) -> dict[str, Any]:
         "tasks_with_videos": _tasks_with_videos(contents, cards),
         "selection": _selection(tasks),
         "episodes": _own_json(_episodes(contents, cards)),
-        "num_episodes": f"{_count(tasks):,}".replace(",", "\N{NARROW NO-BREAK SPACE}"),
+        "num_episodes": whole_number(_count(tasks)),
         "not_all": _count(tasks) > _MOST_EPISODES,
         "where_all": _where_all_are(tasks),
         "task_names": [task.name for task in tasks],
@@ -208,8 +220,7 @@ def _count(tasks: Iterable[ReportTask]) -> int:
 
 
 def _plural(count: int, what: str) -> str:
-    shown = f"{count:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
-    return f"{shown} {what}{'' if count == 1 else 's'}"
+    return f"{whole_number(count)} {what}{'' if count == 1 else 's'}"
 
 
 def _subtitle(contents: ReportContents) -> str:
@@ -343,11 +354,8 @@ def _bar(summary: TaskSummary, decimals: int) -> _Bar | None:
 
 
 def _intervals(bootstrap: Bootstrap) -> str:
-    resamples = f"{bootstrap.resamples:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
-    return (
-        f"{bootstrap.method}, {resamples} resamples, seed {bootstrap.seed}; "
-        "success rates: Wilson's interval"
-    )
+    told = f"{bootstrap.method}, {whole_number(bootstrap.resamples)} resamples"
+    return f"{told}, seed {bootstrap.seed}"
 
 
 # --- All tasks together, and figures ----------------------------------------------
@@ -387,22 +395,23 @@ def _profile(contents: ReportContents) -> _Own | None:
     return _Own(profile_curve(contents.across, key="profile"))
 
 
-def _figures(tasks: Sequence[ReportTask]) -> Iterator[tuple[str, str, _Own]]:
-    """Yield each task's name, what its figure shows, and the figure."""
+def _figures(tasks: Sequence[ReportTask]) -> Iterator[tuple[str, _Own]]:
+    """Yield each task's name and its figure."""
     for index, task in enumerate(tasks[:_MOST_FIGURES]):
         if not np.isfinite(task.episodes.total_reward).any():
             continue
         draw = evaluation_curve if task.is_evaluation else learning_curve
-        words = _WORDS_OF_FIGURES[task.is_evaluation]
         # The description is part of the figure, and what it says is no markup.
         named = _with_name(task, _spelled_out(task.name, _LONGEST_NAME))
-        yield task.name, words, _Own(draw(named, key=f"figure-{index}"))
+        yield task.name, _Own(draw(named, key=f"figure-{index}"))
 
 
 _WORDS_OF_FIGURES: Final = {
-    True: "episodes, each seed's mean, the mean of all with its interval; right: the "
-    "share of episodes that reach a return",
-    False: "running mean, and the middle 80 % of returns",
+    True: "Evaluations: each dot is an episode, each short line a seed's mean, and "
+    "the long one the mean of all with its interval. On the right, the share of "
+    "episodes that reach a return.",
+    False: "Recordings: the mean of episodes in a row, and the range of the middle "
+    "80\N{NO-BREAK SPACE}% of them; where episodes are few, each is a dot.",
 }
 
 

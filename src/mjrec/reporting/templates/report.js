@@ -168,6 +168,7 @@
 
     const table = one("#episodes-table");
     const body = one("tbody", table);
+    const hasSuccesses = one("[data-key=success]", table) !== null;
     const count = one("#episodes-count");
     const previous = one("#episodes-previous"), next = one("#episodes-next");
     const chosen = one("#episodes-task");
@@ -194,24 +195,28 @@
     }
 
     function formats(decimals) {
-      const format = new Intl.NumberFormat("en", { minimumFractionDigits: decimals, maximumFractionDigits: decimals });
+      const format = new Intl.NumberFormat("en", { minimumFractionDigits: decimals, maximumFractionDigits: decimals, useGrouping: "min2" });
       return (value) => (value === null ? DASH : Math.abs(value) >= 1e15 ? value.toPrecision(4) : format.format(value).replaceAll(",", "\u202f"));
     }
+    const whole = formats(0);
     const shown = tasks.map((t) => formats(t.decimals));
 
     function makeRow(n) {
       const t = tasks[taskOf[n]], i = within[n];
       const row = document.createElement("tr");
-      const name = cell(row, t.name);
+      const name = document.createElement("span");
       name.dir = "auto";
+      name.className = "name";
+      name.textContent = t.name;
+      cell(row, "").append(name);
       cell(row, t.runs ? t.runs[t.run[i]] : t.run[i]).dir = "auto";
       cell(row, t.episode[i], true);
       cell(row, shown[taskOf[n]](t.total_reward[i]), true);
-      cell(row, t.length[i], true);
+      cell(row, whole(t.length[i]), true);
       const outcome = cell(row, outcomes[t.outcome[i]] || DASH);
       if (t.failures[i]) outcome.textContent += `: ${t.failures[i]}`;
       if (outcomes[t.outcome[i]] === "failed") outcome.className = "bad";
-      cell(row, t.success[i] < 0 ? DASH : t.success[i] ? "yes" : "no");
+      if (hasSuccesses) cell(row, t.success[i] < 0 ? DASH : t.success[i] ? "yes" : "no");
       const videos = cell(row, "");
       (t.videos[i] ?? []).forEach((place, k) => {
         const link = document.createElement("a");
@@ -229,8 +234,7 @@
       const rows = document.createDocumentFragment();
       for (let k = first; k < last; k += 1) rows.append(makeRow(order[k]));
       body.replaceChildren(rows);
-      const number = (n) => n.toLocaleString("en").replaceAll(",", "\u202f");
-      count.textContent = order.length ? `Rows ${number(first + 1)} to ${number(last)} of ${number(order.length)}` : "No episodes";
+      count.textContent = order.length ? `Rows ${whole(first + 1)} to ${whole(last)} of ${whole(order.length)}` : "No episodes";
       previous.setAttribute("aria-disabled", String(first === 0));
       next.setAttribute("aria-disabled", String(last === order.length));
     }
