@@ -80,7 +80,8 @@ class ReportVideo:
     Attributes:
         task: index into `ReportContents.tasks`.
         index: of its episode in the task's columns; None where it is not known.
-        file: its path relative to the page, or a `data:` URL.
+        file: its path relative to the page, or a `data:` URL; empty where it is not
+            part of the report.
         poster: likewise, of a picture of it; None where there is none.
         name: the base name of the video in its monitor directory.
         roles: which of `"best"`, `"median"`, `"worst"` its episode is among the

@@ -22,7 +22,6 @@ from .contents import ReportVideo
 
 __all__ = ["RecordedVideo", "recorded_videos", "report_video"]
 
-_MOVING: Final = (".mp4", ".avi")
 _SHA256: Final = re.compile(r"[0-9a-f]{64}", re.ASCII)
 _NUMBER: Final = re.compile(r"-?\d+", re.ASCII)
 _LONGEST_TEXT: Final = 1000
@@ -55,20 +54,16 @@ def recorded_videos(
     """Return the videos of a monitor that are finished and there, each once.
 
     They are those that its manifest lists, and those that were finished after it was
-    written, with those of further cameras. Text recordings are none.
+    written, with those of further cameras. Text recordings are among them.
 
     Args:
         results: of the monitor.
         problems: is added to where one is listed and gone, or cannot be read.
     """
     names = _listed(results) + _finished(results)
-    texts = 0
     found: dict[str, RecordedVideo] = {}
     for name in dict.fromkeys(names):
         path = _directory(results) / name
-        if path.suffix not in _MOVING:
-            texts += 1
-            continue
         try:
             regular_path(path)
         except (OSError, ValueError) as error:
@@ -76,12 +71,6 @@ def recorded_videos(
             problems.append(f"The video {path} is left out: {reason}.")
             continue
         found[name] = _recorded(results, path, problems)
-    if texts:
-        problems.append(
-            f"{texts} text {'recording' if texts == 1 else 'recordings'} of "
-            f"{_directory(results)} ({results.files.infix}) are not shown: play them "
-            "with asciinema."
-        )
     return [found[name] for name in sorted(found, key=_order)]
 
 

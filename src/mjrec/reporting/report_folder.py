@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A report in a folder, or in one file.
+
+::
+
+    report/
+    ├── index.html      opens from the disk and needs no network
+    ├── videos/         copies: 0000-dm-control-walker-walk.mp4 ...
+    └── posters/        a picture of each: 0000-dm-control-walker-walk.jpg ...
+
+The folder can be moved, and is whole without the recordings. It appears under its name
+when it is complete; one that was there is replaced then, if it was a report and nothing
+else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import os
+import re
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from ..atomic_files import temporary_path, write_text
+from ..errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
+from ..formats.regular_files import open_regular
+from .contents import ReportContents
+from .gathering import gather
+from .media_files import (
+    POSTERS,
+    VIDEOS,
+    OnProgress,
+    is_own_name,
+    with_copied_videos,
+    with_embedded_videos,
+    with_posters,
+)
+from .page import page_of
+
+__all__ = ["write_report"]
+
+PAGE_NAME: Final = "index.html"
+
+_PAGE_ENDINGS: Final = (".html", ".htm")
+_CHARSET: Final = '<meta charset="utf-8">'
+_GENERATOR: Final = re.compile(rb'<meta name="generator" content="mjrec [^"]*">')
+_BEGIN: Final = 4096
+_SHOWN: Final = 5
+
+
+def write_report(
+    directories: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    path: str | os.PathLike[str] = "report",
+    *,
+    title: str | None = None,
+    single_file: bool = False,
+    max_single_file_bytes: int = 50_000_000,
+    verifications: Iterable[str | os.PathLike[str]] = (),
+    on_progress: OnProgress | None = None,
+) -> Path:
+    """Write a page that shows recordings, and return its path.
+
+    It has a summary of each task, curves, a gallery of the videos, all episodes, and
+    how they came about. It works for evaluations and for any monitor directory, also
+    one that old gym wrote, on a machine without MuJoCo and OpenGL. A file that cannot
+    be read is named on the page, and the rest is shown.
+
+    Args:
+        directories: of evaluations, of monitors, or folders with such directories
+            directly in them; one, or several.
+        path: of the folder to write. A report that is there is replaced, another
+            folder that is not empty is not. With `single_file` it may end in `.html`
+            and is then the page itself.
+        title: of the page; what was recorded, if None.
+        single_file: put posters and videos into the page. Those that are too large
+            for `max_single_file_bytes` are left out, with a note: the posters come
+            first, then the videos in the order of the gallery.
+        max_single_file_bytes: the most bytes of the page with `single_file`.
+        verifications: files that `mjrec verify --json` has printed; a
+            `verification.json` in a directory is found by itself.
+        on_progress: called with a `ReportProgress` for each poster and video.
+
+    Raises:
+        InvalidArgument: a directory has no recordings; `path` is something else than
+            a report; or the page alone is larger than `max_single_file_bytes`.
+        UnreadableFile: one of `verifications`.
+        MissingDependency: Jinja2, matplotlib or scipy is not installed.
+        FileNotWritten, DirectoryNotWritable: the disk is full, or read-only.
+    """
+    target = Path(os.path.realpath(path))
+    is_page = target.suffix.lower() in _PAGE_ENDINGS
+    if is_page and not single_file:
+        raise InvalidArgument(
+            f"{path} names a page, and a report is a folder: name the folder, or ask "
+            "for one file (single_file=True, --single-file)."
+        )
+    _check_target(target, is_page=is_page)
+    tell = on_progress or (lambda progress: None)
+    contents = gather(directories, title=title, verifications=verifications)
+    contents, posters = with_posters(contents, tell)
+    if single_file:
+        page = _single_page(contents, posters, max_single_file_bytes)
+        if is_page:
+            _make_parents(target)
+            write_text(target, page)
+            return Path(path)
+    with _replacing_folder(target) as folder:
+        if not single_file:
+            contents = with_copied_videos(contents, posters, folder, tell)
+            page = _page(contents)
+        write_text(folder / PAGE_NAME, page)
+    return Path(path) / PAGE_NAME
+
+
+def _single_page(
+    contents: ReportContents, posters: Sequence[bytes | None], most_bytes: int
+) -> str:
+    bare = with_embedded_videos(contents, [None] * len(posters), room=0)
+    size = len(_page(bare).encode())
+    if size > most_bytes:
+        raise InvalidArgument(
+            f"The page has {size} bytes without any picture or video, and "
+            f"max_single_file_bytes allows {most_bytes}. Allow more, or write a folder."
+        )
+    return _page(with_embedded_videos(contents, posters, room=most_bytes - size))
+
+
+def _page(contents: ReportContents) -> str:
+    """Return the page, with the mark by which it is known as one of ours."""
+    version = importlib.metadata.version("mjrec")
+    mark = f'<meta name="generator" content="mjrec {version}">'
+    return page_of(contents).replace(_CHARSET, f"{_CHARSET}\n{mark}", 1)
+
+
+def _check_target(target: Path, *, is_page: bool) -> None:
+    """Raise InvalidArgument if there is something that is not to be replaced."""
+    if not os.path.lexists(target):
+        return
+    if is_page:
+        if not _is_own_page(target):
+            raise InvalidArgument(
+                f"{target} is there and is no report. It is not replaced: choose "
+                "another name, or remove it."
+            )
+        return
+    if not target.is_dir():
+        raise InvalidArgument(
+            f"{target} is a file, and a report is a folder: choose another name."
+        )
+    names = {entry.name for entry in target.iterdir()}
+    if not names:
+        return
+    foreign = sorted(names - {PAGE_NAME, VIDEOS, POSTERS}) + sorted(
+        f"{folder}/{entry.name}"
+        for folder in (VIDEOS, POSTERS)
+        if (target / folder).is_dir()
+        for entry in (target / folder).iterdir()
+        if not is_own_name(entry.name)
+    )
+    if not _is_own_page(target / PAGE_NAME):
+        foreign = sorted(names)
+    if foreign:
+        more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
+        raise InvalidArgument(
+            f"{target} holds what is no report: {', '.join(foreign[:_SHOWN])}{more}. "
+            "It is not replaced: choose another folder, or move that away."
+        )
+
+
+def _is_own_page(path: Path) -> bool:
+    try:
+        with open_regular(path) as file:
+            return _GENERATOR.search(file.read(_BEGIN)) is not None
+    except (OSError, ValueError):
+        return False
+
+
+def _make_parents(target: Path) -> None:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DirectoryNotWritable(target.parent, error.strerror) from error
+
+
+@contextlib.contextmanager
+def _replacing_folder(target: Path) -> Iterator[Path]:
+    """Yield a new folder beside `target`, and put it there at the end of the block.
+
+    If the block raises, it is removed, and what was there stays as it was.
+    """
+    _make_parents(target)
+    folder = temporary_path(target)
+    try:
+        for name in ("", VIDEOS, POSTERS):
+            (folder / name).mkdir()
+    except OSError as error:
+        raise DirectoryNotWritable(target.parent, error.strerror) from error
+    try:
+        yield folder
+        for name in (VIDEOS, POSTERS):
+            if not any((folder / name).iterdir()):
+                (folder / name).rmdir()
+        _exchange(folder, target)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _exchange(folder: Path, target: Path) -> None:
+    """Give a finished folder its name; what had it is removed after that."""
+    before = temporary_path(target)
+    try:
+        if target.exists():
+            target.rename(before)
+        try:
+            folder.rename(target)
+        except BaseException:
+            if before.exists():
+                before.rename(target)
+            raise
+    except OSError as error:
+        raise FileNotWritten(
+            target, error.strerror, then="the same command writes it again"
+        ) from error
+    shutil.rmtree(before, ignore_errors=True)
