@@ -125,7 +125,14 @@ def _single_page(
             f"The page has {size} bytes without any picture or video, and "
             f"max_single_file_bytes allows {most_bytes}. Allow more, or write a folder."
         )
-    return _page(with_embedded_videos(contents, posters, room=most_bytes - size))
+    room = most_bytes - size
+    while True:
+        page = _page(with_embedded_videos(contents, posters, room=room))
+        used = len(page.encode()) - size
+        if size + used <= most_bytes:
+            return page
+        # What is embedded may stand there more than once.
+        room = min(room - 1, room * (most_bytes - size) // used)
 
 
 def _page(contents: ReportContents) -> str:

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec report`: a page that shows recordings."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import rich.console
+import rich.progress
+import tyro
+
+from .. import json_text
+from ..reporting.media_files import OnProgress, ReportProgress
+from ..reporting.report_folder import write_report
+from .help_text import flowing_help
+
+__all__ = ["report"]
+
+
+@flowing_help
+def report(
+    directories: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="DIR")
+    ],
+    /,
+    *,
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("report"),
+    single_file: bool = False,
+    max_single_file_bytes: int = 50_000_000,
+    title: str | None = None,
+    verification: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """Write a page that shows recordings: figures, curves, videos, how they came about.
+
+    It is a folder with an index.html that opens from the disk and needs no network;
+    videos are copied into it. It works for what mjrec evaluate and mjrec record have
+    written and for any monitor directory, also of old gym, and needs no MuJoCo and no
+    OpenGL. What cannot be read is named on the page, and the rest is shown.
+
+    Args:
+        directories: evaluations, monitor directories, or folders with such directories
+            directly in them.
+        out: the folder to write. A report that is there is replaced, another folder
+            that is not empty is not.
+        single_file: put posters and videos into the page itself, as far as they fit;
+            --out may then be the name of the page.
+        max_single_file_bytes: the most bytes of that page; videos that do not fit are
+            left out, with a note.
+        title: of the page.
+        verification: a file that mjrec verify --json has printed. May be given several
+            times; a verification.json in a directory is found by itself.
+        as_json: print one JSON object at the end.
+    """
+    console = rich.console.Console(stderr=True)
+    with _progress_on(console) as told:
+        page = write_report(
+            directories,
+            out,
+            title=title,
+            single_file=single_file,
+            max_single_file_bytes=max_single_file_bytes,
+            verifications=verification,
+            on_progress=told,
+        )
+    if as_json:
+        sys.stdout.write(json_text.dumps({"page": str(page.absolute())}) + "\n")
+    else:
+        sys.stdout.write(f"{page.absolute()}\n")
+    return 0
+
+
+@contextlib.contextmanager
+def _progress_on(console: rich.console.Console) -> Iterator[OnProgress | None]:
+    """Show a bar for posters and one for videos on a terminal; nothing elsewhere."""
+    if not console.is_terminal:
+        yield None
+        return
+    bar = rich.progress.Progress(
+        rich.progress.TextColumn("{task.description:8}"),
+        rich.progress.BarColumn(bar_width=30),
+        rich.progress.MofNCompleteColumn(),
+        console=console,
+        transient=True,
+    )
+    tasks: dict[str, rich.progress.TaskID] = {}
+
+    def show(progress: ReportProgress) -> None:
+        if progress.what not in tasks:
+            tasks[progress.what] = bar.add_task(progress.what)
+        bar.update(tasks[progress.what], completed=progress.done, total=progress.total)
+
+    with bar:
+        yield show

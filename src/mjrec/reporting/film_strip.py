@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Film strips for papers: some pictures of an episode, each with its time.
+
+Pictures come from a video, or, sharper and of any size, from a recorded trajectory,
+which is drawn again. Pillow writes the times; it is an extra and is imported when a
+strip is made.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..annotation import check_annotation
+from ..atomic_files import replacing
+from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
+from ..formats.json_fields import field, integer, list_of, rate, read_object
+from ..formats.video_metadata import metadata_path
+from ..frames import Frame
+from ..rendering.captions import Captions
+from ..rendering.recorded_facts import open_for_rendering
+from ..rendering.recorded_pictures import check_has_pictures, warn_of_other_pictures
+from ..rendering.views import View, plain_camera
+from ..rendering.workers import DrawingWorkers
+from .video_stream import VideoStream, read_stream, stream_frames, video_kind
+
+__all__ = ["film_strip", "write_film_strip"]
+
+_TRAJECTORIES: Final = (".h5", ".log")
+_MOST_IN_A_ROW: Final = 8
+_DOTS_PER_INCH: Final = 300
+# Pixels of a whole strip; Pillow calls twice as many an attack.
+_MOST_PIXELS: Final = 1 << 27
+
+_PAPER: Final = 255
+_INK: Final = 32
+# Of the smaller side of a picture.
+_GAP: Final = 0.03
+_LETTERS: Final = 0.09
+_SMALLEST_LETTERS: Final = 9
+_LARGEST_LETTERS: Final = 96
+
+
+def film_strip(
+    file: str | os.PathLike[str],
+    *,
+    frames: int = 8,
+    columns: int | None = None,
+    camera: Any = None,
+    height: int | None = None,
+    width: int | None = None,
+    quality: str | None = None,
+) -> Frame:
+    """Return some pictures of an episode side by side on white, with their times.
+
+    They are evenly spread over the episode, the first and the last one included. Times
+    are simulated seconds since the reset where these are known, else the video's own.
+
+    Args:
+        file: a trajectory (`.h5`, `.log`), which is drawn again; or a video, which is
+            decoded.
+        frames: how many pictures.
+        columns: how many side by side; None is all of up to eight, else as many as make
+            equal rows.
+        camera: of a trajectory, as in `mjrec.render`.
+        height: of each picture, likewise.
+        width: likewise.
+        quality: likewise.
+
+    Returns:
+        `(height, width, 3) uint8`.
+
+    Raises:
+        InvalidArgument: there are fewer pictures than that; or a camera, a size or a
+            quality was asked for of a video.
+        UnreadableFile: it is neither a video nor a trajectory, or is damaged.
+        MissingDependency: there is no Pillow.
+        EncoderError: the video cannot be decoded.
+        NoPictures, UntrustedModel, GLError: as `mjrec.render`.
+    """
+    path = Path(file)
+    _check_count("frames", frames)
+    if columns is not None:
+        _check_count("columns", columns)
+    check_annotation()
+    if path.suffix in _TRAJECTORIES:
+        pictures = _of_trajectory(
+            path,
+            frames,
+            View(
+                camera=None if camera is None else plain_camera(camera),
+                height=height,
+                width=width,
+                quality=quality,
+            ),
+        )
+    elif any(option is not None for option in (camera, height, width, quality)):
+        raise InvalidArgument(
+            f"{path} is shown as it is. Another camera, size or quality can be drawn "
+            "from its trajectory: name that file (openaigym.trajectory.*.h5)."
+        )
+    else:
+        pictures = _of_video(path, frames)
+    return _laid_out(pictures, columns or _usual_columns(frames))
+
+
+def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
+    """Write a film strip as PNG, of 300 dots per inch.
+
+    Raises:
+        InvalidArgument: the name does not end in `.png`.
+        FileNotWritten: the disk is full, or there is no such directory.
+    """
+    # Here, because it is an extra.
+    from PIL import Image
+
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise InvalidArgument(
+            f"A film strip is a PNG, and {path} is called otherwise: name it "
+            f"{path.with_suffix('.png')}."
+        )
+    buffer = io.BytesIO()
+    dpi = (_DOTS_PER_INCH, _DOTS_PER_INCH)
+    Image.fromarray(strip).save(buffer, format="PNG", optimize=True, dpi=dpi)
+    try:
+        with replacing(path) as temporary:
+            temporary.write_bytes(buffer.getvalue())
+    except OSError as error:
+        raise FileNotWritten(
+            path, error.strerror, then="the same command writes it again"
+        ) from error
+
+
+@dataclass(frozen=True)
+class _Timed:
+    """A picture and its time.
+
+    Attributes:
+        picture: `(height, width, 3) uint8`, all of one size.
+        seconds: None where it is not known.
+    """
+
+    picture: Frame
+    seconds: float | None
+
+
+def _of_trajectory(path: Path, count: int, view: View) -> list[_Timed]:
+    with open_for_rendering(path) as reader:
+        check_has_pictures(reader)
+        warn_of_other_pictures(reader)
+        indices = _spread(reader.frame_count, count, path)
+        times = [caption.time for caption in Captions(reader, indices)]
+    workers = DrawingWorkers(1)
+    try:
+        drawn = list(workers.frames(path, indices, view))
+    finally:
+        workers.close()
+    return [_Timed(*pair) for pair in zip(drawn, times, strict=True)]
+
+
+def _of_video(path: Path, count: int) -> list[_Timed]:
+    if video_kind(path) is None:
+        raise UnreadableFile(
+            path,
+            "it is neither a video (mp4, avi, mkv) nor a trajectory (.h5, .log)",
+        )
+    stream = read_stream(path)
+    indices = _spread(len(stream), count, path)
+    facts = _Facts.beside(path, stream)
+    return [
+        _Timed(facts.cropped(frame), facts.times[index])
+        for frame, index in zip(stream_frames(stream, indices), indices, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What a video's metadata says, or where there are none, its file.
+
+    Attributes:
+        times: of all of its pictures, in seconds.
+        height: of the pictures before a row was added to make them even.
+        width: likewise.
+    """
+
+    times: Sequence[float]
+    height: int
+    width: int
+
+    @classmethod
+    def beside(cls, path: Path, stream: VideoStream) -> _Facts:
+        own = cls([float(t) for t in stream.times], stream.height, stream.width)
+        try:
+            said = read_object(metadata_path(path))
+            height, width = (field(said, key, integer) for key in ("height", "width"))
+            times = _simulated_times(said)
+        except (OSError, ValueError):
+            return own
+        fits = 0 <= stream.height - height <= 1 and 0 <= stream.width - width <= 1
+        if not fits:
+            return own
+        if len(times) != len(stream):
+            times = own.times
+        return cls(times, height, width)
+
+    def cropped(self, frame: Frame) -> Frame:
+        return frame[: self.height, : self.width]
+
+
+def _simulated_times(said: Any) -> Sequence[float]:
+    """Return the simulated time of each picture; none where that is not said."""
+    if said.get("timestep") is None or said.get("first_step") is not None:
+        return []
+    timestep: Fraction = field(said, "timestep", rate)
+    stride = field(said, "stride", integer)
+    count = field(said, "frame_count", integer)
+    runs = field(said, "frame_steps", list_of(list_of(integer)))
+    if stride < 1 or any(len(run) != 2 for run in runs):
+        return []
+    steps = itertools.chain.from_iterable(
+        range(first, last + 1, stride) for first, last in runs
+    )
+    # Never more than there are, whatever the runs say.
+    known = list(itertools.islice(steps, count + 1))
+    return [float(step * timestep) for step in known] if len(known) == count else []
+
+
+def _spread(available: int, count: int, path: Path) -> list[int]:
+    """Return the numbers of pictures spread evenly, the first and the last included.
+
+    Raises:
+        InvalidArgument: there are not so many.
+    """
+    if count > available:
+        raise InvalidArgument(
+            f"{path} has {available} pictures, and {count} were asked for: ask for at "
+            f"most {available} (frames, --frames)."
+        )
+    return [int(index) for index in np.linspace(0, available - 1, count).round()]
+
+
+def _usual_columns(count: int) -> int:
+    rows = math.ceil(count / _MOST_IN_A_ROW)
+    return math.ceil(count / rows)
+
+
+def _check_count(name: str, count: object) -> None:
+    is_whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+    if not is_whole or not 1 <= count <= 10_000:  # type: ignore[operator] # see is_whole
+        raise InvalidArgument(
+            f"{name} must be a whole number from 1 to 10000, got {count!r}."
+        )
+
+
+def _laid_out(pictures: Sequence[_Timed], columns: int) -> Frame:
+    """Return pictures in rows on white paper, the time of each under it."""
+    height, width = pictures[0].picture.shape[:2]
+    columns = min(columns, len(pictures))
+    rows = math.ceil(len(pictures) / columns)
+    gap = max(2, round(_GAP * min(height, width)))
+    letters = round(_LETTERS * min(height, width))
+    letters = max(_SMALLEST_LETTERS, min(_LARGEST_LETTERS, letters))
+    labels = _labels([each.seconds for each in pictures])
+    written = [_written(label, letters, most_width=width) for label in labels]
+    line = max((label.shape[0] for label in written), default=0)
+    cell_height = height + (gap // 2 + line if line else 0)
+    shape = (
+        gap + rows * (cell_height + gap),
+        gap + columns * (width + gap),
+        3,
+    )
+    if shape[0] * shape[1] > _MOST_PIXELS:
+        raise InvalidArgument(
+            f"The strip would have {shape[1]}x{shape[0]} pixels. Ask for fewer or "
+            "smaller pictures (frames, size)."
+        )
+    paper = np.full(shape, _PAPER, np.uint8)
+    for number, each in enumerate(pictures):
+        row, column = divmod(number, columns)
+        top, left = gap + row * (cell_height + gap), gap + column * (width + gap)
+        paper[top : top + height, left : left + width] = each.picture
+        if written[number].size:
+            _put(paper, written[number], top + height + gap // 2, left, width)
+    return paper
+
+
+def _put(
+    paper: Frame, label: NDArray[np.uint8], top: int, left: int, width: int
+) -> None:
+    """Put what is written in the middle under a picture."""
+    left += (width - label.shape[1]) // 2
+    part = paper[top : top + label.shape[0], left : left + label.shape[1]]
+    part[:] = label[:, :, None]
+
+
+def _labels(seconds: Sequence[float | None]) -> list[str]:
+    """Return the times as text, with as many digits as tell them apart."""
+    known = [time for time in seconds if time is not None]
+    steps = [b - a for a, b in itertools.pairwise(known) if b > a]
+    digits = 2
+    while digits < 6 and steps and min(steps) < 2 * 10.0**-digits:
+        digits += 1
+    return ["" if time is None else f"{time:.{digits}f} s" for time in seconds]
+
+
+def _written(label: str, letters: int, *, most_width: int) -> NDArray[np.uint8]:
+    """Return a text, dark on white, no wider than that; nothing where it is empty."""
+    # Here, because it is an extra.
+    from PIL import Image, ImageDraw, ImageFont
+
+    if not label:
+        return np.zeros((0, 0), np.uint8)
+    font = ImageFont.load_default(size=letters)
+    while font.getlength(label) > most_width and letters > 1:
+        letters -= 1
+        font = ImageFont.load_default(size=letters)
+    # Pillow's bitmap font, which it has without FreeType, has no metrics.
+    assert isinstance(font, ImageFont.FreeTypeFont)
+    ascent, descent = font.getmetrics()
+    size = (min(most_width, math.ceil(font.getlength(label))), ascent + descent)
+    image = Image.new("L", size, _PAPER)
+    ImageDraw.Draw(image).text((0, ascent), label, fill=_INK, font=font, anchor="ls")
+    return np.asarray(image).copy()
