@@ -50,7 +50,7 @@ def test_figures_of_a_task_by_hand(tmp_path: Path) -> None:
 
 def test_the_other_way_round_everything_turns(tmp_path: Path) -> None:
     """B - A is not A - B."""
-    values = {WALK: drawn(500, seed=0)}, {WALK: drawn(540, seed=1)}
+    values = {WALK: drawn(500, seed=0)}, {WALK: drawn(600, seed=1)}
     a, b = (
         write_evaluation(tmp_path / n, v) for n, v in zip("ab", values, strict=True)
     )
@@ -62,6 +62,9 @@ def test_the_other_way_round_everything_turns(tmp_path: Path) -> None:
     assert one.scores is not None
     assert other.scores is not None
     assert one.scores.difference == pytest.approx(-other.scores.difference)
+    for scores in (one.scores, other.scores):
+        assert scores.interval is not None
+        assert scores.interval.low < scores.difference < scores.interval.high
 
 
 def test_an_evaluation_is_no_better_than_itself(tmp_path: Path) -> None:
@@ -112,6 +115,15 @@ def test_scores_need_the_same_scale_in_both(tmp_path: Path) -> None:
     )
     assert compare(a, b, bootstrap=QUICK).scores is None
     assert compare(a, a, bootstrap=QUICK).scores is not None
+
+
+@pytest.mark.parametrize("scale", [(5, 5), (9, 1), (0, 1e-320), (-1e308, 1e308)])
+def test_impossible_scales_are_none(scale: tuple[float, float], tmp_path: Path) -> None:
+    """A file may say anything."""
+    a = write_evaluation(
+        tmp_path / "a", {"x": [[1, 2, 3, 4]]}, score_ranges={"x": scale}
+    )
+    assert compare(a, a, bootstrap=QUICK).scores is None
 
 
 def test_pairs_are_of_the_same_seed_and_number(tmp_path: Path) -> None:

@@ -398,7 +398,7 @@ def _compared_scores(
     scores_b: dict[str, FloatArray] = {}
     for task, pair in known.items():
         scale = ranges_a.get(task)
-        if scale is not None and scale == ranges_b.get(task):
+        if scale is not None and scale == ranges_b.get(task) and _is_usable(scale):
             scores_a[task] = scaled(pair.returns_a, scale)
             scores_b[task] = scaled(pair.returns_b, scale)
     if not scores_a:
@@ -414,6 +414,12 @@ def _compared_scores(
             scores_b, scores_a, bootstrap=bootstrap
         ),
     )
+
+
+def _is_usable(scale: tuple[float, float]) -> bool:
+    """Tell whether a range, which comes from a file, leaves returns finite."""
+    low, high = scale
+    return 1 / _LARGEST < high - low < _LARGEST
 
 
 def _score_ranges(results: ReadResults) -> dict[str, tuple[float, float] | None]:
