@@ -233,10 +233,20 @@ def test_not_every_video_of_thousands_has_a_player() -> None:
         for i in range(600)
     ]
     page = page_of(contents(task("a", episodes), videos=videos))
-    assert len(Elements(page).named("video")) == 500
+    assert len(Elements(page).named("video")) == 300
     places = data_of(page)["tasks"][0]["videos"]
     assert places["599"] == ["#video-599"]
     assert places["598"] == ["./598.mp4"]
+
+
+def test_a_video_that_is_no_part_of_the_report_has_no_player() -> None:
+    """But its picture, its notes, and the command that renders it."""
+    page = page_of(contents(videos=[video(file="", notes=["It is too large."])]))
+    elements = Elements(page)
+    assert not elements.named("video")
+    assert [image["src"] for image in elements.named("img")] == ["./videos/a%20b.png"]
+    assert "It is too large." in page
+    assert "mjrec render" in page
 
 
 def test_a_report_of_nothing_is_a_page() -> None:

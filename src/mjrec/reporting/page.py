@@ -43,7 +43,7 @@ _LONGEST_COMMAND: Final = 8000
 # What a browser opens at once: rows of the table of episodes, which are numbers until
 # they are shown, and players and figures, which are elements of the page.
 _MOST_EPISODES: Final = 20_000
-_MOST_PLAYERS: Final = 500
+_MOST_PLAYERS: Final = 300
 _MOST_FIGURES: Final = 120
 _MOST_PROBLEMS: Final = 200
 
@@ -436,7 +436,7 @@ class _Card(NamedTuple):
     task_name: str
     roles: Sequence[str]
     is_video: bool
-    url: _Url
+    url: _Url | None
     poster: _Url | None
     width: int | None
     height: int | None
@@ -471,7 +471,7 @@ def _card(index: int, video: ReportVideo, task: ReportTask) -> _Card:
         task_name=task.name,
         roles=[role for role in _ROLES if role in video.roles],
         is_video=not video.file.endswith(".json"),
-        url=_url(video.file, "video"),
+        url=_url(video.file, "video") if video.file else None,
         poster=None if video.poster is None else _url(video.poster, "image"),
         width=video.width,
         height=video.height,
@@ -555,6 +555,7 @@ def _episodes(contents: ReportContents, cards: Sequence[_Card]) -> dict[str, Any
     places = {
         i: f"#video-{i}" if i in shown else _url(video.file, "video")
         for i, video in enumerate(contents.videos)
+        if i in shown or video.file
     }
     choose = _chooser(contents.tasks)
     return {
@@ -601,7 +602,7 @@ def _columns(
             if i in at
         },
         "videos": {
-            at[i]: [places[video] for video in videos]
+            at[i]: [places[video] for video in videos if video in places]
             for i, videos in sorted(columns.videos.items())
             if i in at
         },
