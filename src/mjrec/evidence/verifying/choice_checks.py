@@ -41,6 +41,8 @@ _BY_NAME: Mapping[str, Schedule] = {
 }
 _WITH_NUMBERS = re.compile(r"every:\d{1,15}|at:\d{1,15}(,\d{1,15}){0,9999}", re.ASCII)
 _KEEP = "keep:"
+# As `evaluation.settling` says it.
+_EVALUATION = "evaluation"
 _RULE = re.compile(r"(best|worst|failures):\d{1,18}|failures|median", re.ASCII)
 
 # Numbers of begun episodes, each of which a schedule is asked about.
@@ -136,6 +138,13 @@ def _check_selection(
     if list(recorded) != _numbers(keep.get("chosen")):
         return _check(
             recording, Verdict.FAIL, "its manifest names two choices of one rule"
+        )
+    if keep.get("scope") == _EVALUATION:
+        return _unknown(
+            recording,
+            f"{rule[:100]} was asked about all episodes of an evaluation, of whichever "
+            "recording, and nothing here says which these were; of this recording it "
+            f"chose {_listed(recorded)}",
         )
     selection = _selection(rule)
     if selection is None:
