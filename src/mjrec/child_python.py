@@ -24,6 +24,7 @@ __all__ = [
     "MOST_OF_STACKS",
     "ask_for_stacks",
     "environment_of_child",
+    "how_it_ended",
     "python_command",
     "said_in",
     "say_stacks_when_asked",
@@ -118,6 +119,16 @@ def stacks_said_in(words: IO[bytes], pid: int) -> str:
 def stacks_in(said: bytes) -> str:
     """Return what a child has said of where it hangs, as text."""
     return said.decode(errors="replace").strip() or "(it does not say)"
+
+
+def how_it_ended(status: int) -> str:
+    """Return in words the exit status of a process, as `subprocess` gives it."""
+    if status >= 0:
+        return f"ended with status {status}"
+    try:
+        return f"was killed by {signal.Signals(-status).name}"
+    except ValueError:
+        return f"was killed by signal {-status}"
 
 
 def said_in(line: bytes) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -13,7 +12,7 @@ import weakref
 from collections.abc import Mapping
 from typing import IO, Any
 
-from ..child_python import python_command, said_in
+from ..child_python import how_it_ended, python_command, said_in
 from ..errors import Error
 
 __all__ = ["WorkerProcess"]
@@ -125,9 +124,7 @@ class WorkerProcess:
         status = self._process.returncode
         if status is None:
             return "lives and is silent"
-        if status < 0:
-            return f"was killed by {_signal_name(-status)}"
-        return f"ended with status {status}"
+        return how_it_ended(status)
 
     def _pass_on_rest(self) -> None:
         for _ in range(_LAST_READS):
@@ -216,10 +213,3 @@ def _to_standard_error(said: bytes) -> None:
         with contextlib.suppress(OSError, ValueError):
             sys.stderr.write(said.decode(errors="replace"))
             sys.stderr.flush()
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"

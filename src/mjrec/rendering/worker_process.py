@@ -7,7 +7,6 @@ import contextlib
 import json
 import os
 import select
-import signal
 import subprocess
 import sys
 import weakref
@@ -18,6 +17,7 @@ from ..child_python import (
     MOST_OF_STACKS,
     ask_for_stacks,
     environment_of_child,
+    how_it_ended,
     python_command,
     said_in,
     stacks_in,
@@ -148,9 +148,7 @@ class WorkerProcess:
         status = self._process.returncode
         if status is None:
             return f"process {self.pid} lives and is silent"
-        if status < 0:
-            return f"process {self.pid} was killed by {_signal_name(-status)}"
-        return f"process {self.pid} ended with status {status}"
+        return f"process {self.pid} {how_it_ended(status)}"
 
     def leave_to_parent(self) -> None:
         """Close a forked child's copies of the pipes, or the worker would not end."""
@@ -189,10 +187,3 @@ def _end(
         process.wait(_SECONDS_TO_DIE)
     for pipe in pipes:
         pipe.close()
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
