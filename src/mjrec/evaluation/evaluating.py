@@ -44,7 +44,7 @@ __all__ = ["evaluate"]
 
 logger = logging.getLogger(__name__)
 
-_WORKER = "mjrec.evaluation.worker:EvaluationWorker"
+_WORKER = "mjrec.evaluation.told_checks:CheckingWorker"
 _LOCK_NAME = ".mjrec.evaluation.lock"
 
 # Sums in another order are other numbers, and how many threads a library takes depends

@@ -16,10 +16,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .. import errors
 from ..carried_errors import unpacked
 from ..engines.work import Job, JobOutcome, Run
-from ..errors import EnvironmentNotMade, Error, PicturesDiffer
+from ..errors import EnvironmentNotMade, PicturesDiffer
 from .episode_results import EpisodeResult
 from .evaluation import EvaluationProgress
 from .kept_episodes import Chosen, KeepRule, keep_rule
@@ -105,7 +104,8 @@ def run_tasks(
 
 def _check(task: str, outcome: JobOutcome, rule: KeepRule) -> None:
     if outcome.failure is not None:
-        raise _named_error(task, outcome.failure)
+        # No error of ours, which would have been told: its worker died, or worse.
+        raise EnvironmentNotMade(task, outcome.failure)
     said = outcome.value or {}
     if "error" in said:
         raise unpacked(said["error"])
@@ -116,14 +116,6 @@ def _check(task: str, outcome: JobOutcome, rule: KeepRule) -> None:
             f"{said.get('reason')} Use keep='cubic', 'all' or 'none' (--keep cubic), "
             "which are known beforehand."
         )
-
-
-def _named_error(task: str, failure: str) -> Error:
-    """Return the error that a job failed with, by the name that stands before it."""
-    name, _, message = failure.partition(": ")
-    if name in errors.__all__:
-        return unpacked({"type": name, "message": message})
-    return EnvironmentNotMade(task, failure)
 
 
 class _Runner:

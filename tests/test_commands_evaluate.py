@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mjrec import commands
+from mjrec.commands.evaluate import evaluate
+
+Run = Callable[..., tuple[int, str, str]]
+
+TASK = "InvertedPendulum-v5"
+POLICIES = """
+import numpy as np
+
+def zero(observation):
+    return np.zeros(1)
+
+def raising(observation):
+    raise RuntimeError("[red]no idea[/]" + chr(27) + "[2J")
+"""
+
+
+@pytest.fixture
+def run(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Run:
+    """Return what runs the command and gives its status and what it said."""
+    (tmp_path / "few_policies.py").write_text(POLICIES)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(commands._COMMANDS, "evaluate", evaluate)
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        small = ["--episodes", "2", "--num-seeds", "1", "--max-steps", "5"]
+        rest = ["--size", "32x32", "--workers", "1", "--out", "e"]
+        status = commands.main(["evaluate", *arguments, *small, *rest])
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return run
+
+
+def test_a_table_says_what_came_of_it(run: Run, tmp_path: Path) -> None:
+    """Each task has a row, and the videos and the directory are named."""
+    status, out, err = run(TASK, "--policy", "few_policies:zero", "--keep", "best")
+    assert status == 0
+    header, row = (
+        line for line in out.splitlines() if line.lstrip().startswith(("task ", TASK))
+    )
+    assert header.split()[0] == "task"
+    assert row.split()[:3] == [TASK, "2", "5"]
+    assert "1 video:" in out
+    assert str(tmp_path / "e") in out
+    assert "2/2 episodes" in err
+
+
+def test_json_is_one_object_and_nothing_else(run: Run) -> None:
+    """For programs; over tasks too."""
+    status, out, err = run(
+        *(TASK, "--policy", "zero", "--keep", "none", "--json"),
+        *("--score-range", f"{TASK}=0:10"),
+    )
+    said = json.loads(out)
+    assert (status, err) == (0, "")
+    (task,) = said["tasks"]
+    assert task["mean"] == 5.0
+    assert said["across"]["iqm"] == 0.5
+    assert (said["episodes"], said["failed"]) == (2, 0)
+
+
+@pytest.mark.parametrize(("least", "status"), [("5", 0), ("5.5", 1)])
+def test_fail_under_fails_below_a_mean(run: Run, least: str, status: int) -> None:
+    """The mean itself is enough."""
+    found, out, _ = run(
+        TASK, "--policy", "zero", "--keep", "none", "--fail-under", f"{TASK}={least}"
+    )
+    assert found == status
+    assert ("its mean return 5 is below 5.5" in out) is bool(status)
+
+
+def test_failed_episodes_fail_the_command(run: Run, tmp_path: Path) -> None:
+    """The results are there, and foreign text moves no cursor and paints nothing."""
+    status, out, _ = run(
+        *(TASK, "--policy", "few_policies:raising", "--keep", "none"),
+        *("--fail-under", f"{TASK}=-1000"),
+    )
+    assert status == 1
+    assert "2 of 2 episodes failed:" in out
+    assert "[red]no idea[/]" in out
+    assert "\x1b[2J" not in out
+    assert f"{TASK} falls short: 2 episodes failed." in out
+    assert (tmp_path / "e" / "results.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["NoSuch-v0"], "no Gymnasium environment 'NoSuch-v0'"),
+        (["dm_control:bench"], "dm_control:benchmarking"),
+        ([TASK, "--fail-under", "Ant-v5=3"], "'Ant-v5'"),
+        ([TASK, "--fail-under", TASK], "TASK=VALUE"),
+        ([TASK, "--fail-under", f"{TASK}=nan"], "TASK=VALUE"),
+        ([TASK, "--score-range", f"{TASK}=3"], "TASK=LOW:HIGH"),
+        ([TASK, "--score-range", f"{TASK}=3:nan"], "counts as 0"),
+        ([TASK, "--seeds", "0,x"], "0,1,2"),
+        ([TASK, "--seeds", "0,1"], "one of them"),
+        ([TASK, "--keep", "bset"], "best:N"),
+        ([TASK, "--env-kwargs", "[]"], "JSON object"),
+        ([TASK, "--policy", "few_policies:one"], "zero"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line(
+    run: Run, tmp_path: Path, arguments: list[str], words: str
+) -> None:
+    """It says what there is, and nothing is run."""
+    if "--policy" not in arguments:
+        arguments = [*arguments, "--policy", "zero"]
+    status, out, err = run(*arguments)
+    lines = [line for line in err.splitlines() if line.startswith("mjrec: ")]
+    assert (status, out, len(lines)) == (1, "", 1)
+    assert words in err
+    assert "Traceback" not in err
+    assert not (tmp_path / "e").exists()
+
+
+def test_ctrl_c_says_how_to_go_on(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exit status is that of an interruption."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mjrec.commands.evaluate.evaluate_policy", interrupted)
+    status, _, err = run(TASK, "--policy", "zero")
+    assert status == 130
+    assert "--resume goes on" in err
+
+
+def test_it_goes_on_with_resume(run: Run, tmp_path: Path) -> None:
+    """Without it the directory is refused."""
+    arguments = [TASK, "--policy", "zero", "--keep", "none"]
+    assert run(*arguments)[0] == 0
+    before = (tmp_path / "e" / "results.csv").read_bytes()
+    status, _, err = run(*arguments)
+    assert status == 1
+    assert "--resume" in err
+    assert run(*arguments, "--resume")[0] == 0
+    assert (tmp_path / "e" / "results.csv").read_bytes() == before

@@ -1,0 +1,515 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import csv
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjrec
+from mjrec import (
+    DifferentEvaluation,
+    DirectoryInUse,
+    InvalidArgument,
+    MissingDependency,
+    PicturesDiffer,
+    PolicyError,
+    UnknownName,
+)
+from mjrec.evaluation.evaluating import evaluate
+from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
+from mjrec.evaluation.results_files import read_results
+from mjrec.formats.locks import try_lock
+from mjrec.formats.video_metadata import metadata_path
+
+PENDULUM = "InvertedPendulum-v5"
+DOUBLE = "InvertedDoublePendulum-v5"
+
+
+def run(directory: Path, **options: Any) -> Evaluation:
+    """Evaluate something small."""
+    small: dict[str, Any] = {
+        "tasks": [PENDULUM],
+        "policy": "random",
+        "episodes": 2,
+        "num_seeds": 2,
+        "workers": 2,
+        "keep": "none",
+        "max_steps": 5,
+        "height": 32,
+        "width": 32,
+    }
+    return evaluate(**{**small, **options}, directory=directory)
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    return {
+        name: (directory / name).read_bytes()
+        for name in ("results.json", "results.csv")
+    }
+
+
+def begun(directory: Path) -> int:
+    """Return how many episodes were begun in all, by the ledgers."""
+    ledgers = directory.glob("*/mjrec.evaluation.*.jsonl")
+    return sum(path.read_text().count('{"begun"') for path in ledgers)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An evaluation by one worker, without videos."""
+    directory = tmp_path_factory.mktemp("evaluations") / "reference"
+    run(directory, tasks=[PENDULUM, DOUBLE], workers=1)
+    return directory
+
+
+def test_every_episode_of_every_task_and_seed_is_there(reference: Path) -> None:
+    """In the order of the plan, each with its trajectory, and all read back."""
+    results = list(read_results(reference))
+    assert [(each.task, *each.unit) for each in results] == [
+        (task, seed, episode)
+        for task in (PENDULUM, DOUBLE)
+        for seed in (0, 1)
+        for episode in (0, 1)
+    ]
+    assert all(each.failure is None and each.length <= 5 for each in results)
+    assert len(list(reference.glob("*/*.h5"))) == 8
+    assert begun(reference) == 8
+
+
+def test_results_do_not_depend_on_the_workers(reference: Path, tmp_path: Path) -> None:
+    """Byte for byte, and neither does the choice."""
+    run(tmp_path / "two", tasks=[PENDULUM, DOUBLE], workers=2)
+    assert contents(tmp_path / "two") == contents(reference)
+
+
+def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
+    """By rule, for each task; table, metadata and report of it agree."""
+    evaluation = run(tmp_path / "e", keep="best,worst")
+    read = read_results(tmp_path / "e")
+    columns = read.columns[PENDULUM]
+    returns = columns.total_reward.tolist()
+    best, worst = read.selection[PENDULUM]
+    assert (best.role, worst.role) == ("best", "worst")
+    assert best.seed * 2 + best.episode == returns.index(max(returns))
+    assert worst.seed * 2 + worst.episode == returns.index(min(returns))
+    assert {path.name for path in evaluation.videos} == {
+        video.name for video in columns.videos.values()
+    }
+    assert evaluation.pending == {}
+    for index, video in columns.videos.items():
+        path = read.folder(PENDULUM) / video.name
+        assert path.stat().st_size > 0
+        assert video.sha256 is not None
+        assert video.sha256 in metadata_path(path).read_text()
+        assert columns.video_prefix(index) == path.stem
+
+
+def test_without_opengl_videos_stay_pending(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The results are there, and how to draw the videos elsewhere is told."""
+    monkeypatch.setenv("MUJOCO_GL", "disabled")
+    evaluation = run(tmp_path / "e", keep="best")
+    assert evaluation.videos == []
+    (path,) = evaluation.pending
+    assert f"mjrec render {path.parent}" in caplog.text
+    columns = read_results(tmp_path / "e").columns[PENDULUM]
+    assert [(v.name, v.sha256) for v in columns.videos.values()] == [(path.name, None)]
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    # Whoever goes on draws what is left.
+    assert run(tmp_path / "e", keep="best", resume=True).videos == [path]
+
+
+def test_progress_is_told(tmp_path: Path) -> None:
+    """Up to the end, and never backwards."""
+    told: list[EvaluationProgress] = []
+    run(tmp_path / "e", keep="best", on_progress=told.append)
+    assert [each.done for each in told] == sorted(each.done for each in told)
+    assert told[-1].done == told[-1].total == 4
+    assert (told[-1].videos_done, told[-1].videos) == (1, 1)
+    assert told[-1].failed == 0
+
+
+def raising(observation: Any) -> Any:
+    raise RuntimeError("out of ideas")
+
+
+class Faulty:
+    """Fails in its own way in episodes that begin to the right."""
+
+    def __init__(self, env: Any) -> None:
+        self.shape = env.action_space.shape
+
+    def __call__(self, observation: Any) -> Any:
+        if observation[0] > 0:
+            return np.full(self.shape, np.nan)
+        return np.zeros(self.shape)
+
+
+class Misshapen(Faulty):
+    def __call__(self, observation: Any) -> Any:
+        return np.zeros(self.shape if observation[0] > 0 else (7,))
+
+
+def local(kind: Any) -> Any:
+    """Return a class or function that is not found by its name, but sent whole."""
+    kind.__module__ = "__main__"
+    return kind
+
+
+@pytest.mark.parametrize(
+    ("policy", "reason"),
+    [(Faulty, "nan"), (Misshapen, "must give an action of box(-3.0")],
+)
+def test_a_faulty_policy_fails_its_episodes_only(
+    tmp_path: Path, policy: Any, reason: str
+) -> None:
+    """The others go on, and both are in the table."""
+    evaluation = run(tmp_path / "e", policy=local(policy), episodes=4)
+    failed = evaluation.failed
+    assert 0 < len(failed) < len(evaluation.results) == 8
+    (summary,) = evaluation.summaries
+    assert (summary.failed, summary.episodes) == (len(failed), 8 - len(failed))
+    with (tmp_path / "e" / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [bool(row["failure"]) for row in rows] == [
+        each.failure is not None for each in evaluation.results
+    ]
+    assert all(reason in str(each.failure).lower() for each in failed)
+
+
+def test_a_policy_that_always_raises_leaves_results(tmp_path: Path) -> None:
+    """They say so; there is no mean."""
+    evaluation = run(tmp_path / "e", policy=local(raising), keep="best,failures:1")
+    assert all("out of ideas" in str(each.failure) for each in evaluation.results)
+    assert evaluation.summary(PENDULUM).mean is None
+    assert [each.failure for each in read_results(tmp_path / "e")] == [
+        each.failure for each in evaluation.results
+    ]
+
+
+class DiesOnce:
+    """Kills its worker, the first time that anybody builds it twice."""
+
+    def __init__(self, env: Any) -> None:
+        self.shape = env.action_space.shape
+
+    def __call__(self, observation: Any) -> Any:
+        import os
+        import pathlib
+
+        mark = pathlib.Path(os.environ["MJREC_TEST_MARK"])
+        if not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), 9)
+        return np.zeros(self.shape)
+
+
+class DiesAlways(DiesOnce):
+    def __call__(self, observation: Any) -> Any:
+        import os
+
+        if observation[0] > 0:
+            os.kill(os.getpid(), 9)
+        return np.zeros(self.shape)
+
+
+def test_a_worker_that_dies_once_costs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its job is begun again, and the results are as if it had lived."""
+    monkeypatch.setenv("MJREC_TEST_MARK", str(tmp_path / "mark"))
+    died = run(tmp_path / "died", policy=local(DiesOnce), keep="best")
+    assert "A worker died" in caplog.text
+    lived = run(tmp_path / "lived", policy=local(DiesOnce), keep="best")
+    assert died.failed == []
+    assert contents(tmp_path / "died") == contents(tmp_path / "lived")
+    assert len(died.videos) == len(lived.videos) == 1
+
+
+def test_an_episode_that_kills_its_workers_has_failed(tmp_path: Path) -> None:
+    """The rest is there, and the reason is told."""
+    evaluation = run(
+        tmp_path / "e", policy=local(DiesAlways), episodes=3, num_seeds=1, workers=1
+    )
+    assert evaluation.failed
+    assert any(each.failure is None for each in evaluation.results)
+    assert all("died" in str(each.failure) for each in evaluation.failed)
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+import test_evaluating
+test_evaluating.run(
+    Path(sys.argv[1]), tasks=[test_evaluating.PENDULUM, test_evaluating.DOUBLE],
+    policy="slow_policy:Slow", episodes=6, keep="best", resume="resume" in sys.argv,
+    workers=int(sys.argv[2]),
+)
+"""
+SLOW = """
+import time
+import numpy as np
+
+class Slow:
+    def __init__(self, env):
+        self.shape = env.action_space.shape
+    def __call__(self, observation):
+        time.sleep(0.03)
+        return np.sin(100 * observation[:1])
+"""
+
+
+def slow_run(place: Path, name: str, *arguments: str) -> subprocess.Popen[bytes]:
+    (place / "slow_policy.py").write_text(SLOW)
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(place / name), *arguments],
+        cwd=place,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        start_new_session=True,
+    )
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def ended(directory: Path) -> int:
+    ledgers = directory.glob("*/mjrec.evaluation.*.jsonl")
+    return sum(path.read_bytes().count(b'{"ended"') for path in ledgers)
+
+
+def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path) -> None:
+    """SIGKILL of the one who hands out: the same bytes, and nothing is repeated."""
+    killed = tmp_path / "killed"
+    process = slow_run(tmp_path, "killed", "2")
+    wait_until(lambda: ended(killed) >= 5)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (killed / "results.json").exists()
+    assert slow_run(tmp_path, "killed", "2", "resume").wait() == 0
+    assert slow_run(tmp_path, "whole", "1").wait() == 0
+    assert contents(killed) == contents(tmp_path / "whole")
+    # Each once; those that the two workers were at, once more at most.
+    assert 24 <= begun(killed) <= 26
+    assert ended(killed) == 24
+
+
+def test_what_is_interrupted_stays_to_be_resumed(tmp_path: Path) -> None:
+    """Ctrl-C, or what else is raised, ends the workers and comes out."""
+
+    def interrupt(progress: EvaluationProgress) -> None:
+        if progress.done >= 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "e", episodes=30, on_progress=interrupt)
+    before = ended(tmp_path / "e")
+    assert 2 <= before < 60
+    assert len(run(tmp_path / "e", episodes=30, resume=True).results) == 60
+    assert ended(tmp_path / "e") == 60
+
+
+def test_more_may_be_asked_for(reference: Path, tmp_path: Path) -> None:
+    """More tasks, seeds and episodes; what was done is not done again."""
+    run(tmp_path / "e", episodes=1)
+    run(tmp_path / "e", tasks=[PENDULUM, DOUBLE], resume=True)
+    assert begun(tmp_path / "e") == 8
+    assert contents(tmp_path / "e") == contents(reference)
+
+
+def test_nothing_is_run_when_all_is_done(reference: Path, tmp_path: Path) -> None:
+    """The results are written again, the same."""
+    run(tmp_path / "e", tasks=[PENDULUM, DOUBLE], resume=True)
+    before = contents(tmp_path / "e")
+    (tmp_path / "e" / "results.json").unlink()
+    run(tmp_path / "e", tasks=[PENDULUM, DOUBLE], resume=True)
+    assert contents(tmp_path / "e") == before == contents(reference)
+    assert begun(tmp_path / "e") == 8
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"policy": "zero"}, "policy was 'random' and is now 'zero'"),
+        ({"max_steps": 6}, "max_steps was 5"),
+        ({"keep": "all"}, "keep was 'none'"),
+        ({"protocol": "suite"}, "protocol"),
+        ({"env_kwargs": {"reset_noise_scale": 0.1}}, "env_kwargs"),
+    ],
+)
+def test_another_evaluation_is_not_gone_on_with(
+    reference: Path, options: Mapping[str, Any], what: str
+) -> None:
+    """The differences are told, and nothing is changed."""
+    before = contents(reference)
+    with pytest.raises(DifferentEvaluation, match=what):
+        run(reference, tasks=[PENDULUM, DOUBLE], resume=True, **options)
+    assert contents(reference) == before
+
+
+def test_a_directory_belongs_to_one_evaluation(reference: Path, tmp_path: Path) -> None:
+    """It is not begun over another, nor over anything else, nor while one is at it."""
+    with pytest.raises(InvalidArgument, match="resume=True"):
+        run(reference)
+    (tmp_path / "notes.txt").touch()
+    for resume in (False, True):
+        with pytest.raises(InvalidArgument, match=r"notes\.txt"):
+            run(tmp_path, resume=resume)
+    lock = try_lock(reference / ".mjrec.evaluation.lock", "")
+    assert lock is not None
+    with pytest.raises(DirectoryInUse):
+        run(reference, tasks=[PENDULUM, DOUBLE], resume=True)
+    lock.release()
+
+
+WRONG: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"tasks": ["HalfChetah-v5"]}, UnknownName, "HalfCheetah-v5"),
+    ({"tasks": ["dm_control:bench"]}, UnknownName, "dm_control:benchmarking"),
+    ({"tasks": []}, InvalidArgument, "needs a task"),
+    ({"policy": "no_such_module:x"}, UnknownName, "no_such_module"),
+    ({"policy": "broken_policy:x"}, PolicyError, "name 'undefined' is not defined"),
+    ({"policy": 3}, PolicyError, "neither can be called"),
+    ({"policy": lambda o, f=sys.stdout: f}, PolicyError, "module:name"),
+    ({"episodes": 0}, InvalidArgument, "episodes"),
+    ({"seeds": [1, 1], "num_seeds": None}, InvalidArgument, "each once"),
+    ({"seeds": [-1], "num_seeds": None}, InvalidArgument, "seed"),
+    ({"seeds": [1], "num_seeds": 2}, InvalidArgument, "one of them"),
+    ({"workers": 0}, InvalidArgument, "workers"),
+    ({"keep": "bset"}, UnknownName, "best:N"),
+    ({"protocol": "seed"}, UnknownName, "suite"),
+    ({"quality": "low"}, UnknownName, "draft"),
+    ({"height": 0}, InvalidArgument, "height"),
+    ({"max_fps": -1}, InvalidArgument, "max_fps"),
+    ({"env_kwargs": {"f": print}}, InvalidArgument, "JSON"),
+    ({"env_kwargs": {"no_such": 1}}, mjrec.EnvironmentNotMade, "no_such"),
+    ({"score_ranges": {"Ant-v5": (0, 1)}}, UnknownName, PENDULUM),
+    ({"score_ranges": {PENDULUM: (1, 1)}}, InvalidArgument, "higher"),
+]
+
+
+@pytest.mark.parametrize(("options", "kind", "words"), WRONG)
+def test_what_cannot_be_is_told_before_anything_is_written(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: dict[str, Any],
+    kind: type[Exception],
+    words: str,
+) -> None:
+    """As the error that it is, with a way out."""
+    (tmp_path / "broken_policy.py").write_text("undefined\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(kind, match=words):
+        run(tmp_path / "e", **options)
+    assert not (tmp_path / "e").exists()
+
+
+def test_without_scipy_nothing_is_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The line for pip is told, before hours of work and not after."""
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name: None if name == "scipy" else find(name),
+    )
+    with pytest.raises(MissingDependency, match=r"mjrec\[evaluation\]"):
+        run(tmp_path / "e")
+    assert not (tmp_path / "e").exists()
+
+
+FLAT_WORLD = """
+import gymnasium
+import numpy as np
+
+class FlatWorld(gymnasium.Env):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    observation_space = gymnasium.spaces.Box(0, 1, (1,))
+    action_space = gymnasium.spaces.Discrete(2)
+    render_mode = "rgb_array"
+
+    def __init__(self, render_mode=None):
+        pass
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), float(action), False, False, {}
+
+    def render(self):
+        return self.np_random.integers(255, size=(32, 32, 3), dtype=np.uint8)
+
+gymnasium.register("FlatWorld-v0", FlatWorld)
+"""
+
+
+def test_pictures_that_are_live_cannot_be_chosen_by_returns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is known beforehand can, and is drawn while it runs."""
+    (tmp_path / "flat_world.py").write_text(FLAT_WORLD)
+    monkeypatch.chdir(tmp_path)
+    live: dict[str, Any] = {
+        "tasks": ["flat_world:FlatWorld-v0"],
+        "height": None,
+        "width": None,
+        "num_seeds": 1,
+    }
+    with pytest.raises(PicturesDiffer, match="keep='cubic'"):
+        run(tmp_path / "e", **live, keep="best")
+    assert not (tmp_path / "e").exists()
+    evaluation = run(tmp_path / "e", **live, keep="all")
+    assert evaluation.pending == {}
+    assert len(evaluation.videos) == 2
+    assert evaluation.plan.tasks[0].folder == "flat_world%3AFlatWorld-v0"
+
+
+@pytest.mark.dm_control
+def test_the_suite_has_a_scale_and_its_own_protocol(tmp_path: Path) -> None:
+    """One stream for each task and seed; returns over steps are scores."""
+    options: dict[str, Any] = {
+        "tasks": ["dm_control/cartpole-swingup", "dm_control/pendulum-swingup"],
+        "protocol": "suite",
+        "keep": "median",
+    }
+    evaluation = run(tmp_path / "e", **options)
+    assert [each.score_range for each in evaluation.summaries] == [(0.0, 5.0)] * 2
+    assert evaluation.across.iqm is not None
+    assert len(evaluation.videos) == 2
+    first, second = evaluation.results[:2]
+    assert first.total_reward != second.total_reward
+    with pytest.raises(DifferentEvaluation, match="episodes"):
+        run(tmp_path / "e", **options, episodes=3, resume=True)
+
+
+def test_the_process_that_hands_out_loads_no_simulator(tmp_path: Path) -> None:
+    """It needs no OpenGL, and a policy's memory is the workers'."""
+    code = (
+        "import sys; from pathlib import Path; import test_evaluating\n"
+        "test_evaluating.run(Path(sys.argv[1]))\n"
+        "print([m for m in ('mujoco', 'OpenGL', 'dm_control') if m in sys.modules])"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "e")],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert said.stdout.strip() == "[]"
