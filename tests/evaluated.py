@@ -40,7 +40,7 @@ def worker_of(
 
 
 def run_job(plan: EvaluationPlan, seed: int, *episodes: int) -> dict[str, Any]:
-    """Return the job of a batch of the plan's task; of all episodes, if none is named."""
+    """Return the job of a batch; of all episodes of the plan, if none is named."""
     return {
         "kind": "run",
         "task": plan.tasks[0].name,

@@ -14,13 +14,13 @@ import cloudpickle
 import gymnasium
 import numpy as np
 import pytest
-from evaluated import FOLDER, PENDULUM, facts_of, plan_of, run_job, states_of, worker_of
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from gymnasium.envs.registration import registry
 from recordings import videos_in
 
 import mjrec
 from conftest import Corridor
+from evaluated import FOLDER, PENDULUM, facts_of, plan_of, run_job, states_of, worker_of
 from mjrec.environments.episode_seeds import episode_seeds
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.ledger import read_ledgers

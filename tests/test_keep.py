@@ -23,6 +23,7 @@ import mjrec
 from conftest import Corridor
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder import kept_videos
+from mjrec.recorder.selection import UNDECIDED
 from mjrec.recorder.tracking import FinishedVideo, Tracker
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.pending import recorded_episodes
@@ -636,3 +637,36 @@ def test_nothing_was_finished(tmp_path: Path) -> None:
         "finished": 0,
         "most_bytes_held": 0,
     }
+
+
+def test_what_is_decided_elsewhere_is_left_without_a_word(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Also what was not completed: whoever chooses may want failures."""
+    env = pendulum(RETURNS[:2])
+    with caplog.at_level(logging.WARNING):
+        monitor = mjrec.Monitor(
+            env, tmp_path, keep=UNDECIDED, mode="evaluation", workers=0
+        )
+        with monitor:
+            play_one(monitor)
+            monitor.reset(seed=1)
+            monitor.step(monitor.action_space.sample())
+    assert caplog.text == ""
+    logs = sorted(tmp_path.glob("*.log"))
+    assert len(logs) == 2
+    for log, complete in zip(logs, (True, False), strict=True):
+        with open_trajectory(log) as reader:
+            facts = reader.header.facts
+        assert (facts["candidate"], facts["complete"]) == (True, complete)
+    keep = manifest_of(tmp_path)["mjrec"]["keep"]
+    assert (keep["decided"], keep["left_open"], keep["chosen"]) == (False, True, [])
+
+
+def play_one(env: Any) -> None:
+    """Run one episode."""
+    env.reset(seed=0)
+    done = False
+    while not done:
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        done = terminated or truncated

@@ -13,7 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mjrec.errors import InvalidArgument, UnknownName
-from mjrec.recorder.selection import Selection, Standing, selection_from
+from mjrec.recorder.selection import (
+    UNDECIDED,
+    Selection,
+    Standing,
+    selection_from,
+)
 from mjrec.recorder.tracking import FinishedEpisode
 
 
@@ -267,3 +272,20 @@ def test_what_is_neither_text_nor_function(keep: Any) -> None:
     """Is an error that lists the rules."""
     with pytest.raises(InvalidArgument, match="must be one of best:N"):
         selection_from(keep)
+
+
+def test_what_is_decided_elsewhere_stays_open() -> None:
+    """All are candidates, also when there are no more."""
+    episodes = [episode(number, float(number)) for number in range(3)]
+    selection = told(UNDECIDED, episodes)
+    selection.close()
+    assert selection.is_left_open
+    assert selection.undecided == 3
+    assert {selection.standing(n) for n in range(3)} == {Standing.CANDIDATE}
+    assert selection.chosen == []
+
+
+def test_no_text_of_a_users_leaves_it_open() -> None:
+    """Whoever gives a rule gets a decision."""
+    with pytest.raises(UnknownName):
+        selection_from("undecided")
