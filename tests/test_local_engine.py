@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from interruption import ctrl_c_soon
 from processes import children
 
 import mjrec
@@ -497,6 +498,16 @@ def test_cancelling_while_results_come(tmp_path: Path) -> None:
         assert number < 3
         if number == 2:
             run.cancel()
+
+
+def test_ctrl_c_while_results_come(tmp_path: Path) -> None:
+    """It is raised at once, and leaving `with` closes what the workers are at."""
+    run = begun(closed=str(tmp_path / "closed"))
+    submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
+    pid = wait_for(tmp_path / "begun", run)
+    with pytest.raises(KeyboardInterrupt), run, ctrl_c_soon():
+        outcomes(run)
+    assert lines(tmp_path / "closed") == [str(pid)]
 
 
 def test_a_job_that_takes_no_notice_is_killed(
