@@ -46,6 +46,10 @@ from .errors import (
 )
 
 if TYPE_CHECKING:
+    from .evaluation.comparing import Comparison as Comparison
+    from .evaluation.comparing import compare as compare
+    from .evaluation.evaluating import evaluate as evaluate
+    from .evaluation.evaluation import Evaluation as Evaluation
     from .evidence.packing import pack as pack
     from .evidence.verification import Check as Check
     from .evidence.verification import Verification as Verification
@@ -64,6 +68,8 @@ if TYPE_CHECKING:
     from .recovery import recover as recover
     from .rendering.pictures import render as render
     from .rendering.pictures import render_states as render_states
+    from .reporting.film_strip import film_strip as film_strip
+    from .reporting.report_folder import write_report as write_report
     from .results import Episode as Episode
     from .results import clear_monitor_files as clear_monitor_files
     from .results import detect_monitor_files as detect_monitor_files
@@ -80,8 +86,10 @@ if TYPE_CHECKING:
 
 _LAZY = {
     "Check": "evidence.verification",
+    "Comparison": "evaluation.comparing",
     "DmEnvMonitor": "monitors.dm_env_monitor",
     "Episode": "results",
+    "Evaluation": "evaluation.evaluation",
     "GymnasiumMonitor": "monitors.gymnasium_monitor",
     "Monitor": "monitors",
     "Recovery": "recovery",
@@ -94,10 +102,13 @@ _LAZY = {
     "VideoWriter": "formats.video_writer",
     "capped_cubic_video_schedule": "schedules",
     "clear_monitor_files": "results",
+    "compare": "evaluation.comparing",
     "detect_monitor_files": "results",
     "detect_training_manifests": "results",
     "disable_videos": "schedules",
+    "evaluate": "evaluation.evaluating",
     "exit_on_signals": "signals",
+    "film_strip": "reporting.film_strip",
     "iter_episodes": "results",
     "load_results": "results",
     "load_trajectory": "simulation.trajectories",
@@ -110,6 +121,7 @@ _LAZY = {
     "use_gl": "gl",
     "verify": "evidence.verifying",
     "write_archive": "formats.archive",
+    "write_report": "reporting.report_folder",
 }
 
 # What can be had without any extra, so that `from mjrec import *` works there too;
@@ -120,6 +132,7 @@ __all__ = [
     "BlankVideo",
     "Check",
     "ClosedError",
+    "Comparison",
     "DifferentEnvironment",
     "DifferentEvaluation",
     "DirectoryInUse",
@@ -128,6 +141,7 @@ __all__ = [
     "EnvironmentNotMade",
     "Episode",
     "Error",
+    "Evaluation",
     "ExistingRecordings",
     "FileNotWritten",
     "FrameCountError",
@@ -161,10 +175,13 @@ __all__ = [
     "VideoWriter",
     "capped_cubic_video_schedule",
     "clear_monitor_files",
+    "compare",
     "detect_monitor_files",
     "detect_training_manifests",
     "disable_videos",
+    "evaluate",
     "exit_on_signals",
+    "film_strip",
     "iter_episodes",
     "load_results",
     "load_trajectory",
@@ -177,6 +194,7 @@ __all__ = [
     "use_gl",
     "verify",
     "write_archive",
+    "write_report",
 ]
 
 

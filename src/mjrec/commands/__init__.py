@@ -13,12 +13,16 @@ import tyro
 
 from ..errors import Error
 from ..signals import exiting_on_signals
+from .compare import compare
 from .doctor import doctor
+from .evaluate import evaluate
 from .list_episodes import list_episodes
 from .pack import pack
 from .record import record
 from .recover import recover
 from .render import render
+from .report import report
+from .strip import strip
 from .verify import verify
 
 __all__ = ["main"]
@@ -28,6 +32,10 @@ _COMMANDS: dict[str, Callable[..., int]] = {
     "render": render,
     "recover": recover,
     "list": list_episodes,
+    "strip": strip,
+    "evaluate": evaluate,
+    "compare": compare,
+    "report": report,
     "pack": pack,
     "verify": verify,
     "doctor": doctor,
