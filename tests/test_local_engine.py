@@ -550,8 +550,8 @@ def test_fifty_runs_leave_nothing_open() -> None:
     """No descriptor, and no process."""
 
     def once() -> None:
-        with begun(2) as run:
-            submit(run, "a", "b", do="echo")
+        with begun() as run:
+            submit(run, "a", do="echo")
             outcomes(run)
 
     once()
