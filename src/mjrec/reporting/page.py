@@ -451,13 +451,21 @@ class _Card(NamedTuple):
 
 
 def _cards(contents: ReportContents) -> tuple[list[_Card], int]:
-    """Return the cards of the videos that are shown, and how many those are."""
+    """Return the cards of the videos that are shown, and how many those are.
+
+    For each task the best comes first, then the median, the worst, and the others.
+    """
     videos = list(enumerate(contents.videos))
     if len(videos) > _MOST_PLAYERS:
-        first = sorted(videos, key=lambda pair: not pair[1].roles)[:_MOST_PLAYERS]
-        videos = sorted(first, key=lambda pair: pair[0])
+        videos = sorted(videos, key=lambda pair: not pair[1].roles)[:_MOST_PLAYERS]
+    videos.sort(key=lambda pair: (pair[1].task, _place_of_roles(pair[1]), pair[0]))
     cards = [_card(i, video, contents.tasks[video.task]) for i, video in videos]
     return cards, len(cards)
+
+
+def _place_of_roles(video: ReportVideo) -> int:
+    known = [_ROLES.index(role) for role in video.roles if role in _ROLES]
+    return min(known, default=len(_ROLES))
 
 
 def _card(index: int, video: ReportVideo, task: ReportTask) -> _Card:
