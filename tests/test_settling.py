@@ -187,6 +187,8 @@ def test_a_video_that_somebody_has_rendered_meanwhile_stays(folder: Path) -> Non
     assert other.episode_id in details["schedule"]["recorded"]
     assert other.episode_id not in [each["episode_id"] for each in details["pending"]]
     assert videos_in(folder) == [other.episode_id]
+    name = f"openaigym.manifest.{other.infix}.manifest.json"
+    assert len(json.loads((folder / name).read_text())["videos"]) == 1
 
 
 def _is_not(key: Any, best: EpisodeResult) -> bool:

@@ -128,8 +128,6 @@ def run_batch(evaluation: Evaluation, batch: Batch) -> int:
     whole = evaluation.plan.protocol == SUITE
     done = read_ledgers(evaluation.directory / batch.folder)
     left = [n for n in batch.episodes if (batch.seed, n) not in done]
-    if whole and left:
-        left = list(batch.episodes)
     if left:
         left_of_it = dataclasses.replace(batch, episodes=tuple(left))
         _BatchRun(evaluation, left_of_it, whole=whole).run()

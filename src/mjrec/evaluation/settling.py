@@ -37,7 +37,6 @@ from ..formats.pending_videos import pending_video
 from ..formats.trajectory_file import amend_trajectory
 from ..formats.trajectory_log_facts import append_facts
 from ..formats.video_metadata import is_done
-from ..recovery import recover
 from ..rendering.log_finishing import finish_log
 from ..rendering.pending import EpisodeKey, claim, recorded_episodes
 from ..rendering.recorded_facts import open_for_rendering
@@ -66,7 +65,7 @@ def settle(
 ) -> None:
     """Settle all monitors of a task that are closed.
 
-    What killed workers have left is put in order first.
+    `recover` comes before it, for what killed workers have left.
 
     Args:
         folder: the monitor directory.
@@ -75,9 +74,8 @@ def settle(
         rule: by which they were.
 
     Raises:
-        Error: see `settle_monitor`, and `mjrec.recover`.
+        Error: see `settle_monitor`.
     """
-    recover(folder)
     for infix in unsettled_monitors(folder):
         own = {number: facts for (of, number), facts in chosen.items() if of == infix}
         settle_monitor(folder, infix, own, rule=rule)
