@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import contextlib
 import csv
 import importlib.util
 import os
@@ -118,14 +119,16 @@ def test_without_opengl_videos_stay_pending(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The results are there, and how to draw the videos elsewhere is told."""
-    monkeypatch.setenv("MUJOCO_GL", "disabled")
+    # It needs a display, and there is none.
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    monkeypatch.delenv("DISPLAY", raising=False)
     evaluation = run(tmp_path / "e", keep="best")
     assert evaluation.videos == []
     (path,) = evaluation.pending
     assert f"mjrec render {path.parent}" in caplog.text
     columns = read_results(tmp_path / "e").columns[PENDULUM]
     assert [(v.name, v.sha256) for v in columns.videos.values()] == [(path.name, None)]
-    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.undo()
     # Whoever goes on draws what is left.
     assert run(tmp_path / "e", keep="best", resume=True).videos == [path]
 
@@ -292,20 +295,42 @@ def ended(directory: Path) -> int:
     return sum(path.read_bytes().count(b'{"ended"') for path in ledgers)
 
 
-def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path) -> None:
-    """SIGKILL of the one who hands out: the same bytes, and nothing is repeated."""
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the script gives when nobody kills it."""
+    place = tmp_path_factory.mktemp("whole")
+    assert slow_run(place, "whole", "1").wait() == 0
+    return place / "whole"
+
+
+def kill_with_workers(process: subprocess.Popen[bytes]) -> None:
+    tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
+    workers = [int(pid) for path in tasks for pid in path.read_text().split()]
+    for pid in (process.pid, *workers):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    process.wait()
+
+
+@pytest.mark.parametrize("moment", ["running", "drawing"])
+def test_a_killed_evaluation_goes_on_where_it_was(
+    whole: Path, tmp_path: Path, moment: str
+) -> None:
+    """SIGKILL of all its processes: the same bytes, and nothing is repeated."""
     killed = tmp_path / "killed"
     process = slow_run(tmp_path, "killed", "2")
-    wait_until(lambda: ended(killed) >= 5)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert not (killed / "results.json").exists()
+    if moment == "running":
+        wait_until(lambda: ended(killed) >= 5)
+    else:
+        wait_until((killed / "results.json").exists)
+    kill_with_workers(process)
+    assert (killed / "results.json").exists() is (moment == "drawing")
     assert slow_run(tmp_path, "killed", "2", "resume").wait() == 0
-    assert slow_run(tmp_path, "whole", "1").wait() == 0
-    assert contents(killed) == contents(tmp_path / "whole")
-    # Each once; those that the two workers were at, once more at most.
+    assert contents(killed) == contents(whole)
+    # Each once; those that the two workers were at, once more.
     assert 24 <= begun(killed) <= 26
     assert ended(killed) == 24
+    assert len(list(killed.glob("*/*.mp4"))) == 2
 
 
 def test_what_is_interrupted_stays_to_be_resumed(tmp_path: Path) -> None:

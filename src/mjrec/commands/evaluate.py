@@ -340,12 +340,24 @@ def _across_lines(evaluation: Evaluation) -> list[str]:
     across = evaluation.across
     if len(across.tasks) < 2:
         return []
+    figures = ", ".join(
+        [
+            _figure("IQM", across.iqm, across.iqm_interval),
+            _figure("mean", across.mean, None),
+            _figure("median", across.median, None),
+            _figure(
+                "optimality gap",
+                across.optimality_gap,
+                across.optimality_gap_interval,
+            ),
+        ]
+    )
     return [
-        f"Over {_count(len(across.tasks), 'task')}, as scores from 0 to 1: "
-        f"IQM {_number(across.iqm)} {_interval(across.iqm_interval)}, "
-        f"mean {_number(across.mean)}, median {_number(across.median)}, "
-        f"optimality gap {_number(across.optimality_gap)} "
-        f"{_interval(across.optimality_gap_interval)}"
+        f"Over {_count(len(across.tasks), 'task')}, as scores from 0 to 1: {figures}",
+        *(
+            f"  without {task}: {_printable(reason)}"
+            for task, reason in across.left_out.items()
+        ),
     ]
 
 
@@ -399,6 +411,10 @@ def _fields(evaluation: Evaluation, short: Sequence[_Shortfall]) -> dict[str, An
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.4g}"
+
+
+def _figure(name: str, value: float | None, interval: Interval | None) -> str:
+    return " ".join(filter(None, [name, _number(value), _interval(interval)]))
 
 
 def _interval(interval: Interval | None) -> str:
