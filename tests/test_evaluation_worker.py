@@ -158,6 +158,11 @@ def test_a_random_stream_that_was_cut_is_begun_again(tmp_path: Path) -> None:
     assert [*map(outcome, again.values())] == [*map(outcome, whole.values())]
 
 
+def _first_state(directory: Path, result: EpisodeResult) -> bytes:
+    states = states_of(directory / FOLDER, result.monitor, result.episode_id)
+    return bytes(states[0].tobytes())
+
+
 class Stumbling:
     """Pushes gently; raises, or gives nonsense, in the third step of an episode."""
 
@@ -207,6 +212,9 @@ def test_a_policy_that_fails_loses_its_episode_only(
     assert "\n" not in failed.failure
     assert (failed.total_reward, failed.terminated, failed.length) == (None, None, 2)
     assert [results[0, n].failure for n in (0, 2)] == [None, None]
+    # What comes after it is not the beginning once more.
+    begun = [_first_state(tmp_path, results[0, n]) for n in range(3)]
+    assert len(set(begun)) == 3
     path = f"*.{failed.monitor}.episode{failed.episode_id:06d}.log"
     [trajectory] = (tmp_path / FOLDER).glob(path)
     facts = facts_of(trajectory)
