@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a report costs, beside loading the results that it shows."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import mjrec
+from mjrec.formats.journal import JournalEntry, JournalWriter
+from mjrec.reporting.gathering import gather
+from mjrec.reporting.media_files import ReportProgress
+
+from .children import call
+from .results import Reference, Result, at_most
+from .rounds import Say, take_turns
+
+__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure"]
+
+TITLE = "Reporting: a training of many episodes on a page"
+
+_LOADED, _WRITTEN, _OPENED = "results loaded", "report written", "page opened"
+_WRITING_PROMISE = at_most(3)
+# What a person takes for at once.
+_OPENING_PROMISE = at_most(300)
+_MEMORY_PROMISE = at_most(500)
+
+_CHROMIUM = "/usr/bin/chromium"
+_STEPS = 2
+_SIZE = 64
+_PEAK = re.compile(r"^VmHWM:\s+(\d+) kB$", re.MULTILINE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How much is measured.
+
+    Attributes:
+        rounds: of all variants.
+        episodes: that a report shows.
+        videos: of them.
+        many_episodes: that are loaded, for their memory.
+    """
+
+    rounds: int = 5
+    episodes: int = 10_000
+    videos: int = 100
+    many_episodes: int = 1_000_000
+
+
+FULL = Settings()
+QUICK = Settings(rounds=3, episodes=2000, videos=20, many_episodes=100_000)
+
+
+def measure(settings: Settings, say: Say) -> list[Result]:
+    """Return how long it takes to load results, to show them and to open the page."""
+    with tempfile.TemporaryDirectory() as place:
+        recordings, many = Path(place) / "recordings", Path(place) / "many"
+        say(f"recording {settings.episodes} episodes")
+        call(
+            record,
+            directory=str(recordings),
+            episodes=settings.episodes,
+            videos=settings.videos,
+        )
+        say(f"writing a journal of {settings.many_episodes} episodes")
+        write_journal(many, settings.many_episodes)
+        samples = take_turns(
+            _variants(recordings, many, Path(place) / "report"),
+            rounds=settings.rounds,
+            say=say,
+        )
+    return _results(samples, settings)
+
+
+class _Flicker(gymnasium.Env[Any, Any]):
+    """Costs nothing to step, and shows something else each time."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  # Gymnasium's
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    render_mode = "rgb_array"
+
+    def __init__(self) -> None:
+        self._step = 0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self._step = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self._step += 1
+        reward = float(self.np_random.normal())
+        ended = self._step >= _STEPS
+        return np.zeros(1, np.float32), reward, False, ended, {}
+
+    def render(self) -> Any:
+        return np.full((_SIZE, _SIZE, 3), 40 * self._step, np.uint8)
+
+
+def record(directory: str, episodes: int, videos: int) -> None:
+    """Record a training."""
+    every = max(1, episodes // videos)
+    monitor: Any = mjrec.Monitor(_Flicker(), directory, lambda n: n % every == 0)
+    for number in range(episodes):
+        monitor.reset(seed=number)
+        for _ in range(_STEPS):
+            monitor.step(np.zeros(1, np.float32))
+    monitor.close()
+
+
+def write_journal(directory: Path, episodes: int) -> None:
+    """Write what a monitor that is still open has written of so many episodes."""
+    directory.mkdir()
+    info = {"gym_version": "mjrec-1", "env_id": "HalfCheetah-v5"}
+    path = directory / "openaigym.episodes.0.1.jsonl"
+    writer = JournalWriter(path, env_info=info)
+    for number in range(episodes):
+        writer.append(
+            JournalEntry(
+                episode_id=number,
+                length=1000,
+                reward=float(number % 1013),
+                type="t",
+                start_time=1.79e9 + number,
+                end_time=1.79e9 + number + 0.5,
+                seed=number,
+                options=None,
+                terminated=False,
+                truncated=True,
+                success=None,
+            )
+        )
+    writer.close()
+
+
+def seconds_to_load(directory: str) -> float:
+    """Return how long it takes to load the results."""
+    start = time.perf_counter()
+    gather(directory)
+    return time.perf_counter() - start
+
+
+def seconds_to_write(directory: str, report: str) -> float:
+    """Return how long it takes to write a report, but for the posters."""
+    at: dict[str, list[float]] = {}
+
+    def note(progress: ReportProgress) -> None:
+        at.setdefault(progress.what, []).append(time.perf_counter())
+
+    shutil.rmtree(report, ignore_errors=True)
+    # matplotlib is loaded by the first figure of a process, whatever that shows.
+    importlib.import_module("matplotlib.figure")
+    start = time.perf_counter()
+    mjrec.write_report(directory, report, on_progress=note)
+    seconds = time.perf_counter() - start
+    posters = at.get("posters", [])
+    return seconds - (posters[-1] - posters[0]) if posters else seconds
+
+
+def milliseconds_to_open(report: str) -> float:
+    """Return when Chromium has read the page and run its script."""
+    from playwright.sync_api import sync_playwright
+
+    arguments = ("--no-sandbox", "--disable-gpu", "--disable-background-networking")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=_CHROMIUM, args=list(arguments)
+        )
+        page = browser.new_page()
+        page.goto(Path(report, "index.html").as_uri())
+        milliseconds: float = page.evaluate(
+            "performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
+        )
+        browser.close()
+    return milliseconds
+
+
+def memory_to_load(directory: str) -> float:
+    """Return the peak of this process's memory, in MB, after loading the results."""
+    contents = gather(directory)
+    if not contents.tasks[0].episodes.length.size:
+        raise RuntimeError("nothing was loaded")
+    match = _PEAK.search(Path("/proc/self/status").read_text())
+    assert match is not None
+    return int(match[1]) * 1024 / 1e6
+
+
+def _variants(
+    recordings: Path, many: Path, report: Path
+) -> dict[str, Callable[[], float]]:
+    variants: dict[str, Callable[[], float]] = {
+        _LOADED: functools.partial(call, seconds_to_load, directory=str(recordings)),
+        _WRITTEN: functools.partial(
+            call, seconds_to_write, directory=str(recordings), report=str(report)
+        ),
+        "memory": functools.partial(call, memory_to_load, directory=str(many)),
+    }
+    has_browser = importlib.util.find_spec("playwright") and Path(_CHROMIUM).exists()
+    if has_browser:
+        variants[_OPENED] = functools.partial(_open_report, recordings, report)
+    return variants
+
+
+def _open_report(recordings: Path, report: Path) -> float:
+    if not report.exists():
+        call(seconds_to_write, directory=str(recordings), report=str(report))
+    return call(milliseconds_to_open, report=str(report))
+
+
+def _results(samples: Mapping[str, list[float]], settings: Settings) -> list[Result]:
+    subject = f"{settings.episodes} episodes, {settings.videos} videos"
+    loaded = Reference(_LOADED, tuple(samples[_LOADED]))
+    opened = tuple(samples.get(_OPENED, ()))
+    return [
+        Result(subject=subject, variant=_LOADED, unit="s", samples=loaded.samples),
+        Result(
+            subject=subject,
+            variant=_WRITTEN,
+            unit="s",
+            samples=tuple(samples[_WRITTEN]),
+            reference=loaded,
+            promise=_WRITING_PROMISE,
+            note="posters apart",
+        ),
+        Result(
+            subject=subject,
+            variant=_OPENED,
+            unit="ms",
+            samples=opened,
+            promise=_OPENING_PROMISE,
+            note="" if opened else "needs Playwright and Debian's chromium",
+        ),
+        Result(
+            subject=f"{settings.many_episodes} episodes",
+            variant="results loaded, peak memory",
+            unit="MB",
+            samples=tuple(samples["memory"]),
+            promise=_MEMORY_PROMISE,
+        ),
+    ]

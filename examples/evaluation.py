@@ -1,0 +1,50 @@
+"""Evaluate two policies on the same starts, compare them, and make a page of one."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+import mjrec
+
+PLACE = Path("recordings/evaluation")
+
+
+class Wave:
+    """Moves each joint to and fro, one after the other, whatever is observed."""
+
+    def __init__(self, env) -> None:
+        self.shape = env.action_spec().shape
+        self.step = 0
+
+    def reset(self, seed: int) -> None:
+        self.step = 0
+
+    def __call__(self, observation) -> np.ndarray:
+        self.step += 1
+        return np.sin(0.3 * self.step + np.arange(self.shape[0]))
+
+
+def main() -> None:
+    shutil.rmtree(PLACE, ignore_errors=True)
+    tasks = ["dm_control/cheetah-run", "dm_control/swimmer-swimmer6"]
+    for name, policy in {"random": "random", "wave": Wave}.items():
+        evaluation = mjrec.evaluate(
+            tasks,
+            policy=policy,
+            directory=PLACE / name,
+            episodes=2,
+            num_seeds=2,
+            max_steps=50,
+            height=120,
+            width=160,
+        )
+        for summary in evaluation.summaries:
+            print(f"{name}: {summary.task}: mean return {summary.mean:.3g}")
+    comparison = mjrec.compare(PLACE / "random", PLACE / "wave")
+    print(comparison)
+    print(mjrec.write_report([PLACE / "random", PLACE / "wave"], PLACE / "report"))
+
+
+if __name__ == "__main__":
+    main()
