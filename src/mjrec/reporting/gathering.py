@@ -26,6 +26,7 @@ from ..evaluation.results_files import ReadResults, read_results
 from ..evaluation.summaries import AcrossTasks, Bootstrap
 from ..results.episodes import episodes_of
 from ..results.monitor_files import MonitorFiles, monitors_of
+from ..results.recorded_environment import recorded_env_info
 from ..results.sources import MonitorResults
 from .contents import ReportContents, ReportTask, ReportVideo, Verdict
 from .episode_columns import (
@@ -247,13 +248,15 @@ class _Gathering:
         groups: dict[str, list[MonitorResults]] = {}
         for monitor in monitors:
             groups.setdefault(self._environment(monitor), []).append(monitor)
-        if len(groups) > 1:
-            self._problems.append(
-                f"{directory} holds recordings of {len(groups)} environments, "
-                f"{', '.join(groups)}: each is shown by itself."
-            )
+        before = len(self._tasks)
         for name, group in groups.items():
             self._add_group(directory, name, group)
+        names = [each.task.name for each in self._tasks[before:]]
+        if len(names) > 1:
+            self._problems.append(
+                f"{directory} holds recordings of {len(names)} environments, "
+                f"{', '.join(names)}: each is shown by itself."
+            )
 
     def _add_group(
         self, directory: Path, name: str, monitors: Sequence[MonitorResults]
@@ -266,6 +269,9 @@ class _Gathering:
         rows = EpisodeRows([monitor.files.infix for monitor in monitors], numbered)
         for monitor in monitors:
             self._read_episodes(monitor, rows)
+        if name == _UNKNOWN_ENVIRONMENT and not rows and not videos:
+            # Files that nothing can be read from.
+            return
         columns, places = rows.columns()
         placed = [
             (video, places.get((video.infix, video.episode_id or 0)))
@@ -326,8 +332,9 @@ class _Gathering:
         try:
             info = monitor.env_info or {}
         except UnreadableFile:
-            # Its episodes cannot be read either, and then that is said.
-            info = {}
+            # Its episodes cannot be read either, and then that is said. There may be
+            # videos.
+            info = recorded_env_info(monitor.files, None) or {}
         name = info.get("env_id")
         is_name = isinstance(name, str) and name
         return str(name)[:_LONGEST_NAME] if is_name else _UNKNOWN_ENVIRONMENT

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..errors import Error
+from ..errors import Error, UnreadableFile
 from ..evaluation.kept_episodes import keep_rule
 from ..evaluation.plan import SEEDED, EvaluationPlan
 from ..evaluation.results_files import ReadResults
@@ -66,7 +66,7 @@ def provenance_of_monitors(
         videos: of these monitors.
         columns: their episodes.
     """
-    details = [monitor.details for monitor in monitors]
+    details = [_details(monitor) for monitor in monitors]
     return [
         ("Environment", environment),
         ("Monitors", ", ".join(_some(m.files.infix for m in monitors))),
@@ -96,7 +96,7 @@ def provenance_of_evaluation(
         columns: the episodes.
     """
     plan = results.plan
-    details = [monitor.details for monitor in monitors]
+    details = [_details(monitor) for monitor in monitors]
     return [
         ("Environment", task),
         *_row("Arguments of the environment", [_arguments(plan)]),
@@ -141,7 +141,10 @@ def _in_words(versions: Any) -> str | None:
 
 
 def _gym(monitor: MonitorResults) -> str | None:
-    version = (monitor.env_info or {}).get("gym_version")
+    try:
+        version = (monitor.env_info or {}).get("gym_version")
+    except UnreadableFile:
+        return None
     if not isinstance(version, str) or version == GYM_VERSION:
         return None
     return f"gym {_short(version)}"
@@ -220,6 +223,13 @@ def _most_steps(plan: EvaluationPlan) -> str:
 
 def _arguments(plan: EvaluationPlan) -> str | None:
     return ", ".join(_short(f"{k}={v!r}") for k, v in plan.env_kwargs.items()) or None
+
+
+def _details(monitor: MonitorResults) -> Mapping[str, Any]:
+    try:
+        return monitor.details
+    except UnreadableFile:
+        return {}
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

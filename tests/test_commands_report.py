@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`mjrec report` writes a page and says where it is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mjrec.commands.report import report
+from mjrec.errors import InvalidArgument
+from report_recordings import GYM, entry, write_journal
+
+
+@pytest.fixture
+def recordings(tmp_path: Path) -> Path:
+    write_journal(tmp_path / "run", "0.a", "X-v0", [entry(i) for i in range(3)])
+    return tmp_path / "run"
+
+
+def test_it_writes_a_folder_and_prints_its_page(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of several directories."""
+    page = tmp_path / "r" / "index.html"
+    directories = (recordings, GYM / "0.7.4" / "plain")
+    assert report(directories, out=page.parent, title="Both") == 0
+    assert capsys.readouterr().out == f"{page}\n"
+    text = page.read_text()
+    assert "<title>Both</title>" in text
+    assert "X-v0" in text
+    assert "Tiny-v0" in text
+
+
+def test_json_names_the_page(
+    recordings: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With its whole path; in a folder called report, if none is given."""
+    monkeypatch.chdir(tmp_path)
+    assert report((recordings,), as_json=True) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"page": str(tmp_path / "report" / "index.html")}
+
+
+def test_a_single_file_and_a_verdict(recordings: Path, tmp_path: Path) -> None:
+    """What the options say reaches the page."""
+    counts = {"pass": 1, "fail": 2, "not checkable": 0}
+    said = {"path": "run", "level": "stats", "passed": False, "counts": counts}
+    path = tmp_path / "said.json"
+    path.write_text(json.dumps(said))
+    page = tmp_path / "one.html"
+    assert report((recordings,), out=page, single_file=True, verification=(path,)) == 0
+    assert "said.json" in page.read_text()
+    with pytest.raises(InvalidArgument, match="max_single_file_bytes"):
+        report((recordings,), out=page, single_file=True, max_single_file_bytes=10)
+
+
+def test_a_directory_without_recordings(tmp_path: Path) -> None:
+    """It is named."""
+    with pytest.raises(InvalidArgument, match=str(tmp_path)):
+        report((tmp_path,), out=tmp_path / "report")
+    assert not (tmp_path / "report").exists()

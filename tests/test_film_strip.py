@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Film strips show the right pictures with the right times."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from PIL import Image
+from recordings import frames_of
+
+import mjrec
+from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
+from mjrec.reporting import film_strip as module
+from mjrec.reporting.film_strip import film_strip, write_film_strip
+from mjrec.reporting.video_stream import read_stream, stream_frames
+from report_recordings import record
+
+HEIGHT, WIDTH = 47, 64
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """An episode of ten steps of 0.05 s, of an odd height."""
+    directory = tmp_path_factory.mktemp("strip")
+    env = gymnasium.make(
+        "HalfCheetah-v5",
+        render_mode="rgb_array",
+        width=WIDTH,
+        height=HEIGHT,
+        max_episode_steps=10,
+    )
+    record(env, directory, 1)
+    return directory
+
+
+@pytest.fixture
+def trajectory(recorded: Path) -> Path:
+    [path] = recorded.glob("*.h5")
+    return path
+
+
+@pytest.fixture
+def video(recorded: Path) -> Path:
+    [path] = recorded.glob("*.mp4")
+    return path
+
+
+def cells(strip: Any, rows: int, columns: int, size: tuple[int, int]) -> list[Any]:
+    """Cut a strip's pictures out, by its margins of white."""
+    height, width = size
+    gap = max(2, round(0.03 * min(size)))
+    row_height = (strip.shape[0] - gap) // rows
+    return [
+        strip[
+            gap + row * row_height : gap + row * row_height + height,
+            gap + column * (width + gap) : gap + column * (width + gap) + width,
+        ]
+        for row in range(rows)
+        for column in range(columns)
+    ]
+
+
+@pytest.fixture
+def labels(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is written under the pictures."""
+    written: list[str] = []
+    original = module._written
+
+    def noting(label: str, letters: int, **options: Any) -> Any:
+        written.append(label)
+        return original(label, letters, **options)
+
+    monkeypatch.setattr(module, "_written", noting)
+    return written
+
+
+def test_pictures_of_a_trajectory_are_those_rendered(
+    trajectory: Path, labels: list[str]
+) -> None:
+    """Evenly spread, the first and the last included, byte for byte."""
+    strip = film_strip(trajectory, frames=3)
+    rendered = list(mjrec.render(trajectory))
+    shown = cells(strip, 1, 3, (HEIGHT, WIDTH))
+    for picture, index in zip(shown, (0, 5, 10), strict=True):
+        np.testing.assert_array_equal(picture, rendered[index])
+    assert labels == ["0.00 s", "0.25 s", "0.50 s"]
+
+
+def test_pictures_of_a_video_are_those_decoded(video: Path, labels: list[str]) -> None:
+    """Without the row that made its height even, and with simulated times."""
+    strip = film_strip(video, frames=6, columns=3)
+    decoded = frames_of(video)
+    shown = cells(strip, 2, 3, (HEIGHT, WIDTH))
+    for picture, index in zip(shown, (0, 2, 4, 6, 8, 10), strict=True):
+        difference = picture.astype(int) - decoded[index][:HEIGHT]
+        assert np.abs(difference).max() <= 2
+    assert labels == [f"{t:.2f} s" for t in (0, 0.1, 0.2, 0.3, 0.4, 0.5)]
+
+
+def test_a_video_alone_has_its_own_times(
+    video: Path, tmp_path: Path, labels: list[str]
+) -> None:
+    """Those of the stream, where there is no metadata beside it."""
+    copy = tmp_path / "copy.mp4"
+    copy.write_bytes(video.read_bytes())
+    strip = film_strip(copy, frames=2)
+    assert labels == ["0.00 s", "0.50 s"]
+    assert strip.shape[1] == 3 * 2 + 2 * WIDTH
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[]",
+        '{"height": 47, "width": 64, "timestep": "1/0"}',
+        '{"height": 47, "width": 64, "timestep": "1/20", "stride": 1, '
+        '"frame_count": 11, "frame_steps": [[0, 1000000000000]]}',
+        '{"height": 3, "width": 3, "timestep": "1/20"}',
+    ],
+)
+def test_metadata_that_do_not_fit_are_ignored(
+    video: Path, tmp_path: Path, text: str, labels: list[str]
+) -> None:
+    """They may be anybody's, and claim any number of pictures."""
+    copy = tmp_path / "copy.mp4"
+    copy.write_bytes(video.read_bytes())
+    copy.with_suffix(".meta.json").write_text(text)
+    film_strip(copy, frames=2)
+    assert labels == ["0.00 s", "0.50 s"]
+
+
+def test_a_trajectory_is_drawn_again_at_any_size(trajectory: Path) -> None:
+    """From another camera, too: sharper than a video can be."""
+    strip = film_strip(
+        trajectory, frames=2, height=96, width=128, camera="track", quality="draft"
+    )
+    shown = cells(strip, 1, 2, (96, 128))
+    again = mjrec.render(
+        trajectory, height=96, width=128, camera="track", quality="draft"
+    )
+    np.testing.assert_array_equal(shown[0], next(again))
+
+
+@pytest.mark.parametrize(("frames", "columns"), [(8, 8), (9, 5), (1, 1), (11, 6)])
+def test_usual_columns(video: Path, frames: int, columns: int) -> None:
+    """Up to eight stand in one row, more in rows of equal length."""
+    strip = film_strip(video, frames=frames)
+    assert strip.shape[1] == 2 + columns * (WIDTH + 2)
+
+
+def test_what_is_no_picture_is_white_paper(video: Path) -> None:
+    """The margins, and what is left of the last row; letters stand in between."""
+    strip = film_strip(video, frames=3, columns=2)
+    assert (strip[:2] == 255).all()
+    assert (strip[:, :2] == 255).all()
+    assert (strip[-2:, -2:] == 255).all()
+    under = strip[2 + HEIGHT : strip.shape[0] // 2, :, 0]
+    assert under.min() < 64
+
+
+def test_more_pictures_than_there_are(video: Path, trajectory: Path) -> None:
+    """The error says how many there are."""
+    for file in (video, trajectory):
+        with pytest.raises(InvalidArgument, match="has 11 pictures, and 12"):
+            film_strip(file, frames=12)
+
+
+@pytest.mark.parametrize("options", [{"frames": 0}, {"columns": -1}, {"frames": True}])
+def test_numbers_that_cannot_be(video: Path, options: dict[str, Any]) -> None:
+    """They are an error with the name of the option."""
+    with pytest.raises(InvalidArgument, match=next(iter(options))):
+        film_strip(video, **options)
+
+
+def test_a_strip_that_is_too_large(trajectory: Path) -> None:
+    """It says what to ask for instead."""
+    module_most = module._MOST_PIXELS
+    assert module_most < 11 * 4000 * 4000
+    with pytest.raises(InvalidArgument, match="Ask for fewer or smaller"):
+        film_strip(trajectory, frames=11, height=4000, width=4000)
+
+
+def test_a_video_is_shown_as_it_is(video: Path) -> None:
+    """Another camera needs the trajectory, and the error says so."""
+    with pytest.raises(InvalidArgument, match="trajectory"):
+        film_strip(video, camera="track")
+
+
+def test_other_files(tmp_path: Path) -> None:
+    """Neither a video nor a trajectory, or damaged, or not there."""
+    text = tmp_path / "notes.txt"
+    text.write_text("no video")
+    with pytest.raises(UnreadableFile, match="neither a video"):
+        film_strip(text)
+    with pytest.raises(UnreadableFile, match=r"nothing\.mp4"):
+        film_strip(tmp_path / "nothing.mp4")
+
+
+def test_a_cut_off_video(video: Path, tmp_path: Path) -> None:
+    """An error names it."""
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(video.read_bytes()[:600])
+    with pytest.raises(mjrec.Error, match=r"cut\.mp4"):
+        film_strip(cut)
+
+
+def test_a_hundred_pictures_are_the_right_ones(tmp_path: Path) -> None:
+    """More than ffmpeg picks at once."""
+    path = tmp_path / "grey.mp4"
+    with mjrec.VideoWriter(path, fps=30) as writer:
+        for i in range(120):
+            writer.write(np.full((16, 16, 3), 2 * i, np.uint8))
+    stream = read_stream(path)
+    assert (len(stream), stream.seconds) == (120, pytest.approx(4))
+    indices = list(range(120))
+    means = [frame.mean() for frame in stream_frames(stream, indices)]
+    np.testing.assert_allclose(means, [2 * i for i in indices], atol=2)
+
+
+def test_a_strip_is_a_png_for_print(video: Path, tmp_path: Path) -> None:
+    """Of 300 dots per inch, with the very pixels."""
+    strip = film_strip(video, frames=2)
+    write_film_strip(tmp_path / "strip.png", strip)
+    with Image.open(tmp_path / "strip.png") as image:
+        assert image.info["dpi"] == pytest.approx((300, 300), abs=0.1)
+        np.testing.assert_array_equal(np.asarray(image), strip)
+
+
+def test_a_strip_is_written_whole_or_not_at_all(video: Path, tmp_path: Path) -> None:
+    """Nor under another kind's name."""
+    strip = film_strip(video, frames=2)
+    with pytest.raises(InvalidArgument, match=r"strip\.png"):
+        write_film_strip(tmp_path / "strip.jpg", strip)
+    with pytest.raises(FileNotWritten):
+        write_film_strip(tmp_path / "nowhere" / "strip.png", strip)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_pillow(video: Path) -> None:
+    """An error names the extra."""
+    code = (
+        "import sys; sys.modules['PIL'] = None\n"
+        "import mjrec\n"
+        "from mjrec.reporting.film_strip import film_strip\n"
+        "try:\n    film_strip(sys.argv[1])\n"
+        "except mjrec.MissingDependency as error:\n    print(error)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(video)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "Pillow" in done.stdout

@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A report is a folder that stands on its own, or one file."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mjrec
+from mjrec.errors import DirectoryNotWritable, InvalidArgument
+from mjrec.reporting.media_files import ReportProgress
+from mjrec.reporting.posters import poster_of
+from mjrec.reporting.report_folder import write_report
+from report_recordings import GYM, entry, record, write_evaluation, write_journal
+
+
+@pytest.fixture
+def recordings(corridor: Any, tmp_path: Path) -> Path:
+    """Two episodes with a video each."""
+    directory = tmp_path / "recordings"
+    record(corridor, directory, 2)
+    return directory
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(
+        str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()
+    )
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_a_report_is_a_page_with_copies_beside_it(
+    recordings: Path, tmp_path: Path
+) -> None:
+    """It names them, and outlives the recordings; their names are made here."""
+    hashes = [sha256(path) for path in sorted(recordings.glob("*.mp4"))]
+    page = write_report(recordings, tmp_path / "report")
+    assert page == tmp_path / "report" / "index.html"
+    shutil.rmtree(recordings)
+    assert names(page.parent) == [
+        "index.html",
+        "posters/0000-unknown-corridor.jpg",
+        "posters/0001-unknown-corridor.jpg",
+        "videos/0000-unknown-corridor.mp4",
+        "videos/0001-unknown-corridor.mp4",
+    ]
+    copies = sorted((page.parent / "videos").iterdir())
+    assert [sha256(path) for path in copies] == hashes
+    assert all(path.stat().st_nlink == 1 for path in copies)
+    text = page.read_text()
+    for name in names(page.parent)[1:]:
+        assert name in text
+    assert all(each in text for each in hashes)
+
+
+def test_posters_show_the_middle(tmp_path: Path) -> None:
+    """At most 640 pixels wide, with the colours of the video."""
+    video = tmp_path / "video.mp4"
+    with mjrec.VideoWriter(video, fps=10) as writer:
+        for colour in ((255, 0, 0), (20, 160, 90), (0, 0, 255)):
+            writer.write(np.full((400, 800, 3), colour, np.uint8))
+    poster = poster_of(video)
+    assert poster.seconds == pytest.approx(0.3)
+    assert poster.jpeg is not None
+    with Image.open(io.BytesIO(poster.jpeg)) as image:
+        assert image.format == "JPEG"
+        assert image.size == (640, 320)
+        np.testing.assert_allclose(np.asarray(image)[100, 100], (20, 160, 90), atol=4)
+
+
+def test_a_video_that_cannot_be_decoded_has_no_poster(
+    recordings: Path, tmp_path: Path
+) -> None:
+    """It is copied, with a note that it was changed, and the rest is there."""
+    first, _ = sorted(recordings.glob("*.mp4"))
+    first.write_bytes(first.read_bytes()[:200])
+    page = write_report(recordings, tmp_path / "report")
+    assert "posters/0000-unknown-corridor.jpg" not in names(page.parent)
+    assert "posters/0001-unknown-corridor.jpg" in names(page.parent)
+    text = page.read_text()
+    assert "There is no picture of a video" in text
+    assert "not the file that its metadata describe" in text
+    assert sha256(first) in text
+
+
+def test_what_is_called_a_video_and_is_none_is_left_out(
+    recordings: Path, tmp_path: Path
+) -> None:
+    """A page, say, which a browser would open."""
+    first, _ = sorted(recordings.glob("*.mp4"))
+    first.write_text("<html><script>alert(1)</script></html>")
+    page = write_report(recordings, tmp_path / "report")
+    assert [n for n in names(page.parent) if n.startswith("videos")] == [
+        "videos/0001-unknown-corridor.mp4"
+    ]
+    assert "is left out" in page.read_text()
+
+
+def test_hostile_names_are_text_on_the_page_and_no_names_of_files(
+    tmp_path: Path,
+) -> None:
+    """Whatever an environment is called."""
+    env_id = "../<script>alert(1)</script>\u202e"
+    write_journal(tmp_path / "run", "0.a", env_id, [entry(0)])
+    text = (GYM / "0.22.0" / "text").glob("*.video000000*.json")
+    for path in text:
+        name = path.name.replace("0.20545", "0.a")
+        shutil.copyfile(path, tmp_path / "run" / name)
+    page = write_report(tmp_path / "run", tmp_path / "report")
+    assert names(page.parent) == [
+        "index.html",
+        "videos/0000-script-alert-1-script.json",
+    ]
+    assert "<script>alert" not in page.read_text()
+
+
+def test_text_recordings_of_gym_are_copied(tmp_path: Path) -> None:
+    """All of its directories in one report."""
+    page = write_report(GYM / "0.9.6", tmp_path / "report")
+    copied = [name for name in names(page.parent) if name.startswith("videos")]
+    assert len(copied) == 2
+    assert all(name.endswith(".json") for name in copied)
+
+
+def test_an_evaluation_without_videos(tmp_path: Path) -> None:
+    """Its page is the only file."""
+    write_evaluation(tmp_path / "run", ["a/x", "b/y"])
+    page = write_report(tmp_path / "run", tmp_path / "report", title="Of two tasks")
+    assert names(page.parent) == ["index.html"]
+    text = page.read_text()
+    assert "<title>Of two tasks</title>" in text
+    assert "PolicyError: it gave " in text
+    assert "<b>NaN" not in text
+
+
+def test_nothing_but_damaged_files(tmp_path: Path) -> None:
+    """There is a page all the same, which names them."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "openaigym.manifest.1.b.manifest.json").write_text("{")
+    page = write_report(tmp_path / "run", tmp_path / "report")
+    assert "openaigym.manifest.1.b.manifest.json" in page.read_text()
+
+
+def test_a_report_replaces_a_report(recordings: Path, tmp_path: Path) -> None:
+    """And an empty folder; nothing of the older one, or of the making, is left."""
+    (tmp_path / "report").mkdir()
+    write_report(recordings, tmp_path / "report")
+    run = tmp_path / "run"
+    write_journal(run, "0.a", "X-v0", [entry(0)])
+    write_report(run, tmp_path / "report")
+    assert names(tmp_path / "report") == ["index.html"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report", "run"]
+
+
+@pytest.mark.parametrize("name", ["index.html", "videos/mine.mp4", "notes.txt"])
+def test_what_is_no_report_is_not_replaced(
+    recordings: Path, tmp_path: Path, name: str
+) -> None:
+    """Neither another folder, nor a report that somebody has put something into."""
+    report = tmp_path / "report"
+    if name != "index.html":
+        write_report(recordings, report)
+    (report / name).parent.mkdir(exist_ok=True, parents=True)
+    (report / name).write_text("mine")
+    before = names(report)
+    with pytest.raises(InvalidArgument, match=re.escape(name)):
+        write_report(recordings, report)
+    assert names(report) == before
+    assert (report / name).read_text() == "mine"
+
+
+def test_recordings_are_never_replaced_by_their_report(recordings: Path) -> None:
+    """Whoever names the same directory twice keeps it."""
+    before = names(recordings)
+    with pytest.raises(InvalidArgument, match="no report"):
+        write_report(recordings, recordings)
+    assert names(recordings) == before
+
+
+def test_a_failed_report_leaves_what_was_there(
+    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing half-written."""
+    page = write_report(recordings, tmp_path / "report")
+    before = page.read_text()
+
+    def stop(progress: ReportProgress) -> None:
+        if progress == ReportProgress("videos", 2, 2):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_report(recordings, tmp_path / "report", title="2", on_progress=stop)
+    assert page.read_text() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report"]
+
+
+def test_progress_is_told(recordings: Path, tmp_path: Path) -> None:
+    """Of each poster, then of each video."""
+    told: list[ReportProgress] = []
+    write_report(recordings, tmp_path / "report", on_progress=told.append)
+    assert told == [
+        ReportProgress("posters", 1, 2),
+        ReportProgress("posters", 2, 2),
+        ReportProgress("videos", 1, 2),
+        ReportProgress("videos", 2, 2),
+    ]
+
+
+def test_a_single_file_has_everything_in_it(recordings: Path, tmp_path: Path) -> None:
+    """Pictures and videos too, byte for byte."""
+    page = write_report(recordings, tmp_path / "one.html", single_file=True)
+    assert page == tmp_path / "one.html"
+    text = page.read_text()
+    for path in recordings.glob("*.mp4"):
+        assert base64.b64encode(path.read_bytes()).decode() in text
+    assert len(re.findall("poster=.data:image/jpeg;base64,", text)) == 2
+    assert write_report(recordings, page, single_file=True) == page
+
+
+def test_a_single_file_may_be_in_a_folder(recordings: Path, tmp_path: Path) -> None:
+    """As any report."""
+    page = write_report(recordings, tmp_path / "report", single_file=True)
+    assert names(page.parent) == ["index.html"]
+
+
+def test_a_single_file_is_no_larger_than_allowed(
+    recordings: Path, tmp_path: Path
+) -> None:
+    """Posters come first, then the videos in their order; what is missing is told."""
+    whole = write_report(recordings, tmp_path / "whole.html", single_file=True)
+    most = whole.stat().st_size - 100
+    part = write_report(
+        recordings,
+        tmp_path / "part.html",
+        single_file=True,
+        max_single_file_bytes=most,
+    )
+    assert part.stat().st_size <= most
+    text = part.read_text()
+    assert len(re.findall(r"\b(poster|src)=.data:image/jpeg;base64,", text)) == 2
+    assert len(re.findall("<video[^>]* src=.data:video/mp4;base64,", text)) == 1
+    assert "1 of 2 videos are not embedded" in text
+    with pytest.raises(InvalidArgument, match="without any picture or video"):
+        write_report(
+            recordings,
+            tmp_path / "tiny.html",
+            single_file=True,
+            max_single_file_bytes=1000,
+        )
+    assert not (tmp_path / "tiny.html").exists()
+
+
+def test_a_page_that_is_somebody_elses_is_not_replaced(
+    recordings: Path, tmp_path: Path
+) -> None:
+    """Nor does a report that is a folder end in .html."""
+    page = tmp_path / "mine.html"
+    page.write_text("mine")
+    with pytest.raises(InvalidArgument, match="is no report"):
+        write_report(recordings, page, single_file=True)
+    with pytest.raises(InvalidArgument, match="single_file"):
+        write_report(recordings, page)
+    assert page.read_text() == "mine"
+
+
+def test_where_nothing_can_be_written(recordings: Path, tmp_path: Path) -> None:
+    """The error names the place."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DirectoryNotWritable, match="file"):
+        write_report(recordings, tmp_path / "file" / "report")
+    with pytest.raises(InvalidArgument, match="is a file"):
+        write_report(recordings, tmp_path / "file")
+
+
+def test_the_page_says_what_was_verified(recordings: Path, tmp_path: Path) -> None:
+    """Where there is a verdict."""
+    counts = {"pass": 31, "fail": 0, "not checkable": 2}
+    said = {"path": "run", "level": "pixels", "passed": True, "counts": counts}
+    path = tmp_path / "said.json"
+    path.write_text(json.dumps(said))
+    page = write_report(recordings, tmp_path / "report", verifications=[path])
+    assert "said.json" in page.read_text()
