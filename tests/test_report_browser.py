@@ -17,6 +17,7 @@ from report_contents import HOSTILE, columns, contents, task, video
 import mjrec
 from mjrec.reporting.contents import ReportContents, Verdict
 from mjrec.reporting.page import page_of
+from mjrec.reporting.report_folder import write_report
 
 # Where it is installed to be tested, being unable to start it is no reason to skip.
 if "MJREC_TEST_BROWSER" not in os.environ:
@@ -181,6 +182,28 @@ def test_videos_play(usual: Page) -> None:
         assert told[4] is None
     playing = "[...document.querySelectorAll('video')].filter(v => !v.paused).length"
     assert usual.evaluate(playing) <= 1
+
+
+@pytest.mark.parametrize("single_file", [False, True])
+def test_a_recordings_report_plays(
+    page: Page, tmp_path: Path, make_corridor: Any, play: Any, single_file: bool
+) -> None:
+    """From the monitor's files to the picture in the browser."""
+    directory = tmp_path / "recordings #1"
+    with mjrec.Monitor(make_corridor(length=20), directory) as monitor:
+        play(monitor, 3, seed=0)
+    index = write_report(directory, tmp_path / "a report", single_file=single_file)
+    # The folder is whole by itself.
+    shutil.rmtree(directory)
+    page.goto(index.resolve().as_uri())
+    expect(page.locator("#summary-table tbody tr")).to_have_count(1)
+    expect(page.locator("#episodes-count")).to_have_text("Rows 1 to 3 of 3")
+    player = page.locator("video").first
+    player.click()
+    page.wait_for_function("() => document.querySelector('video').currentTime > 0.1")
+    # The environment's own rate is 10, and the first picture is the reset's.
+    assert player.evaluate("v => v.duration") == pytest.approx(2.1, abs=0.1)
+    assert player.evaluate("v => v.poster") != ""
 
 
 # --- Sorting ----------------------------------------------------------------------

@@ -91,6 +91,16 @@
     }, true);
   }
 
+  // Chromium begins a video that it has not read only by the button, not by the picture.
+  function playByPicture() {
+    const heightOfControls = 70;
+    document.addEventListener("click", (event) => {
+      const video = event.target;
+      if (!(video instanceof HTMLVideoElement) || !video.paused || video.readyState > 0) return;
+      if (event.offsetY < video.clientHeight - heightOfControls) video.play().catch(() => {});
+    });
+  }
+
   // --- Copying --------------------------------------------------------------------
 
   function select(element) {
@@ -261,6 +271,7 @@
   sortSummary(one("#summary-table"));
   startEpisodes((place) => { if (one(place)?.hidden) reset(); });
   playOneAtATime();
+  playByPicture();
   addCopyButtons();
   printPosters();
 })();
