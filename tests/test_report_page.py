@@ -225,6 +225,14 @@ def test_more_episodes_than_a_page_opens_with_are_left_to_the_files() -> None:
     assert "30\u202f000" in page
 
 
+def test_returns_of_any_size_are_told() -> None:
+    """And one that is no number is not."""
+    made = task("a", columns([1e307, -2.5, 0.123456789]), score_range=None)
+    inside = replace(made.episodes, total_reward=np.array([1e307, -2.5, np.nan]))
+    shown = data_of(page_of(contents(replace(made, episodes=inside), across={})))
+    assert shown["tasks"][0]["total_reward"] == [1e307, -2.5, None]
+
+
 def test_not_every_video_of_thousands_has_a_player() -> None:
     """Those that are best or worst first; the table of episodes links to the others."""
     episodes = columns([1.0] * 600, videos={i: [i] for i in range(600)})

@@ -623,8 +623,11 @@ def _names(names: Iterable[str]) -> list[str]:
 
 def _json_numbers(values: NDArray[np.float64], decimals: int) -> list[float | None]:
     """Return numbers with two decimals more than are shown, so that they sort well."""
-    rounded = np.round(values, decimals + 2).tolist()
-    return [value if math.isfinite(value) else None for value in rounded]
+    rounded = values.copy()
+    # Larger ones have no decimals, and rounding would multiply them.
+    small = np.abs(values) < 1e15
+    rounded[small] = np.round(values[small], decimals + 2)
+    return [value if math.isfinite(value) else None for value in rounded.tolist()]
 
 
 _SPECIAL: Final = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
