@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -134,7 +135,9 @@ def test_ctrl_c_says_how_to_go_on(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mjrec.commands.evaluate.evaluate_policy", interrupted)
+    # By its name it is the command, which has the name of its module.
+    module = sys.modules[evaluate.__module__]
+    monkeypatch.setattr(module, "evaluate_policy", interrupted)
     status, _, err = run(TASK, "--policy", "zero")
     assert status == 130
     assert "--resume goes on" in err

@@ -243,7 +243,7 @@ def test_a_worker_that_dies_once_costs_nothing(
 def test_an_episode_that_kills_its_workers_has_failed(tmp_path: Path) -> None:
     """The rest is there, and the reason is told."""
     evaluation = run(
-        tmp_path / "e", policy=local(DiesAlways), episodes=3, num_seeds=1, workers=1
+        tmp_path / "e", policy=local(DiesAlways), episodes=2, num_seeds=1, workers=1
     )
     assert evaluation.failed
     assert any(each.failure is None for each in evaluation.results)

@@ -387,12 +387,14 @@ def _video_lines(evaluation: Evaluation) -> list[str]:
         rest = len(evaluation.videos) - _SHOWN
         lines += [f"  and {rest} more"] if rest > 0 else []
     if evaluation.pending:
-        lines.append(
-            f"{_count(len(evaluation.pending), 'video')} could not be drawn here; on a "
-            "machine with OpenGL:"
-        )
-        folders = dict.fromkeys(path.parent for path in evaluation.pending)
-        lines += [f"  mjrec render {folder}" for folder in folders]
+        lines.append(f"{_count(len(evaluation.pending), 'video')} could not be drawn:")
+        by_reason: dict[str, list[str]] = {}
+        for path, reason in evaluation.pending.items():
+            by_reason.setdefault(reason, []).append(path.name)
+        lines += [
+            f"  {names[0]}{_and_more(len(names) - 1)}: {_printable(reason)}"
+            for reason, names in by_reason.items()
+        ]
     return lines
 
 

@@ -94,20 +94,24 @@ def _render(
     """Return why videos are not there, or show nothing, by their names."""
     outcomes = finish_pending(folder, keys, workers=workers, on_progress=show)
     reasons = {
-        outcome.name: outcome.failure or "another process is drawing it"
+        outcome.name: outcome.failure or "Another process is drawing it."
         for outcome in outcomes
         if outcome.failure is not None or outcome.is_elsewhere
     }
     for reason in dict.fromkeys(reasons.values()):
         names = [name for name in reasons if reasons[name] == reason]
         logger.warning(
-            "%s in %s: %s To try again: mjrec render %s",
+            "%s in %s: %s %s",
             ", ".join(names),
             folder,
             reason,
-            folder,
+            _again(folder),
         )
-    return reasons
+    return {name: f"{reason} {_again(folder)}" for name, reason in reasons.items()}
+
+
+def _again(folder: Path) -> str:
+    return f"To try again: mjrec render {folder}"
 
 
 def _sort(
@@ -124,14 +128,13 @@ def _sort(
         if there:
             videos.there.append(there[0])
         else:
-            videos.pending[path] = (
-                reasons.get(path.name) or problem or _not_promised(folder, key)
-            )
+            why = reasons.get(path.name) or problem or _not_promised(folder, key)
+            videos.pending[path] = why
 
 
 def _not_promised(folder: Path, key: EpisodeKey) -> str:
     return (
-        "it was not among the chosen when its recording was settled, in an earlier "
-        f"part of the evaluation; mjrec render {folder / key.trajectory_name}.h5 "
-        "--out VIDEO.mp4 draws it"
+        "It was not among the chosen when its recording was settled, before more was "
+        f"asked for. To draw it: mjrec render {folder / key.trajectory_name}.h5 "
+        "--out VIDEO.mp4"
     )
