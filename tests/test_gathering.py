@@ -21,6 +21,7 @@ import pytest
 import mjrec
 from mjrec.commands import main
 from mjrec.errors import InvalidArgument, UnreadableFile
+from mjrec.formats.monitor_directory import infix_of
 from mjrec.reporting.contents import EpisodeColumns
 from mjrec.reporting.episode_columns import episodes_with_roles
 from mjrec.reporting.gathering import gather
@@ -274,11 +275,11 @@ def test_videos_of_an_evaluation_know_their_episode(
     record(corridor, tmp_path / "a-x", 1, uid="batch")
     [journal] = (tmp_path / "a-x").glob("*.jsonl")
     journal.unlink()
-    write_evaluation(
-        tmp_path, ["a/x"], videos={"a/x": "openaigym.video.0.batch.video000000.mp4"}
-    )
+    [path] = (tmp_path / "a-x").glob("*.mp4")
+    infix = infix_of(path.name)
+    assert infix is not None
+    write_evaluation(tmp_path, ["a/x"], videos={"a/x": path.name}, infix=infix)
     contents = gather(tmp_path)
-    assert contents.problems == (), sorted((tmp_path / "a-x").iterdir())
     [video] = contents.videos
     assert (video.index, video.roles) == (0, ("best",))
     assert contents.tasks[0].episodes.videos == {0: [0]}

@@ -8,11 +8,12 @@ strip is made.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -93,25 +94,24 @@ def film_strip(
     if columns is not None:
         _check_count("columns", columns)
     check_annotation()
+    source: contextlib.AbstractContextManager[_Shots]
     if path.suffix in _TRAJECTORIES:
-        pictures = _of_trajectory(
-            path,
-            frames,
-            View(
-                camera=None if camera is None else plain_camera(camera),
-                height=height,
-                width=width,
-                quality=quality,
-            ),
+        view = View(
+            camera=None if camera is None else plain_camera(camera),
+            height=height,
+            width=width,
+            quality=quality,
         )
+        source = _of_trajectory(path, frames, view)
     elif any(option is not None for option in (camera, height, width, quality)):
         raise InvalidArgument(
             f"{path} is shown as it is. Another camera, size or quality can be drawn "
             "from its trajectory: name that file (openaigym.trajectory.*.h5)."
         )
     else:
-        pictures = _of_video(path, frames)
-    return _laid_out(pictures, columns or _usual_columns(frames))
+        source = _of_video(path, frames)
+    with source as shots:
+        return _laid_out(shots, columns or _usual_columns(frames))
 
 
 def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
@@ -143,19 +143,21 @@ def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
 
 
 @dataclass(frozen=True)
-class _Timed:
-    """A picture and its time.
+class _Shots:
+    """Pictures and their times.
 
     Attributes:
-        picture: `(height, width, 3) uint8`, all of one size.
-        seconds: None where it is not known.
+        pictures: `(height, width, 3) uint8` each, all of one size; one after the other,
+            each drawn when it is asked for.
+        times: in seconds; None where it is not known.
     """
 
-    picture: Frame
-    seconds: float | None
+    pictures: Iterator[Frame]
+    times: Sequence[float | None]
 
 
-def _of_trajectory(path: Path, count: int, view: View) -> list[_Timed]:
+@contextlib.contextmanager
+def _of_trajectory(path: Path, count: int, view: View) -> Iterator[_Shots]:
     with open_for_rendering(path) as reader:
         check_has_pictures(reader)
         warn_of_other_pictures(reader)
@@ -163,13 +165,13 @@ def _of_trajectory(path: Path, count: int, view: View) -> list[_Timed]:
         times = [caption.time for caption in Captions(reader, indices)]
     workers = DrawingWorkers(1)
     try:
-        drawn = list(workers.frames(path, indices, view))
+        yield _Shots(workers.frames(path, indices, view), times)
     finally:
         workers.close()
-    return [_Timed(*pair) for pair in zip(drawn, times, strict=True)]
 
 
-def _of_video(path: Path, count: int) -> list[_Timed]:
+@contextlib.contextmanager
+def _of_video(path: Path, count: int) -> Iterator[_Shots]:
     if video_kind(path) is None:
         raise UnreadableFile(
             path,
@@ -178,10 +180,9 @@ def _of_video(path: Path, count: int) -> list[_Timed]:
     stream = read_stream(path)
     indices = _spread(len(stream), count, path)
     facts = _Facts.beside(path, stream)
-    return [
-        _Timed(facts.cropped(frame), facts.times[index])
-        for frame, index in zip(stream_frames(stream, indices), indices, strict=True)
-    ]
+    with contextlib.closing(stream_frames(stream, indices)) as decoded:
+        pictures = map(facts.cropped, decoded)
+        yield _Shots(pictures, [facts.times[index] for index in indices])
 
 
 @dataclass(frozen=True)
@@ -263,33 +264,31 @@ def _check_count(name: str, count: object) -> None:
         )
 
 
-def _laid_out(pictures: Sequence[_Timed], columns: int) -> Frame:
+def _laid_out(shots: _Shots, columns: int) -> Frame:
     """Return pictures in rows on white paper, the time of each under it."""
-    height, width = pictures[0].picture.shape[:2]
-    columns = min(columns, len(pictures))
-    rows = math.ceil(len(pictures) / columns)
+    count = len(shots.times)
+    first = next(shots.pictures)
+    height, width = first.shape[:2]
+    columns = min(columns, count)
+    rows = math.ceil(count / columns)
     gap = max(2, round(_GAP * min(height, width)))
     letters = round(_LETTERS * min(height, width))
     letters = max(_SMALLEST_LETTERS, min(_LARGEST_LETTERS, letters))
-    labels = _labels([each.seconds for each in pictures])
+    labels = _labels(shots.times)
     written = [_written(label, letters, most_width=width) for label in labels]
-    line = max((label.shape[0] for label in written), default=0)
+    line = max(label.shape[0] for label in written)
     cell_height = height + (gap // 2 + line if line else 0)
-    shape = (
-        gap + rows * (cell_height + gap),
-        gap + columns * (width + gap),
-        3,
-    )
+    shape = gap + rows * (cell_height + gap), gap + columns * (width + gap), 3
     if shape[0] * shape[1] > _MOST_PIXELS:
         raise InvalidArgument(
             f"The strip would have {shape[1]}x{shape[0]} pixels. Ask for fewer or "
             "smaller pictures (frames, size)."
         )
     paper = np.full(shape, _PAPER, np.uint8)
-    for number, each in enumerate(pictures):
+    for number, picture in enumerate(itertools.chain([first], shots.pictures)):
         row, column = divmod(number, columns)
         top, left = gap + row * (cell_height + gap), gap + column * (width + gap)
-        paper[top : top + height, left : left + width] = each.picture
+        paper[top : top + height, left : left + width] = picture
         if written[number].size:
             _put(paper, written[number], top + height + gap // 2, left, width)
     return paper

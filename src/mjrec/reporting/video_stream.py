@@ -8,7 +8,7 @@ opens no other file for it.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -107,7 +107,9 @@ def read_stream(path: Path) -> VideoStream:
     return VideoStream(regular_path(path), height, width, times, seconds)
 
 
-def stream_frames(stream: VideoStream, indices: Sequence[int]) -> Iterator[Frame]:
+def stream_frames(
+    stream: VideoStream, indices: Sequence[int]
+) -> Generator[Frame, None, None]:
     """Yield some pictures of a video, decoded, as `(height, width, 3) uint8`.
 
     Args:
