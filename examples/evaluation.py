@@ -18,9 +18,11 @@ class Wave:
         self.step = 0
 
     def reset(self, seed: int) -> None:
+        """Begin an episode."""
         self.step = 0
 
     def __call__(self, observation) -> np.ndarray:
+        """Return the next action."""
         self.step += 1
         return np.sin(0.3 * self.step + np.arange(self.shape[0]))
 

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import importlib.util
 import os
 import signal
 import subprocess
@@ -21,7 +20,6 @@ from mjrec import (
     DifferentEvaluation,
     DirectoryInUse,
     InvalidArgument,
-    MissingDependency,
     PicturesDiffer,
     PolicyError,
     UnknownName,
@@ -439,21 +437,6 @@ def test_what_cannot_be_is_told_before_anything_is_written(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(kind, match=words):
         run(tmp_path / "e", **options)
-    assert not (tmp_path / "e").exists()
-
-
-def test_without_scipy_nothing_is_begun(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The line for pip is told, before hours of work and not after."""
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util,
-        "find_spec",
-        lambda name: None if name == "scipy" else find(name),
-    )
-    with pytest.raises(MissingDependency, match=r"mjrec\[evaluation\]"):
-        run(tmp_path / "e")
     assert not (tmp_path / "e").exists()
 
 

@@ -22,6 +22,7 @@ from recordings import videos_in
 import mjrec
 from conftest import Corridor
 from evaluated import FOLDER, PENDULUM, facts_of, plan_of, run_job, states_of, worker_of
+from mjrec.carried_errors import unpacked
 from mjrec.environments.episode_seeds import episode_seeds
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.ledger import read_ledgers
@@ -74,13 +75,21 @@ def test_a_task_is_checked_without_a_step(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_not_there_is_found_by_the_check(tmp_path: Path) -> None:
-    """Tasks and policies by their names, with ours for errors."""
-    with pytest.raises(mjrec.UnknownName, match="InvertedPendulm"):
-        worker_of(tmp_path, plan_of())({"kind": "check", "task": "InvertedPendulm-v5"})
-    worker = worker_of(tmp_path, plan_of(policy="no_such_module:policy"))
-    with pytest.raises(mjrec.UnknownName, match="no_such_module"):
-        worker({"kind": "check", "task": PENDULUM})
+@pytest.mark.parametrize(
+    ("task", "policy", "words"),
+    [
+        ("InvertedPendulm-v5", "zero", "InvertedPendulm"),
+        (PENDULUM, "no_such_module:policy", "no_such_module"),
+    ],
+)
+def test_what_is_not_there_is_told_by_the_check(
+    tmp_path: Path, task: str, policy: str, words: str
+) -> None:
+    """As an error of ours that can be raised elsewhere."""
+    worker = worker_of(tmp_path, plan_of(policy=policy))
+    error = unpacked(worker({"kind": "check", "task": task})["error"])
+    assert isinstance(error, mjrec.UnknownName)
+    assert words in str(error)
 
 
 # The second draws its springs when it is made.

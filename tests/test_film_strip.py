@@ -17,8 +17,8 @@ from recordings import frames_of
 
 import mjrec
 from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
-from mjrec.reporting import film_strip as module
-from mjrec.reporting.film_strip import film_strip, write_film_strip
+from mjrec.reporting import film_strips as module
+from mjrec.reporting.film_strips import film_strip, write_film_strip
 from mjrec.reporting.video_stream import read_stream, stream_frames
 from report_recordings import record
 
@@ -250,7 +250,7 @@ def test_without_pillow(video: Path) -> None:
     code = (
         "import sys; sys.modules['PIL'] = None\n"
         "import mjrec\n"
-        "from mjrec.reporting.film_strip import film_strip\n"
+        "from mjrec.reporting.film_strips import film_strip\n"
         "try:\n    film_strip(sys.argv[1])\n"
         "except mjrec.MissingDependency as error:\n    print(error)"
     )

@@ -426,8 +426,10 @@ def test_paper_has_pictures_and_no_buttons(usual: Page) -> None:
     expect(usual.locator("video").first).to_be_visible()
 
 
-def test_ten_thousand_episodes_open_without_lag(page: Page, tmp_path: Path) -> None:
-    """The page within 300 ms, and a click on a heading within 100 ms."""
+def test_of_ten_thousand_episodes_a_hundred_are_laid_out(
+    page: Page, tmp_path: Path
+) -> None:
+    """Opening and sorting the page cost no more than what is shown."""
     returns = np.random.default_rng(0).normal(500, 200, 2000).tolist()
     shown = {i: [i] for i in range(20)}
     tasks = [
@@ -436,28 +438,14 @@ def test_ten_thousand_episodes_open_without_lag(page: Page, tmp_path: Path) -> N
     ]
     cards = [video(i // 20, i % 20, file=f"{i}.mp4") for i in range(100)]
     report = contents(*tasks, videos=[replace(v, poster=_PIXEL) for v in cards])
-    opening, sorting = [], []
-    for _ in range(3):
-        open_report(page, tmp_path, report)
-        opening.append(page.evaluate(_TIME_OF_OPENING))
-        sorting.append(page.evaluate(_TIME_OF_SORTING))
+    open_report(page, tmp_path, report)
     expect(page.locator("#episodes-count")).to_have_text("Rows 1 to 100 of 10\u202f000")
-    # The quickest of three, because other tests run beside this one.
-    assert min(opening) < 300
-    assert min(sorting) < 100
+    expect(page.locator("#episodes tbody tr")).to_have_count(100)
+    page.locator("[data-key=total_reward] button").click()
+    expect(page.locator("#episodes tbody tr")).to_have_count(100)
+    assert page.evaluate("document.querySelectorAll('*').length") < 10_000
 
 
-_TIME_OF_OPENING = """() => {
-    const told = performance.getEntriesByType("navigation")[0];
-    return told.domContentLoadedEventEnd - told.startTime;
-}"""
-# Until the rows are laid out.
-_TIME_OF_SORTING = """() => {
-    const start = performance.now();
-    document.querySelector("[data-key=total_reward] button").click();
-    document.body.getBoundingClientRect();
-    return performance.now() - start;
-}"""
 _PIXEL = (
     "data:image/png;base64,iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk"
     "YPhfDwAChwGA60e6kgAAAABJRU5ErkJggg=="

@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from .recovery import recover as recover
     from .rendering.pictures import render as render
     from .rendering.pictures import render_states as render_states
-    from .reporting.film_strip import film_strip as film_strip
+    from .reporting.film_strips import film_strip as film_strip
     from .reporting.report_folder import write_report as write_report
     from .results import Episode as Episode
     from .results import clear_monitor_files as clear_monitor_files
@@ -108,7 +108,7 @@ _LAZY = {
     "disable_videos": "schedules",
     "evaluate": "evaluation.evaluating",
     "exit_on_signals": "signals",
-    "film_strip": "reporting.film_strip",
+    "film_strip": "reporting.film_strips",
     "iter_episodes": "results",
     "load_results": "results",
     "load_trajectory": "simulation.trajectories",

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from .. import json_text
-from ..reporting.film_strip import film_strip, write_film_strip
+from ..reporting.film_strips import film_strip, write_film_strip
 from .help_text import flowing_help
 from .view_options import camera_of, size_of
 

@@ -10,7 +10,6 @@ OpenGL: it may be killed at any time, and whoever goes on repeats nothing.
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,10 +21,11 @@ from ..engines.work import Engine, Work
 from ..errors import (
     DirectoryInUse,
     DirectoryNotWritable,
+    GLError,
     InvalidArgument,
-    MissingDependency,
 )
 from ..formats.locks import try_lock
+from ..gl.choice import choose
 from ..recorder.versions import versions
 from .chosen_videos import ChosenVideos, render_chosen
 from .evaluation import Evaluation, EvaluationProgress
@@ -39,17 +39,25 @@ from .policy_objects import SentPolicy, sent_policy
 from .recorded_files import RecordedFiles
 from .results_files import PLAN_NAME, ChosenEpisode, write_results
 from .summaries import AcrossTasks, Bootstrap, TaskSummary
+from .summarizing import (
+    default_score_range,
+    split_by_scale,
+    summarize_across,
+    summarize_results,
+)
 
 __all__ = ["evaluate"]
 
 logger = logging.getLogger(__name__)
 
-_WORKER = "mjrec.evaluation.told_checks:CheckingWorker"
+_WORKER = "mjrec.evaluation.worker:EvaluationWorker"
 _LOCK_NAME = ".mjrec.evaluation.lock"
 
 # Sums in another order are other numbers, and how many threads a library takes depends
 # on the machine; and so many processes keep all CPUs busy.
 _ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+_GL = "MUJOCO_GL"
 
 _Tell = Callable[[EvaluationProgress], object]
 
@@ -130,14 +138,13 @@ def evaluate(
         `results.csv` and `timing.csv`.
 
     Raises:
-        MissingDependency: scipy, or the framework of a task, is not installed.
+        MissingDependency: the framework of a task is not installed.
         DifferentEvaluation: what is resumed was begun in another way.
         DirectoryInUse: another evaluation writes into the directory.
         PolicyError: the policy cannot be built, or not be sent to other processes.
         Error: an argument, a task or the policy cannot be. All of these are told
             before anything is run or written.
     """
-    _check_scipy()
     local = LocalEngine(workers)
     place = Path(directory)
     begun = _begun(place, resume=resume)
@@ -183,15 +190,6 @@ def evaluate(
             bootstrap=bootstrap or Bootstrap(),
             workers=local.workers,
             tell=tell,
-        )
-
-
-def _check_scipy() -> None:
-    if importlib.util.find_spec("scipy") is None:
-        raise MissingDependency(
-            "scipy",
-            purpose="What is said of an evaluation",
-            install='pip install "mjrec[evaluation]"',
         )
 
 
@@ -251,7 +249,7 @@ def _run(
         entry=_WORKER,
         settings={"directory": str(directory.absolute()), "plan": plan_to_json(plan)},
         payload=sent.payload,
-        environ={name: "1" for name in _ONE_THREAD_EACH if name not in os.environ},
+        environ=_environ_of_workers(),
     )
     with engine.begin(work) as run:
         left = [task for task in plan.tasks if _is_left(plan, done[task.name])]
@@ -261,6 +259,16 @@ def _run(
             stack.enter_context(_held(directory))
         write_plan(directory, plan)
         return run_tasks(run, plan, directory, done=done, workers=workers, tell=tell)
+
+
+def _environ_of_workers() -> dict[str, str]:
+    wanted = dict.fromkeys(_ONE_THREAD_EACH, "1")
+    if _GL not in os.environ:
+        # Tasks that are drawn live need a backend that works, and libraries that draw
+        # complain of one that does not; a task that is not drawn needs none.
+        with contextlib.suppress(GLError):
+            wanted[_GL] = choose().backend
+    return {name: value for name, value in wanted.items() if name not in os.environ}
 
 
 def _is_left(plan: EvaluationPlan, done: Mapping[tuple[int, int], object]) -> bool:
@@ -366,14 +374,6 @@ def _summarized(
     ranges: Mapping[str, tuple[float, float]],
     bootstrap: Bootstrap,
 ) -> tuple[list[TaskSummary], AcrossTasks]:
-    # Not at the top: scipy is an extra, and takes a while to import.
-    from .summarizing import (
-        default_score_range,
-        split_by_scale,
-        summarize_across,
-        summarize_results,
-    )
-
     scales = {
         task.name: ranges.get(task.name)
         or default_score_range(task.name, plan.max_steps)

@@ -5,7 +5,9 @@ Settings: `{"directory": DIR, "plan": <the plan as JSON>}`; payload: the pickled
 where it is an object. Jobs, by their `kind`, each of which may be done again:
 
 `check`    `{"task"}`: makes the environment and the policy, and takes no step. Returns
-           `{"env_id", "step_limit", "deferrable", "reason"}`.
+           `{"env_id", "step_limit", "deferrable", "reason"}`, or `{"error": ...}`
+           where they cannot be: as `carried_errors` packs it, so that it comes home
+           as what it is, and leaves no traceback in the log that nobody needs.
 `run`      `{"task", "folder", "seed", "episodes"}`: runs those episodes of a batch
            that no ledger has. Returns `{"episodes": how many it ran}`.
 `recover`  `{"folder"}`: puts in order what killed workers left. Returns
@@ -18,10 +20,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ..carried_errors import carried
+from ..errors import Error
 from ..recorder.options import DEFERRED
 from .plan import Batch
 from .plan_json import plan_from_json
@@ -52,12 +57,16 @@ class EvaluationWorker:
             "recover": self._recover,
             "settle": self._settle,
         }
+        # dm_control tries GLFW where no other backend was found, and complains of the
+        # display that a machine without a screen has not got. Where that matters,
+        # drawing says so.
+        warnings.filterwarnings("ignore", message=r"\(65550\) b'X11")
 
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Do a job.
 
         Raises:
-            Error: of what the job is about; the module says which job is which.
+            Error: of what the job is about, unless it is a check.
         """
         return self._by_kind[arguments["kind"]](arguments)
 
@@ -65,6 +74,12 @@ class EvaluationWorker:
         """Do nothing: nothing is held between jobs."""
 
     def _check(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        try:
+            return self._checked(arguments)
+        except Error as error:
+            return {"error": carried(error)}
+
+    def _checked(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         seed = self._evaluation.plan.seeds[0]
         named = make_acting(self._evaluation, arguments["task"], seed).named
         with contextlib.closing(named.environment):

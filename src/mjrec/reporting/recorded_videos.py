@@ -240,7 +240,7 @@ def _camera(camera: Any) -> str | None:
     return _posed(camera) if isinstance(camera, Mapping) else None
 
 
-def _posed(camera: Mapping[str, Any]) -> str:
+def _posed(camera: Mapping[str, Any]) -> str | None:
     if camera.get("type") == "mjCAMERA_FIXED":
         fixed = camera.get("fixedcamid")
         return f"camera {fixed}" if type(fixed) is int else None
