@@ -30,6 +30,7 @@ from ..recorder.versions import versions
 from .chosen_videos import ChosenVideos, render_chosen
 from .evaluation import Evaluation, EvaluationProgress
 from .following import TaskRun, check_tasks, run_tasks
+from .kept_episodes import keep_rule
 from .ledger import read_ledgers
 from .plan import SEEDED, EvaluationPlan
 from .plan_file import check_continues, read_plan, write_plan
@@ -249,7 +250,7 @@ def _run(
         entry=_WORKER,
         settings={"directory": str(directory.absolute()), "plan": plan_to_json(plan)},
         payload=sent.payload,
-        environ=_environ_of_workers(),
+        environ=_environ_of_workers(draws=not keep_rule(plan.keep).keeps_none),
     )
     with engine.begin(work) as run:
         left = [task for task in plan.tasks if _is_left(plan, done[task.name])]
@@ -261,11 +262,10 @@ def _run(
         return run_tasks(run, plan, directory, done=done, workers=workers, tell=tell)
 
 
-def _environ_of_workers() -> dict[str, str]:
+def _environ_of_workers(*, draws: bool) -> dict[str, str]:
     wanted = dict.fromkeys(_ONE_THREAD_EACH, "1")
-    if _GL not in os.environ:
-        # Tasks that are drawn live need a backend that works, and libraries that draw
-        # complain of one that does not; a task that is not drawn needs none.
+    if draws and _GL not in os.environ:
+        # A task that is drawn live needs a backend that works.
         with contextlib.suppress(GLError):
             wanted[_GL] = choose().backend
     return {name: value for name, value in wanted.items() if name not in os.environ}

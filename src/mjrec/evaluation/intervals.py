@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -327,14 +327,9 @@ def _across_by_bootstrap(
         drawn = np.concatenate([places[task][block[task]] for task in scores], axis=1)
         drawn.sort(axis=1)
         iqms.append(pooled[drawn[:, first:end]].mean(axis=1))
-        gaps.append(
-            np.mean([shortfalls[t][block[t]].mean(axis=1) for t in scores], axis=0)
-        )
+        gaps.append(_mean([shortfalls[t][block[t]].mean(axis=1) for t in scores]))
         profiles.append(
-            np.mean(
-                [_shares_above(ordered[t], block[t], thresholds) for t in scores],
-                axis=0,
-            )
+            _mean(_shares_above(ordered[t], block[t], thresholds) for t in scores)
         )
     low, high = np.quantile(np.concatenate(profiles), _tails(bootstrap), axis=0)
     return AcrossIntervals(
@@ -343,6 +338,16 @@ def _across_by_bootstrap(
         low,
         high,
     )
+
+
+def _mean(arrays: Iterable[FloatArray]) -> FloatArray:
+    """Return the mean of arrays of one shape, of which one is held at a time."""
+    total, count = None, 0
+    for array in arrays:
+        total = array if total is None else np.add(total, array, out=total)
+        count += 1
+    assert total is not None
+    return total / count
 
 
 def _shares_above(
