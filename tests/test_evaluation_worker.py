@@ -71,6 +71,7 @@ def test_a_task_is_checked_without_a_step(tmp_path: Path) -> None:
         "step_limit": 8,
         "deferrable": True,
         "reason": None,
+        "velocities": 2,
     }
     assert list(tmp_path.iterdir()) == []
 

@@ -254,12 +254,20 @@ def _run(
     )
     with engine.begin(work) as run:
         left = [task for task in plan.tasks if _is_left(plan, done[task.name])]
-        check_tasks(run, plan, left)
+        amounts = check_tasks(run, plan, left)
         if not is_begun:
             _make(directory)
             stack.enter_context(_held(directory))
         write_plan(directory, plan)
-        return run_tasks(run, plan, directory, done=done, workers=workers, tell=tell)
+        return run_tasks(
+            run,
+            plan,
+            directory,
+            done=done,
+            work=amounts,
+            workers=workers,
+            tell=tell,
+        )
 
 
 def _environ_of_workers(*, draws: bool) -> dict[str, str]:

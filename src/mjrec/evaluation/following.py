@@ -59,8 +59,13 @@ class TaskRun:
     problem: str | None = None
 
 
-def check_tasks(run: Run, plan: EvaluationPlan, tasks: Iterable[EvaluatedTask]) -> None:
+def check_tasks(
+    run: Run, plan: EvaluationPlan, tasks: Iterable[EvaluatedTask]
+) -> dict[str, int]:
     """Let workers make the environment and the policy of each task, and no step.
+
+    Returns:
+        How much work a step of each task is, roughly, by name.
 
     Raises:
         Error: the one that making them raised, such as an `UnknownName`.
@@ -71,10 +76,13 @@ def check_tasks(run: Run, plan: EvaluationPlan, tasks: Iterable[EvaluatedTask]) 
     for key, name in names.items():
         run.submit(Job(key=key, arguments={"kind": "check", "task": name}))
     rule = keep_rule(plan.keep)
+    work: dict[str, int] = {}
     for outcome in run.results():
         # Without patience there is always one.
         assert outcome is not None
-        _check(names[outcome.key], outcome, rule)
+        name = names[outcome.key]
+        work[name] = _checked(name, outcome, rule)["velocities"]
+    return work
 
 
 def run_tasks(
@@ -83,6 +91,7 @@ def run_tasks(
     directory: Path,
     *,
     done: _Done,
+    work: Mapping[str, int],
     workers: int,
     tell: _Tell,
 ) -> list[TaskRun]:
@@ -93,16 +102,17 @@ def run_tasks(
         plan: what is evaluated.
         directory: of the evaluation.
         done: the results of what was done before, by task.
+        work: how much a step of each task is that is not done, as `check_tasks` says.
         workers: how many processes it is for.
         tell: is told how far it is.
 
     Raises:
         Error: workers cannot be started, or a ledger is damaged.
     """
-    return _Runner(run, plan, directory, tell).run(done, workers)
+    return _Runner(run, plan, directory, tell).run(done, work, workers)
 
 
-def _check(task: str, outcome: JobOutcome, rule: KeepRule) -> None:
+def _checked(task: str, outcome: JobOutcome, rule: KeepRule) -> Mapping[str, Any]:
     if outcome.failure is not None:
         # No error of ours, which would have been told: its worker died, or worse.
         raise EnvironmentNotMade(task, outcome.failure)
@@ -116,6 +126,7 @@ def _check(task: str, outcome: JobOutcome, rule: KeepRule) -> None:
             f"{said.get('reason')} Use keep='cubic', 'all' or 'none' (--keep cubic), "
             "which are known beforehand."
         )
+    return said
 
 
 class _Runner:
@@ -140,8 +151,10 @@ class _Runner:
         self._batches: dict[str, Batch] = {}
         self._counts = LedgerCounts(directory / task.folder for task in plan.tasks)
 
-    def run(self, done: _Done, workers: int) -> list[TaskRun]:
-        for batch in batches_of(self._plan, done, workers=workers):
+    def run(self, done: _Done, work: Mapping[str, int], workers: int) -> list[TaskRun]:
+        batches = batches_of(self._plan, done, workers=workers)
+        # What takes long comes first, so that all workers end at about the same time.
+        for batch in sorted(batches, key=lambda batch: -work.get(batch.task, 0)):
             self._submit_batch(batch)
         for of in self._tasks.values():
             if not of.unfinished:

@@ -5,7 +5,8 @@ Settings: `{"directory": DIR, "plan": <the plan as JSON>}`; payload: the pickled
 where it is an object. Jobs, by their `kind`, each of which may be done again:
 
 `check`    `{"task"}`: makes the environment and the policy, and takes no step. Returns
-           `{"env_id", "step_limit", "deferrable", "reason"}`, or `{"error": ...}`
+           `{"env_id", "step_limit", "deferrable", "reason", "velocities"}`, the last
+           one the number of degrees of freedom (0 without MuJoCo), or `{"error": ...}`
            where they cannot be: as `carried_errors` packs it, so that it comes home
            as what it is, and leaves no traceback in the log that nobody needs.
 `run`      `{"task", "folder", "seed", "episodes"}`: runs those episodes of a batch
@@ -28,6 +29,7 @@ from typing import Any
 from ..carried_errors import carried
 from ..errors import Error
 from ..recorder.options import DEFERRED
+from ..simulation.inside import simulation_in
 from .plan import Batch
 from .plan_json import plan_from_json
 from .running import Evaluation, make_acting, rendering_of, run_batch
@@ -89,6 +91,7 @@ class EvaluationWorker:
             "step_limit": named.step_limit,
             "deferrable": choice is None or choice.mode == DEFERRED,
             "reason": None if choice is None else choice.reason,
+            "velocities": _velocities(named.environment),
         }
 
     def _run(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -127,3 +130,8 @@ class EvaluationWorker:
 
     def _folder(self, arguments: Mapping[str, Any]) -> Path:
         return self._evaluation.directory / str(arguments["folder"])
+
+
+def _velocities(environment: Any) -> int:
+    simulation = simulation_in(environment)
+    return 0 if simulation is None else int(simulation.model.nv)
