@@ -15,8 +15,10 @@ import pytest
 from benchmarks import (
     disk,
     encoding,
+    evaluating,
     memory,
     rendering,
+    reporting,
     stepping,
     time_to_video,
     verifying,
@@ -190,6 +192,28 @@ def test_verifying_is_compared_with_stepping() -> None:
     kept = promised(results)
     assert kept["steps alone"] == "≤ 1.5"
     assert kept["steps and environment"] == "≤ 2.5"
+
+
+@pytest.mark.dm_control
+def test_evaluating_compares_two_workers_with_one() -> None:
+    """The promise is a part of the time of one."""
+    settings = evaluating.Settings(rounds=1, tasks=1, episodes=1, steps=2)
+    results = evaluating.measure(settings, silently)
+    assert labels(results) == [
+        ("1 tasks, 1 episodes each", "1 worker"),
+        ("1 tasks, 1 episodes each", "2 workers"),
+    ]
+    assert promised(results) == {"2 workers": "≤ 0.588235"}
+
+
+def test_reporting_is_compared_with_loading() -> None:
+    """And the memory of many episodes has a limit."""
+    settings = reporting.Settings(rounds=1, episodes=20, videos=2, many_episodes=100)
+    results = reporting.measure(settings, silently)
+    kept = promised(results)
+    assert kept["report written"] == "≤ 3"
+    assert kept["results loaded, peak memory"] == "≤ 500"
+    assert all(r.median > 0 for r in results if r.samples)
 
 
 def test_disk_gives_the_size_of_every_file() -> None:

@@ -91,6 +91,28 @@ def test_results_do_not_depend_on_the_workers(reference: Path, tmp_path: Path) -
     assert contents(tmp_path / "two") == contents(reference)
 
 
+def test_what_takes_long_begins_first(reference: Path) -> None:
+    """Whatever the order of the plan, so that no worker ends long after the others."""
+    with (reference / "timing.csv").open(newline="") as file:
+        begun_at = {row["task"]: float(row["start"]) for row in csv.DictReader(file)}
+    # One of its two pendulums has one joint more.
+    assert begun_at[DOUBLE] < begun_at[PENDULUM]
+
+
+def test_workers_are_given_an_opengl_backend_that_works(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nobody has chosen one, for tasks that are drawn while they run."""
+    monkeypatch.delenv("MUJOCO_GL")
+
+    def push(_: Any) -> Any:
+        assert os.environ["MUJOCO_GL"] in ("egl", "osmesa")
+        return np.zeros(1)
+
+    evaluation = run(tmp_path / "e", policy=push, keep="best", episodes=1, num_seeds=1)
+    assert [each.failure for each in evaluation.results] == [None]
+
+
 def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
     """By rule, for each task; table, metadata and report of it agree."""
     evaluation = run(tmp_path / "e", keep="best,worst")
