@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -165,11 +166,12 @@ def usual(page: Page, videos: Path) -> Page:
 
 def test_videos_play(usual: Page) -> None:
     """Each at its size and for its time, and one at a time."""
+    expect(usual.locator("video")).to_have_count(0)
+    buttons = usual.get_by_role("button", name="Play dm_control/")
+    expect(buttons).to_have_count(4)
     players = usual.locator("video")
-    expect(players).to_have_count(4)
     for i in range(4):
-        players.nth(i).scroll_into_view_if_needed()
-        players.nth(i).click()
+        buttons.first.click()
         usual.wait_for_function(
             "i => document.querySelectorAll('video')[i].currentTime > 0.1", arg=i
         )
@@ -182,6 +184,20 @@ def test_videos_play(usual: Page) -> None:
         assert told[4] is None
     playing = "[...document.querySelectorAll('video')].filter(v => !v.paused).length"
     assert usual.evaluate(playing) <= 1
+
+
+@pytest.mark.parametrize("key", ["Enter", "Space"])
+def test_a_video_is_played_by_keyboard(usual: Page, key: str) -> None:
+    """Its player has the keyboard then, and the name of what it plays."""
+    button = usual.locator("#video-1").get_by_role("button", name="Play dm_control/")
+    button.press(key)
+    player = usual.locator("#video-1 video")
+    expect(player).to_be_focused()
+    expect(player).to_have_accessible_name(re.compile("^dm_control/walker-walk, seed"))
+    usual.wait_for_function("() => document.querySelector('video').currentTime > 0.1")
+    usual.keyboard.press("Space")
+    assert player.evaluate("v => v.paused")
+    expect(usual.locator("video")).to_have_count(1)
 
 
 @pytest.mark.parametrize("single_file", [False, True])
@@ -198,8 +214,9 @@ def test_a_recordings_report_plays(
     page.goto(index.resolve().as_uri())
     expect(page.locator("#summary-table tbody tr")).to_have_count(1)
     expect(page.locator("#episodes-count")).to_have_text("Rows 1 to 3 of 3")
+    expect(page.locator("video")).to_have_count(0)
+    page.get_by_role("button", name="Play").first.click()
     player = page.locator("video").first
-    player.click()
     page.wait_for_function("() => document.querySelector('video').currentTime > 0.1")
     # The environment's own rate is 10, and the first picture is the reset's.
     assert player.evaluate("v => v.duration") == pytest.approx(2.1, abs=0.1)
@@ -411,7 +428,9 @@ def test_without_scripts_everything_but_the_tools_is_there(
     with browser.new_context(java_script_enabled=False) as context:
         page = context.new_page()
         open_report(page, videos, usual_report())
-        expect(page.locator("video")).to_have_count(4)
+        links = page.get_by_role("link", name="Play dm_control/")
+        expect(links).to_have_count(4)
+        assert (links.first.get_attribute("href") or "").endswith(".mp4")
         expect(page.locator("#summary-table tbody tr")).to_have_count(2)
         expect(page.locator("noscript")).to_be_visible()
         expect(page.locator("#gallery-filter")).to_be_hidden()
@@ -423,7 +442,11 @@ def test_paper_has_pictures_and_no_buttons(usual: Page) -> None:
     usual.emulate_media(media="print")
     expect(usual.locator("#gallery-filter")).to_be_hidden()
     expect(usual.locator("nav")).to_be_hidden()
-    expect(usual.locator("video").first).to_be_visible()
+    picture = usual.locator(".play").first
+    expect(picture).to_be_visible()
+    sign = "e => [getComputedStyle(e, '::before'), getComputedStyle(e, '::after')]"
+    shown = picture.evaluate(f"e => ({sign})(e).map(s => s.display)")
+    assert shown == ["none", "none"]
 
 
 def test_of_ten_thousand_episodes_a_hundred_are_laid_out(

@@ -8,14 +8,16 @@ import re
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
+from importlib.metadata import version
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
 from report_contents import HOSTILE, columns, contents, task, video
 
 from mjrec.errors import MissingDependency
-from mjrec.evaluation.summaries import AcrossTasks, Interval, Profile
+from mjrec.evaluation.summaries import AcrossTasks, Interval, Profile, TaskSummary
 from mjrec.reporting.contents import ReportContents, Verdict
 from mjrec.reporting.curves import evaluation_curve, learning_curve, profile_curve
 from mjrec.reporting.numbers import decimals_for, number, whole_number
@@ -100,7 +102,9 @@ def test_texts_of_strangers_stay_text() -> None:
     page = page_of(hostile_report())
     plain = Elements(page)
     assert len(plain.named("script")) == 2
-    assert not plain.named("img")
+    assert {image["src"] for image in plain.named("img")} == {
+        f"./{quote(text, safe='/')}" for text in HOSTILE
+    }
     handlers = [a for _, attributes in plain.found for a in attributes if a[:2] == "on"]
     assert handlers == []
     assert HOSTILE[0] in plain.texts["h1"]
@@ -178,18 +182,21 @@ def test_the_policy_lets_only_the_pages_own_style_and_script_run() -> None:
 )
 def test_a_path_becomes_an_address(path: str, address: str) -> None:
     """Of a file beside the page, whatever it looks like, or a video's bytes."""
-    (player,) = Elements(page_of(contents(videos=[video(file=path)]))).named("video")
-    assert player["src"] == address
+    page = Elements(page_of(contents(videos=[video(file=path)])))
+    (link,) = [a for a in page.named("a") if a.get("class") == "play"]
+    assert link["href"] == address
 
 
 def test_a_card_says_what_a_video_shows() -> None:
     """Its episode, its size, and how it is made again."""
     page = page_of(contents(videos=[video(index=12, roles=("worst", "best"))]))
-    (player,) = Elements(page).named("video")
-    assert (player["width"], player["height"]) == ("64", "48")
-    assert player["poster"] == "./videos/a%20b.png"
+    (picture,) = Elements(page).named("img")
+    assert (picture["width"], picture["height"]) == ("64", "48")
+    assert picture["src"] == "./videos/a%20b.png"
+    assert picture["loading"] == "lazy"
     card = page[page.index('id="video-0"') : page.index('id="episodes"')]
     for words in (
+        "Play <bdi>dm_control/walker-walk, seed 1, episode 2, side</bdi>",
         "seed 1, episode 2",
         "15 steps",
         "truncated",
@@ -199,6 +206,66 @@ def test_a_card_says_what_a_video_shows() -> None:
         "mjrec render evaluation/walker --episode 3 -o again.mp4",
     ):
         assert words in card
+
+
+def test_a_video_that_is_embedded_stands_in_the_page_once() -> None:
+    """Its link saves it, for no browser opens a page that is such an address."""
+    page = page_of(contents(videos=[video(file="data:video/mp4;base64,AAAA")]))
+    assert page.count("data:video/mp4") == 1
+    (link,) = [a for a in Elements(page).named("a") if a.get("class") == "play"]
+    assert link["download"] == "a b.mp4"
+
+
+def test_the_parts_of_a_rule_stand_apart() -> None:
+    """Beside the videos, on a card, and in the provenance; nothing else changes."""
+    pairs = [("Policy", "best,median"), ("Selection of videos", "best:2,median,worst")]
+    made = task("a", columns([1.0, 2.0]), provenance=pairs)
+    note = "Chosen by best:2,median,worst among 3 episodes."
+    page = page_of(contents(made, videos=[video(notes=[note])]))
+    assert page.count("best:2, median, worst") == 3
+    assert "best:2,median" not in page
+    assert "best,median" in page
+
+
+def test_why_a_task_has_no_figures_is_said() -> None:
+    """Where a return is no finite number, and only there."""
+    made = task("odd", columns([1.0, 2.0, 3.0]))
+    summary = TaskSummary(task="odd", runs=1, episodes=3, not_finite=1)
+    page = page_of(contents(replace(made, summary=summary), task("b", columns([1.0]))))
+    assert re.search(
+        r"<li><span[^>]*>odd</span>: No figures of the returns: 1 of 3 returns is no "
+        r"finite number\.</li>",
+        page,
+    )
+    assert page.count("No figures of the returns") == 1
+
+
+def test_it_is_said_how_intervals_were_made() -> None:
+    """For most tasks in the head, for others below the table."""
+    few = columns([1.0, 2.0, 3.0])
+    large = task("large", columns([1.0, 2.0]))
+    large = replace(
+        large,
+        summary=replace(large.summary, interval_method="large-sample normal interval"),
+    )
+    head = r"intervals of 95\xa0%: ([^.]*)\."
+    mixed = page_of(contents(task("a", few), task("b", few), large))
+    (usual,) = re.findall(head, mixed)
+    assert usual.endswith("50 resamples, seed 0")
+    assert re.search(
+        r">large</span>: Intervals by another method, large-sample normal int", mixed
+    )
+    alone = page_of(contents(large, across={}))
+    assert re.findall(head, alone) == ["large-sample normal interval"]
+    assert "resamples" not in alone
+    assert re.findall(head, page_of(contents(task("one", columns([1.0]))))) == []
+
+
+def test_the_page_says_what_has_made_it() -> None:
+    """By this mark a report is known as one, and may be replaced."""
+    page = page_of(contents(), curves=False)
+    mark = {"name": "generator", "content": f"mjrec {version('mjrec')}"}
+    assert mark in Elements(page).named("meta")
 
 
 def test_the_rule_of_selection_stands_beside_the_videos() -> None:
@@ -241,7 +308,8 @@ def test_not_every_video_of_thousands_has_a_player() -> None:
         for i in range(600)
     ]
     page = page_of(contents(task("a", episodes), videos=videos))
-    assert len(Elements(page).named("video")) == 300
+    links = [a for a in Elements(page).named("a") if a.get("class") == "play"]
+    assert len(links) == 300
     places = data_of(page)["tasks"][0]["videos"]
     assert places["599"] == ["#video-599"]
     assert places["598"] == ["./598.mp4"]
@@ -251,7 +319,7 @@ def test_a_video_that_is_no_part_of_the_report_has_no_player() -> None:
     """But its picture, its notes, and the command that renders it."""
     page = page_of(contents(videos=[video(file="", notes=["It is too large."])]))
     elements = Elements(page)
-    assert not elements.named("video")
+    assert "play" not in [a.get("class") for a in elements.named("a")]
     assert [image["src"] for image in elements.named("img")] == ["./videos/a%20b.png"]
     assert "It is too large." in page
     assert "mjrec render" in page

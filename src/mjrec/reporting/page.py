@@ -15,9 +15,11 @@ import hashlib
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from html import escape
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from urllib.parse import quote
@@ -26,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingDependency
+from ..evaluation.intervals import PERCENTILE_BOOTSTRAP
 from ..evaluation.summaries import AcrossTasks, Bootstrap, Interval, TaskSummary
 from .contents import EpisodeColumns, ReportContents, ReportTask, ReportVideo, Verdict
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
@@ -177,18 +180,21 @@ def _page(contents: ReportContents, *, curves: bool) -> dict[str, Any]:
     common, differing = _provenance(tasks)
     return {
         "title": contents.title,
+        "version": version("mjrec"),
         "subtitle": _subtitle(contents),
         "problems": list(contents.problems[:_MOST_PROBLEMS]),
         "problems_left_out": len(contents.problems[_MOST_PROBLEMS:]),
         "verdicts": [_verdict(verdict) for verdict in contents.verdicts],
         "rows": [_row(task.summary, task.name) for task in tasks],
         "has_bars": any(_scale(task.summary) for task in tasks),
+        "has_success_intervals": any(task.summary.success_interval for task in tasks),
         "has_successes": any(task.summary.success_known for task in tasks),
         "has_warnings": any(task.summary.warnings for task in tasks),
-        "intervals": _intervals(contents.bootstrap),
+        "intervals": _words_of(_usual_method(contents), contents.bootstrap),
+        "notes": list(_notes(contents)),
         "percent": f"{contents.bootstrap.confidence * 100:.4g}\N{NO-BREAK SPACE}%",
         "across": [
-            _across(name, told, i)
+            _across(name, told, i, contents)
             for i, (name, told) in enumerate(contents.across.items())
         ],
         "profile": _profile(contents) if curves else None,
@@ -353,9 +359,53 @@ def _bar(summary: TaskSummary, decimals: int) -> _Bar | None:
     )
 
 
-def _intervals(bootstrap: Bootstrap) -> str:
+def _usual_method(contents: ReportContents) -> str | None:
+    """Return how most tasks' intervals were made; None where there are none."""
+    methods = [_method(task.summary) for task in contents.tasks]
+    counted = Counter(method for method in methods if method is not None)
+    return max(counted, key=counted.__getitem__, default=None)
+
+
+def _method(summary: TaskSummary) -> str | None:
+    if summary.mean_interval is None and summary.iqm_interval is None:
+        return None
+    return summary.interval_method or PERCENTILE_BOOTSTRAP
+
+
+def _words_of(method: str | None, bootstrap: Bootstrap) -> str | None:
+    """Return how intervals were made, with what that method depends on."""
+    if method != PERCENTILE_BOOTSTRAP:
+        return method
     told = f"{bootstrap.method}, {whole_number(bootstrap.resamples)} resamples"
     return f"{told}, seed {bootstrap.seed}"
+
+
+class _Note(NamedTuple):
+    """What is to be said of the figures of some tasks."""
+
+    words: str
+    tasks: Sequence[str]
+
+
+def _notes(contents: ReportContents) -> Iterator[_Note]:
+    """Yield why figures are missing, and where intervals were made in another way."""
+    for task in contents.tasks:
+        if count := task.summary.not_finite:
+            of = _plural(task.summary.episodes, "return")
+            what = "is no finite number" if count == 1 else "are no finite numbers"
+            yield _Note(
+                f"No figures of the returns: {whole_number(count)} of {of} {what}",
+                [task.name],
+            )
+    usual = _usual_method(contents)
+    others: dict[str, list[str]] = {}
+    for task in contents.tasks:
+        method = _method(task.summary)
+        if method is not None and method != usual:
+            others.setdefault(method, []).append(task.name)
+    for method, names in others.items():
+        words = _words_of(method, contents.bootstrap)
+        yield _Note(f"Intervals by another method, {words}", names)
 
 
 # --- All tasks together, and figures ----------------------------------------------
@@ -368,9 +418,12 @@ class _Across(NamedTuple):
     series: int
     tiles: Sequence[tuple[str, str, str]]
     left_out: Sequence[tuple[str, str]]
+    method: str | None
 
 
-def _across(name: str, told: AcrossTasks, index: int) -> _Across:
+def _across(
+    name: str, told: AcrossTasks, index: int, contents: ReportContents
+) -> _Across:
     tiles = [
         ("Interquartile mean", _score(told.iqm), _interval(told.iqm_interval, 3)),
         (
@@ -382,7 +435,15 @@ def _across(name: str, told: AcrossTasks, index: int) -> _Across:
         ("Mean of tasks", _score(told.mean), ""),
         ("Tasks", str(len(told.tasks)), ""),
     ]
-    return _Across(name, index % SERIES, tiles, list(told.left_out.items()))
+    is_usual = told.interval_method == _usual_method(contents)
+    method = _words_of(told.interval_method, contents.bootstrap)
+    return _Across(
+        name,
+        index % SERIES,
+        tiles,
+        list(told.left_out.items()),
+        None if is_usual else method,
+    )
 
 
 def _score(value: float | None) -> str:
@@ -436,6 +497,7 @@ class _Card(NamedTuple):
     task_name: str
     roles: Sequence[str]
     is_video: bool
+    is_embedded: bool
     url: _Url | None
     poster: _Url | None
     width: int | None
@@ -473,13 +535,15 @@ def _card(index: int, video: ReportVideo, task: ReportTask) -> _Card:
     decimals = decimals_for((task.summary.minimum, task.summary.maximum))
     reward = None if at is None else float(columns.total_reward[at])
     which = "" if at is None else _which(task, at)
+    url = _url(video.file, "video") if video.file else None
     return _Card(
         number=index,
         task=video.task,
         task_name=task.name,
         roles=[role for role in _ROLES if role in video.roles],
         is_video=not video.file.endswith(".json"),
-        url=_url(video.file, "video") if video.file else None,
+        is_embedded=url is not None and url.startswith("data:"),
+        url=url,
         poster=None if video.poster is None else _url(video.poster, "image"),
         width=video.width,
         height=video.height,
@@ -489,7 +553,7 @@ def _card(index: int, video: ReportVideo, task: ReportTask) -> _Card:
         facts=list(_facts(video, task)),
         sha256=video.sha256,
         command=video.command,
-        notes=video.notes,
+        notes=[_readable(note) for note in video.notes],
         failure=None if at is None else columns.failures.get(at),
     )
 
@@ -546,12 +610,21 @@ def _tasks_with_videos(
 def _selection(tasks: Sequence[ReportTask]) -> list[str]:
     """Return the rules by which episodes got a video, as the provenance states them."""
     rules = {
-        value: None
+        _readable(value): None
         for task in tasks
         for label, value in task.provenance
         if _SELECTION in label.casefold()
     }
     return list(rules)[:10]
+
+
+_CHOICE: Final = r"(?:best|median|worst|failures)(?::\d+)?"
+_CHOICES: Final = re.compile(rf"\b({_CHOICE}),(?={_CHOICE}\b)")
+
+
+def _readable(rule: str) -> str:
+    """Return what is said of a rule of selection, with its parts apart."""
+    return _CHOICES.sub(r"\1, ", rule)
 
 
 # --- The table of episodes --------------------------------------------------------
@@ -682,9 +755,14 @@ def _provenance(tasks: Sequence[ReportTask]) -> tuple[_Pairs, list[tuple[str, _P
         return [], []
     others = [set(task.provenance) for task in tasks]
     everywhere = set.intersection(*others)
-    common = [pair for pair in tasks[0].provenance if pair in everywhere]
+    common = [_pair(pair) for pair in tasks[0].provenance if pair in everywhere]
     differing = [
-        (task.name, [pair for pair in task.provenance if pair not in everywhere])
+        (task.name, [_pair(pair) for pair in task.provenance if pair not in everywhere])
         for task in tasks
     ]
     return common, [(name, pairs) for name, pairs in differing if pairs]
+
+
+def _pair(pair: tuple[str, str]) -> tuple[str, str]:
+    label, value = pair
+    return label, _readable(value) if _SELECTION in label.casefold() else value

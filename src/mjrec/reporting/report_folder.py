@@ -16,7 +16,6 @@ else.
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import os
 import re
 import shutil
@@ -45,7 +44,6 @@ __all__ = ["write_report"]
 PAGE_NAME: Final = "index.html"
 
 _PAGE_ENDINGS: Final = (".html", ".htm")
-_CHARSET: Final = '<meta charset="utf-8">'
 _GENERATOR: Final = re.compile(rb'<meta name="generator" content="mjrec [^"]*">')
 _BEGIN: Final = 4096
 _SHOWN: Final = 5
@@ -110,7 +108,7 @@ def write_report(
     with _replacing_folder(target) as folder:
         if not single_file:
             contents = with_copied_videos(contents, posters, folder, tell)
-            page = _page(contents)
+            page = page_of(contents)
         write_text(folder / PAGE_NAME, page)
     return Path(path) / PAGE_NAME
 
@@ -119,7 +117,7 @@ def _single_page(
     contents: ReportContents, posters: Sequence[bytes | None], most_bytes: int
 ) -> str:
     bare = with_embedded_videos(contents, [None] * len(posters), room=0)
-    size = len(_page(bare).encode())
+    size = len(page_of(bare).encode())
     if size > most_bytes:
         raise InvalidArgument(
             f"The page has {size} bytes without any picture or video, and "
@@ -127,19 +125,12 @@ def _single_page(
         )
     room = most_bytes - size
     while True:
-        page = _page(with_embedded_videos(contents, posters, room=room))
+        page = page_of(with_embedded_videos(contents, posters, room=room))
         used = len(page.encode()) - size
         if size + used <= most_bytes:
             return page
-        # What is embedded may stand there more than once.
+        # A card with a video has more markup than the bare one.
         room = min(room - 1, room * (most_bytes - size) // used)
-
-
-def _page(contents: ReportContents) -> str:
-    """Return the page, with the mark by which it is known as one of ours."""
-    version = importlib.metadata.version("mjrec")
-    mark = f'<meta name="generator" content="mjrec {version}">'
-    return page_of(contents).replace(_CHARSET, f"{_CHARSET}\n{mark}", 1)
 
 
 def _check_target(target: Path, *, is_page: bool) -> None:

@@ -91,14 +91,39 @@
     }, true);
   }
 
-  // Chromium begins a video that it has not read only by the button, not by the picture.
-  function playByPicture() {
-    const heightOfControls = 70;
-    document.addEventListener("click", (event) => {
-      const video = event.target;
-      if (!(video instanceof HTMLVideoElement) || !video.paused || video.readyState > 0) return;
-      if (event.offsetY < video.clientHeight - heightOfControls) video.play().catch(() => {});
-    });
+  // A player costs milliseconds to make, and there may be hundreds: each is made when
+  // it is wanted. Until then its place has a button, and without this script a link.
+  function playWhenAsked() {
+    for (const link of all("a.play")) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.className = "play";
+      button.append(...link.childNodes);
+      button.addEventListener("click", () => {
+        const video = playerOf(link, button);
+        button.replaceWith(video);
+        video.focus({ preventScroll: true });
+        video.play().catch(() => {});
+      });
+      link.replaceWith(button);
+    }
+  }
+
+  function playerOf(link, button) {
+    const video = document.createElement("video");
+    const picture = one("img", button);
+    if (picture) {
+      video.poster = picture.src;
+      for (const name of ["width", "height"]) {
+        if (picture.hasAttribute(name)) video.setAttribute(name, picture.getAttribute(name));
+      }
+    }
+    video.controls = true;
+    video.playsInline = true;
+    video.tabIndex = 0;
+    video.setAttribute("aria-label", one("bdi", button).textContent);
+    video.src = link.href;
+    return video;
   }
 
   // --- Copying --------------------------------------------------------------------
@@ -233,6 +258,8 @@
         link.href = place;
         link.textContent = k ? ` ${k + 1}` : "video";
         link.setAttribute("aria-label", `Video ${k + 1} of ${t.name}, episode ${t.episode[i]}`);
+        // No browser opens a page that is such an address.
+        if (place.startsWith("data:")) link.download = "";
         if (place.startsWith("#")) link.addEventListener("click", () => showCard(place));
         videos.append(link);
       });
@@ -271,7 +298,7 @@
   sortSummary(one("#summary-table"));
   startEpisodes((place) => { if (one(place)?.hidden) reset(); });
   playOneAtATime();
-  playByPicture();
+  playWhenAsked();
   addCopyButtons();
   printPosters();
 })();
