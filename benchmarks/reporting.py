@@ -32,6 +32,7 @@ __all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure"]
 TITLE = "Reporting: a training of many episodes on a page"
 
 _LOADED, _WRITTEN, _OPENED = "results loaded", "report written", "page opened"
+_EMPTY = "empty page opened"
 _WRITING_PROMISE = at_most(3)
 # What a person takes for at once.
 _OPENING_PROMISE = at_most(300)
@@ -171,8 +172,17 @@ def seconds_to_write(directory: str, report: str) -> float:
     return seconds - (posters[-1] - posters[0]) if posters else seconds
 
 
-def milliseconds_to_open(report: str) -> float:
-    """Return when Chromium has read the page and run its script."""
+def milliseconds_to_open(page: str, empty: str) -> float:
+    """Return how long a browser takes to read a page and to run its script.
+
+    Chromium is started anew and has no profile, so nothing of the page is cached or
+    compiled. It opens an empty file first: what follows is the page's own time, and
+    not that of the browser's start, during which it still loads parts of itself.
+
+    Args:
+        page: the file to open.
+        empty: an empty page, on the disk as well.
+    """
     from playwright.sync_api import sync_playwright
 
     arguments = ("--no-sandbox", "--disable-gpu", "--disable-background-networking")
@@ -180,9 +190,10 @@ def milliseconds_to_open(report: str) -> float:
         browser = playwright.chromium.launch(
             executable_path=_CHROMIUM, args=list(arguments)
         )
-        page = browser.new_page()
-        page.goto(Path(report, "index.html").as_uri())
-        milliseconds: float = page.evaluate(
+        tab = browser.new_page()
+        tab.goto(Path(empty).as_uri())
+        tab.goto(Path(page).as_uri())
+        milliseconds: float = tab.evaluate(
             "performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd"
         )
         browser.close()
@@ -211,20 +222,27 @@ def _variants(
     }
     has_browser = importlib.util.find_spec("playwright") and Path(_CHROMIUM).exists()
     if has_browser:
-        variants[_OPENED] = functools.partial(_open_report, recordings, report)
+        empty = report.with_name("empty.html")
+        empty.write_text("<!doctype html><title>Empty</title>")
+        variants[_EMPTY] = functools.partial(
+            call, milliseconds_to_open, page=str(empty), empty=str(empty)
+        )
+        variants[_OPENED] = functools.partial(_open_report, recordings, report, empty)
     return variants
 
 
-def _open_report(recordings: Path, report: Path) -> float:
+def _open_report(recordings: Path, report: Path, empty: Path) -> float:
     if not report.exists():
         call(seconds_to_write, directory=str(recordings), report=str(report))
-    return call(milliseconds_to_open, report=str(report))
+    page = report / "index.html"
+    return call(milliseconds_to_open, page=str(page), empty=str(empty))
 
 
 def _results(samples: Mapping[str, list[float]], settings: Settings) -> list[Result]:
     subject = f"{settings.episodes} episodes, {settings.videos} videos"
     loaded = Reference(_LOADED, tuple(samples[_LOADED]))
     opened = tuple(samples.get(_OPENED, ()))
+    empty = tuple(samples.get(_EMPTY, ()))
     return [
         Result(subject=subject, variant=_LOADED, unit="s", samples=loaded.samples),
         Result(
@@ -236,6 +254,7 @@ def _results(samples: Mapping[str, list[float]], settings: Settings) -> list[Res
             promise=_WRITING_PROMISE,
             note="posters apart",
         ),
+        Result(subject="no report", variant=_EMPTY, unit="ms", samples=empty),
         Result(
             subject=subject,
             variant=_OPENED,
