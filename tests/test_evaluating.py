@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -89,6 +90,17 @@ def test_results_do_not_depend_on_the_workers(reference: Path, tmp_path: Path) -
     """Byte for byte, and neither does the choice."""
     run(tmp_path / "two", tasks=[PENDULUM, DOUBLE], workers=2)
     assert contents(tmp_path / "two") == contents(reference)
+
+
+def test_policies_that_draw_for_themselves_are_seeded(tmp_path: Path) -> None:
+    """Also from generators that nobody has given them, whatever ran before."""
+
+    def wander(_: Any) -> Any:
+        return np.random.uniform(-1, 1, 1) * random.random()
+
+    for workers in (1, 2):
+        run(tmp_path / str(workers), policy=wander, workers=workers)
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")
 
 
 def test_what_takes_long_begins_first(reference: Path) -> None:
@@ -391,6 +403,7 @@ def test_nothing_is_run_when_all_is_done(reference: Path, tmp_path: Path) -> Non
     [
         ({"policy": "zero"}, "policy was 'random' and is now 'zero'"),
         ({"max_steps": 6}, "max_steps was 5"),
+        ({"episodes": 1}, "episodes was 2 and is now 1"),
         ({"keep": "all"}, "keep was 'none'"),
         ({"protocol": "suite"}, "protocol"),
         ({"env_kwargs": {"reset_noise_scale": 0.1}}, "env_kwargs"),

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from .environments.episode_seeds import EpisodeSeeds, episode_seeds
 from .environments.from_name import NamedEnvironment, environment_from_name
+from .environments.global_generators import seed_global_generators
 from .environments.names import parse_environment_name
 from .environments.options import EnvironmentOptions
 from .environments.policies import (
@@ -295,6 +296,7 @@ def _run_episode(
     on_step: Callable[[], None],
 ) -> None:
     with working_directory_importable():
+        seed_global_generators(seeds.policy)
         policy.reset(seeds)
         observation = named.begin_episode(monitor, seeds)
         done = False

@@ -12,6 +12,8 @@
 
 A policy is called with the observation, for dm_env that of the time step, and returns
 an action. If it has a `reset`, that is called with a seed at the start of each episode.
+The generators that a process shares (`random`, `numpy.random`, PyTorch's) are seeded
+with the same.
 """
 
 from __future__ import annotations

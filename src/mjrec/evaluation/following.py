@@ -190,7 +190,7 @@ class _Runner:
         batch = self._batches[outcome.key]
         if outcome.failure is not None:
             units = [(batch.seed, number) for number in batch.episodes]
-            of.reasons.update(dict.fromkeys(units, outcome.failure))
+            of.reasons.update(dict.fromkeys(units, _in_short(outcome.failure)))
         of.unfinished -= 1
         if not of.unfinished:
             self._complete(of)
@@ -230,6 +230,12 @@ class _Runner:
         return EvaluationProgress(
             done=min(done, total), failed=min(failed, total), total=total
         )
+
+
+def _in_short(failure: str) -> str:
+    """Return why a job failed, without what its worker printed, which is logged."""
+    logger.warning("%s", failure)
+    return failure.partition(" The end of what it said")[0]
 
 
 def _note_problem(of: TaskRun, outcome: JobOutcome) -> None:

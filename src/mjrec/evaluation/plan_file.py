@@ -17,7 +17,7 @@ from .results_files import FORMAT_VERSION, PLAN_NAME
 __all__ = ["check_continues", "read_plan", "write_plan"]
 
 # What may be asked for anew: each task, seed and episode stands for itself.
-_MAY_GROW = ("tasks", "seeds", "episodes")
+_MAY_DIFFER = ("tasks", "seeds")
 
 
 def write_plan(directory: Path, plan: EvaluationPlan) -> None:
@@ -54,9 +54,9 @@ def check_continues(
 ) -> None:
     """Check that what is asked for goes on with what was begun.
 
-    Other tasks, seeds and episodes may be asked for, more or fewer; with the protocol
-    `"suite"` not episodes, whose number belongs to the unit of work. All else makes
-    other results, or other videos.
+    Other tasks and seeds may be asked for, and more episodes; with the protocol
+    `"suite"` not those, whose number belongs to the unit of work. All else makes other
+    results, or other videos; and whoever leaves episodes out has seen their returns.
 
     Raises:
         DifferentEvaluation: it does not.
@@ -65,16 +65,16 @@ def check_continues(
     differences = {
         name: (was[name], now[name])
         for name in now
-        if was[name] != now[name] and not _may_differ(name, asked)
+        if was[name] != now[name] and not _may_differ(name, begun, asked)
     }
     if differences:
         raise DifferentEvaluation(directory, _named(differences))
 
 
-def _may_differ(name: str, asked: EvaluationPlan) -> bool:
-    if name == "episodes" and asked.protocol == SUITE:
-        return False
-    return name in _MAY_GROW
+def _may_differ(name: str, begun: EvaluationPlan, asked: EvaluationPlan) -> bool:
+    if name == "episodes":
+        return asked.protocol != SUITE and asked.episodes > begun.episodes
+    return name in _MAY_DIFFER
 
 
 def _named(differences: dict[str, Any]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from ..environments.episode_seeds import EpisodeSeeds, episode_seeds
 from ..environments.from_name import NamedEnvironment, environment_from_name
+from ..environments.global_generators import seed_global_generators
 from ..environments.options import EnvironmentOptions
 from ..environments.policies import (
     Policy,
@@ -371,6 +372,7 @@ def _run_episode(
     """Run an episode, and return how often MuJoCo warned in it."""
     named, policy = acting.named, acting.policy
     with working_directory_importable():
+        seed_global_generators(seeds.policy)
         policy.reset(seeds)
         observation = begin(monitor, seeds)
         before = _warnings(named.environment)
