@@ -315,6 +315,20 @@ def test_a_damaged_results_file_is_named_and_the_rest_shown(tmp_path: Path) -> N
     assert "results.json" in contents.problems[0]
 
 
+def test_a_damaged_table_takes_no_figures_away(tmp_path: Path) -> None:
+    """The summaries say how many failed; that the list does not hold them is told."""
+    write_evaluation(tmp_path, ["a/x", "b/y"])
+    (tmp_path / "results.csv").write_text("no table")
+    contents = gather(tmp_path)
+    summary = contents.tasks[0].summary
+    assert (summary.episodes, summary.failed, summary.runs) == (3, 1, 2)
+    assert list(contents.tasks[0].episodes.total_reward) == [3.0, 1.0, 2.0]
+    assert contents.across.keys() == {str(tmp_path)}
+    [problem] = contents.problems
+    assert "results.csv" in problem
+    assert "episodes that failed are not in it" in problem
+
+
 def test_intervals_of_monitors_are_made_as_the_evaluation_made_its_own(
     tmp_path: Path,
 ) -> None:

@@ -18,7 +18,7 @@ evaluation was killed and resumed. `result_tables` describes the tables.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -56,6 +56,7 @@ __all__ = [
     "ReadResults",
     "is_evaluation",
     "read_results",
+    "read_summaries",
     "write_results",
 ]
 
@@ -185,6 +186,17 @@ def read_results(directory: Path) -> ReadResults:
         UnreadableFile: there are none, the evaluation is not finished, or a file is
             damaged.
     """
+    read = read_summaries(directory)
+    table, timing = directory / _TABLE_NAME, directory / _TIMING_NAME
+    return replace(read, columns=read_tables(table, timing, read.plan))
+
+
+def read_summaries(directory: Path) -> ReadResults:
+    """Return the results without episodes: what `results.json` alone holds.
+
+    Raises:
+        UnreadableFile: there is no such file, or it is damaged.
+    """
     path = directory / RESULTS_NAME
     if not path.exists():
         raise UnreadableFile(path, _why_missing(directory))
@@ -213,7 +225,7 @@ def read_results(directory: Path) -> ReadResults:
         bootstrap=bootstrap,
         selection=selection,
         versions=versions,
-        columns=read_tables(directory / _TABLE_NAME, directory / _TIMING_NAME, plan),
+        columns={},
     )
 
 

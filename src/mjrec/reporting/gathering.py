@@ -22,13 +22,13 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UnreadableFile
-from ..evaluation.results_files import ReadResults, read_results
+from ..evaluation.results_files import ReadResults, read_results, read_summaries
 from ..evaluation.summaries import AcrossTasks, Bootstrap
 from ..results.episodes import episodes_of
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.recorded_environment import recorded_env_info
 from ..results.sources import MonitorResults
-from .contents import ReportContents, ReportTask, ReportVideo, Verdict
+from .contents import EpisodeColumns, ReportContents, ReportTask, ReportVideo, Verdict
 from .episode_columns import (
     EpisodeRows,
     columns_of_results,
@@ -80,6 +80,15 @@ class _Task:
 
     task: ReportTask
     videos: Sequence[tuple[RecordedVideo, int | None]]
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """The episodes of monitors, their videos, and how many monitors have episodes."""
+
+    columns: EpisodeColumns
+    placed: Sequence[tuple[RecordedVideo, int | None]]
+    runs: int
 
 
 class _Gathering:
@@ -187,15 +196,10 @@ class _Gathering:
         try:
             results = read_results(directory)
         except UnreadableFile as error:
-            self._problems.append(
-                f"{error} What its monitors recorded is shown instead."
-            )
-            self._add_below(directory)
+            self._add_evaluation_without_tables(directory, error)
             return
+        self._add_figures(results)
         source = str(directory)
-        self._bootstraps[source] = results.bootstrap
-        if results.across is not None:
-            self._across[source] = results.across
         for summary in results.summaries:
             task = summary.task
             columns = columns_of_results(results.columns[task])
@@ -219,6 +223,49 @@ class _Gathering:
                     placed,
                 )
             )
+
+    def _add_evaluation_without_tables(
+        self, directory: Path, why: UnreadableFile
+    ) -> None:
+        """Add the figures that there are, and the episodes that monitors recorded."""
+        try:
+            results = read_summaries(directory)
+        except UnreadableFile:
+            self._problems.append(f"{why} What its monitors recorded is shown instead.")
+            self._add_below(directory)
+            return
+        self._problems.append(
+            f"{why} The summaries are those of results.json; the list of episodes is "
+            "what the monitors recorded, and episodes that failed are not in it."
+        )
+        self._add_figures(results)
+        for summary in results.summaries:
+            folder = results.folder(summary.task)
+            monitors = self._monitors(folder)
+            videos = self._videos(monitors)
+            recorded = self._recorded(monitors, videos)
+            self._tasks.append(
+                _Task(
+                    ReportTask(
+                        name=summary.task[:_LONGEST_NAME],
+                        source=str(folder),
+                        is_evaluation=False,
+                        summary=summary,
+                        episodes=recorded.columns,
+                        provenance=provenance_of_evaluation(
+                            results, summary.task, monitors, videos, recorded.columns
+                        ),
+                    ),
+                    recorded.placed,
+                )
+            )
+
+    def _add_figures(self, results: ReadResults) -> None:
+        """Add what is said of all tasks."""
+        source = str(results.directory)
+        self._bootstraps[source] = results.bootstrap
+        if results.across is not None:
+            self._across[source] = results.across
 
     def _add_below(self, directory: Path) -> None:
         """Add the monitor directories of an evaluation without results."""
@@ -262,25 +309,11 @@ class _Gathering:
         self, directory: Path, name: str, monitors: Sequence[MonitorResults]
     ) -> None:
         videos = self._videos(monitors)
-        numbered: dict[str, set[int]] = {}
-        for video in videos:
-            if video.episode_id is not None:
-                numbered.setdefault(video.infix, set()).add(video.episode_id)
-        rows = EpisodeRows([monitor.files.infix for monitor in monitors], numbered)
-        for monitor in monitors:
-            self._read_episodes(monitor, rows)
-        if name == _UNKNOWN_ENVIRONMENT and not rows and not videos:
+        recorded = self._recorded(monitors, videos)
+        columns = recorded.columns
+        if name == _UNKNOWN_ENVIRONMENT and not len(columns.run) and not videos:
             # Files that nothing can be read from.
             return
-        columns, places = rows.columns()
-        placed = [
-            (video, places.get((video.infix, video.episode_id or 0)))
-            if video.episode_id is not None
-            else (video, None)
-            for video in videos
-        ]
-        runs = rows.run_count
-        del rows
         bootstrap = next(iter(self._bootstraps.values()), Bootstrap())
         self._tasks.append(
             _Task(
@@ -289,14 +322,34 @@ class _Gathering:
                     source=str(directory),
                     is_evaluation=False,
                     summary=summary_of_columns(
-                        name, columns, runs=runs, bootstrap=bootstrap
+                        name, columns, runs=recorded.runs, bootstrap=bootstrap
                     ),
                     episodes=columns,
                     provenance=provenance_of_monitors(name, monitors, videos, columns),
                 ),
-                placed,
+                recorded.placed,
             )
         )
+
+    def _recorded(
+        self, monitors: Sequence[MonitorResults], videos: Sequence[RecordedVideo]
+    ) -> _Recorded:
+        """Return the episodes of monitors, and which of them their videos show."""
+        numbered: dict[str, set[int]] = {}
+        for video in videos:
+            if video.episode_id is not None:
+                numbered.setdefault(video.infix, set()).add(video.episode_id)
+        rows = EpisodeRows([monitor.files.infix for monitor in monitors], numbered)
+        for monitor in monitors:
+            self._read_episodes(monitor, rows)
+        columns, places = rows.columns()
+        placed = [
+            (video, places.get((video.infix, video.episode_id or 0)))
+            if video.episode_id is not None
+            else (video, None)
+            for video in videos
+        ]
+        return _Recorded(columns, placed, rows.run_count)
 
     def _read_episodes(self, monitor: MonitorResults, rows: EpisodeRows) -> None:
         before = len(rows)
