@@ -329,6 +329,28 @@ def test_a_damaged_table_takes_no_figures_away(tmp_path: Path) -> None:
     assert "episodes that failed are not in it" in problem
 
 
+@pytest.mark.parametrize("there", [None, "pipe", "folder"])
+def test_videos_are_shown_without_the_table_of_their_files(
+    corridor: Any, tmp_path: Path, there: str | None
+) -> None:
+    """That it is missing, or is none, is told; no pipe is waited for."""
+    record(corridor, tmp_path / "a-x", 1, uid="batch")
+    [video] = (tmp_path / "a-x").glob("*.mp4")
+    infix = infix_of(video.name)
+    assert infix is not None
+    write_evaluation(tmp_path, ["a/x"], videos={"a/x": video.name}, infix=infix)
+    timing = tmp_path / "timing.csv"
+    timing.unlink()
+    if there == "pipe":
+        os.mkfifo(timing)
+    elif there == "folder":
+        timing.mkdir()
+    contents = gather(tmp_path)
+    assert [Path(shown.file).name for shown in contents.videos] == [video.name]
+    assert contents.tasks[0].summary.failed == 1
+    assert any("timing.csv" in problem for problem in contents.problems)
+
+
 def test_intervals_of_monitors_are_made_as_the_evaluation_made_its_own(
     tmp_path: Path,
 ) -> None:

@@ -99,7 +99,7 @@ def write_timing_table(
 
 
 def read_tables(
-    results: Path, timing: Path, plan: EvaluationPlan
+    results: Path, timing: Path, plan: EvaluationPlan, *, needs_timing: bool = False
 ) -> dict[str, ResultColumns]:
     """Return the episodes of each task, in the plan's order.
 
@@ -108,9 +108,10 @@ def read_tables(
         timing: the path of `timing.csv`. Where there is none, times and files are not
             known.
         plan: what was evaluated: exactly its episodes must be there.
+        needs_timing: whether `timing.csv` must be there, too.
 
     Raises:
-        UnreadableFile: a table is damaged, or is that of another plan.
+        UnreadableFile: a table is damaged or missing, or is that of another plan.
     """
     episodes = len(plan.seeds) * plan.episodes
     columns = {task.name: _Columns() for task in plan.tasks}
@@ -118,11 +119,12 @@ def read_tables(
         if episodes * len(columns) > _MOST_ROWS:
             raise ValueError(f"its plan has more than {_MOST_ROWS} episodes")
         _read_rows(results, _RESULTS, plan, columns, _Columns.add_result)
-    if timing.is_file():
+    with_timing = needs_timing or timing.is_file()
+    if with_timing:
         with unreadable(timing):
             _read_rows(timing, _TIMING, plan, columns, _Columns.add_timing)
     return {
-        task: each.finished(task, plan, with_timing=timing.is_file())
+        task: each.finished(task, plan, with_timing=with_timing)
         for task, each in columns.items()
     }
 

@@ -176,19 +176,25 @@ def write_results(
     write_text(directory / RESULTS_NAME, dumps(value, indent=2) + "\n")
 
 
-def read_results(directory: Path) -> ReadResults:
+def read_results(directory: Path, *, needs_timing: bool = False) -> ReadResults:
     """Return the results that are in an evaluation's directory.
 
     They may be anybody's: sizes, numbers, names and their order are checked, and no
     file outside of the directory is opened.
 
+    Args:
+        directory: of the evaluation.
+        needs_timing: whether `timing.csv` must be there; else times and files are not
+            known where it is not.
+
     Raises:
         UnreadableFile: there are none, the evaluation is not finished, or a file is
-            damaged.
+            damaged or missing.
     """
     read = read_summaries(directory)
     table, timing = directory / _TABLE_NAME, directory / _TIMING_NAME
-    return replace(read, columns=read_tables(table, timing, read.plan))
+    columns = read_tables(table, timing, read.plan, needs_timing=needs_timing)
+    return replace(read, columns=columns)
 
 
 def read_summaries(directory: Path) -> ReadResults:

@@ -194,7 +194,8 @@ class _Gathering:
 
     def _add_evaluation(self, directory: Path) -> None:
         try:
-            results = read_results(directory)
+            # Without times nothing tells which episode a video shows.
+            results = read_results(directory, needs_timing=True)
         except UnreadableFile as error:
             self._add_evaluation_without_tables(directory, error)
             return
