@@ -351,6 +351,45 @@ def test_videos_are_shown_without_the_table_of_their_files(
     assert any("timing.csv" in problem for problem in contents.problems)
 
 
+@pytest.mark.parametrize(
+    ("changed", "about"),
+    [
+        ("a/x,0,1,1.5,", ["the smallest return", "the mean return"]),
+        ("a/x,0,1,2.5,", ["the smallest return", "the mean return"]),
+        ("a/x,0,1,9.0,", ["the smallest", "the largest return", "the mean return"]),
+        ("a/x,0,1,nan,", ["how many returns are finite"]),
+    ],
+)
+def test_a_changed_return_is_told(
+    tmp_path: Path, changed: str, about: list[str]
+) -> None:
+    """The table and the summary of its task do not agree then."""
+    write_evaluation(tmp_path, ["a/x", "b/y"])
+    assert gather(tmp_path).problems == ()
+    table = tmp_path / "results.csv"
+    text = table.read_text()
+    assert "a/x,0,1,1.0," in text
+    table.write_text(text.replace("a/x,0,1,1.0,", changed))
+    [problem] = gather(tmp_path).problems
+    assert "a/x" in problem
+    assert "results.json and results.csv disagree" in problem
+    assert all(words in problem for words in about)
+
+
+def test_a_changed_outcome_is_told(tmp_path: Path) -> None:
+    """A failed episode that has got a return; a return in the middle of others."""
+    write_evaluation(tmp_path, ["a/x"])
+    table = tmp_path / "results.csv"
+    text = table.read_text()
+    row = next(line for line in text.splitlines() if "PolicyError" in line)
+    table.write_text(text.replace(row, "a/x,7,0,2.5,10,false,true,,"))
+    [problem] = gather(tmp_path).problems
+    assert "the number of episodes, how many failed, the mean return" in problem
+    table.write_text(text.replace("a/x,7,1,2.0,", "a/x,7,1,2.001,"))
+    [problem] = gather(tmp_path).problems
+    assert "disagree about the mean return." in problem
+
+
 def test_intervals_of_monitors_are_made_as_the_evaluation_made_its_own(
     tmp_path: Path,
 ) -> None:

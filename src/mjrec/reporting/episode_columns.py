@@ -21,6 +21,7 @@ __all__ = [
     "columns_of_results",
     "episodes_with_roles",
     "summary_of_columns",
+    "what_disagrees",
 ]
 
 ROLES: Final = ("best", "median", "worst")
@@ -151,6 +152,35 @@ def summary_of_columns(
         score_range=default_score_range(name),
         bootstrap=bootstrap,
     )
+
+
+def what_disagrees(summary: TaskSummary, columns: EpisodeColumns) -> list[str]:
+    """Return what a summary says of these episodes that is not so, in words.
+
+    Means may differ by what another order of summing makes of them.
+    """
+    completed = columns.outcome != _FAILED
+    returns = columns.total_reward[completed]
+    finite = np.isfinite(returns)
+    told: list[tuple[str, float | None, float]] = [
+        ("the number of episodes", summary.episodes, len(returns)),
+        ("how many failed", summary.failed, int(np.count_nonzero(~completed))),
+        ("how many returns are finite", summary.not_finite, int((~finite).sum())),
+    ]
+    has_figures = len(returns) > 0 and bool(finite.all())
+    if has_figures:
+        told += [
+            ("the smallest return", summary.minimum, float(returns.min())),
+            ("the largest return", summary.maximum, float(returns.max())),
+        ]
+    differing = [what for what, said, there in told if said != there]
+    # There is no mean where the sum is too large for a number.
+    if has_figures and summary.mean is not None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean = float(returns.mean())
+        if abs(mean - summary.mean) > 1e-9 * float(np.abs(returns).max()):
+            differing.append("the mean return")
+    return differing
 
 
 def episodes_with_roles(columns: EpisodeColumns) -> dict[int, tuple[str, ...]]:

@@ -23,7 +23,7 @@ import numpy as np
 
 from ..errors import UnreadableFile
 from ..evaluation.results_files import ReadResults, read_results, read_summaries
-from ..evaluation.summaries import AcrossTasks, Bootstrap
+from ..evaluation.summaries import AcrossTasks, Bootstrap, TaskSummary
 from ..results.episodes import episodes_of
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.recorded_environment import recorded_env_info
@@ -34,6 +34,7 @@ from .episode_columns import (
     columns_of_results,
     episodes_with_roles,
     summary_of_columns,
+    what_disagrees,
 )
 from .found_recordings import FoundRecordings, find_recordings
 from .provenance import provenance_of_evaluation, provenance_of_monitors
@@ -204,6 +205,7 @@ class _Gathering:
         for summary in results.summaries:
             task = summary.task
             columns = columns_of_results(results.columns[task])
+            self._note_disagreement(source, summary, columns)
             folder = results.folder(task)
             monitors = self._monitors(folder)
             videos = self._videos(monitors)
@@ -273,6 +275,17 @@ class _Gathering:
         for folder in sorted(directory.iterdir()):
             if folder.is_dir() and not folder.is_symlink() and monitors_of(folder):
                 self._add_monitors(folder)
+
+    def _note_disagreement(
+        self, source: str, summary: TaskSummary, columns: EpisodeColumns
+    ) -> None:
+        differing = what_disagrees(summary, columns)
+        if differing:
+            self._problems.append(
+                f"{summary.task} in {source}: results.json and results.csv disagree "
+                f"about {', '.join(differing)}. One of them was changed after "
+                "they were written."
+            )
 
     def _note_missing(
         self,
