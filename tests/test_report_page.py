@@ -403,6 +403,31 @@ def test_a_learning_curve_is_in_the_order_of_time() -> None:
     )
 
 
+def test_what_is_left_out_is_said_with_its_own_reason() -> None:
+    """Which need not be that a task has no scale."""
+    told = AcrossTasks(tasks=("a",), left_out={"b": "no episode was completed"})
+    page = page_of(contents(across={"one": told}))
+    assert "<summary>1 left out</summary>" in page
+    assert ">b</span>: no episode was completed</li>" in page
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"), [(1, ["0"]), (2, ["0", "1"]), (6, ["0", "2", "4"])]
+)
+def test_a_learning_curve_begins_with_episode_0(
+    count: int, expected: list[str]
+) -> None:
+    """As the cards and the table count; the first dot is over the tick."""
+    episodes = columns(np.arange(float(count)).tolist(), runs=["0.1"])
+    svg = learning_curve(task("a", episodes), key="k")
+    ticks = re.findall(r'x="([\d.]+)" y="188"[^>]*>(.*?)</text>', svg)
+    assert [text for _, text in ticks] == expected
+    dots = next(path for path in re.findall("<path[^>]*>", svg) if "round" in path)
+    first = re.search(r"M ([\d.]+) ", dots)
+    assert first is not None
+    assert float(first[1]) == pytest.approx(float(ticks[0][0]), abs=0.02)
+
+
 def test_each_profile_has_a_line_of_its_own() -> None:
     """Told apart by class and by dashes."""
     shares = (1.0, 0.5, 0.0)

@@ -70,7 +70,8 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
     """Return a figure of returns over episodes: a running mean and how they spread.
 
     Episodes are in the order in which they ended, where that is known of all, else in
-    the order of the task's columns. Where they are few, each has a dot.
+    the order of the task's columns; the first is 0, as in all that counts episodes.
+    Where they are few, each has a dot.
 
     Args:
         task: episodes of monitors, such as those of a training.
@@ -85,15 +86,16 @@ def learning_curve(task: ReportTask, *, key: str) -> str:
     middle, low, mean, high = _running(returns, window)
     # What is not drawn needs no room.
     seen = returns if count <= _MOST_DOTS else np.append(low, high)
-    episodes = _span(np.array([1.0, count]), margin=0.01)
+    episodes = _span(np.array([0.0, count - 1]), margin=0.01)
     panel = _Panel(figure, left=46, right=14, x=episodes, y=_span(seen))
     panel.grid()
     if count <= _MOST_DOTS:
-        panel.dots(np.arange(1.0, count + 1), returns, "accent", opacity=0.4)
+        panel.dots(np.arange(float(count)), returns, "accent", opacity=0.4)
     panel.band(middle, low, high, "accent")
     panel.line(middle, mean, "accent")
     panel.label_y("Return")
-    panel.label_x("Episode", [(tick, _short(tick)) for tick in _whole(panel.ticks_x)])
+    ticks = [x for x in panel.ticks_x if 0 <= x < count and x == round(x)]
+    panel.label_x("Episode", [(tick, _short(tick)) for tick in ticks])
     said = (
         f"{_told(task.summary)} Mean of {window} episodes in a row, and the range of "
     )
@@ -212,7 +214,7 @@ def _running(
     windows = returns[starts[:, None] + inside[None, :]]
     low, high = np.quantile(windows, (0.1, 0.9), axis=1)
     # The last window ends with the last episode.
-    middle = starts.astype(np.float64) + (window + 1) / 2
+    middle = starts.astype(np.float64) + (window - 1) / 2
     return middle, low, windows.mean(axis=1), high
 
 
@@ -318,10 +320,6 @@ def _span(values: _Floats, *, margin: float = 0.06) -> tuple[float, float]:
         return low - room, high + room
     room = room if margin else 0.0
     return low - room, high + room
-
-
-def _whole(ticks: Sequence[float]) -> list[float]:
-    return [tick for tick in ticks if tick == round(tick)]
 
 
 class _Drawing:
