@@ -179,6 +179,13 @@ def test_the_same_environment_in_two_directories_is_told_apart(tmp_path: Path) -
     ]
 
 
+def test_the_title_counts_what_the_page_counts(tmp_path: Path) -> None:
+    """The same environment in two directories is two tasks."""
+    for name, env_id in (("a", "X-v0"), ("b", "X-v0"), ("c", "Y-v0")):
+        write_journal(tmp_path / name, "0.x", env_id, [entry(0)])
+    assert gather(tmp_path).title == "Recordings: 3 tasks"
+
+
 def test_a_damaged_file_is_named_and_the_rest_shown(tmp_path: Path) -> None:
     """Of the one monitor there is nothing, of the other everything."""
     write_journal(tmp_path, "0.a", "X-v0", [entry(0)])

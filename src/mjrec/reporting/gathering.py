@@ -463,4 +463,4 @@ def _title(tasks: Sequence[ReportTask], found: Sequence[FoundRecordings]) -> str
     names = list(dict.fromkeys(task.summary.task for task in tasks))
     if len(names) == 1:
         return f"{what}: {names[0]}"
-    return f"{what}: {len(names)} tasks" if names else what
+    return f"{what}: {len(tasks)} tasks" if names else what
