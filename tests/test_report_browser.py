@@ -265,7 +265,7 @@ def test_what_is_not_known_comes_last(page: Page, tmp_path: Path) -> None:
     rewards = page.locator("#episodes-table").get_by_role("button", name="Return")
     for shown in (["3.000", "3.000", "1.000", "1.000"], ["1.000", "1.000", "3.000"]):
         rewards.click()
-        cells = page.locator("#episodes-table tbody td:nth-child(4)").all_inner_texts()
+        cells = page.locator("#episodes-table tbody td:nth-child(5)").all_inner_texts()
         assert cells[: len(shown)] == shown
         assert cells[-1] == "\N{EN DASH}"
 
@@ -335,12 +335,28 @@ def test_the_table_of_episodes_filters_sorts_and_turns_pages(
     page.locator("#episodes-task").select_option(label="long")
     page.locator("#episodes-table").get_by_role("button", name="Return").click()
     expect(count).to_have_text("Rows 1 to 100 of 250")
-    assert rows.first.locator("td").all_inner_texts()[:4] == [
+    assert rows.first.locator("td").all_inner_texts()[:5] == [
         "long",
+        "truncated",
         "0",
         "249",
         "249.0",
     ]
+
+
+def test_a_phone_shows_which_episodes_failed(browser: Browser, tmp_path: Path) -> None:
+    """And why, beside the task's name, without scrolling to the right."""
+    reason = "PolicyError: " + "it gave an action of the wrong shape " * 4
+    named = task("gymnasium/HalfCheetah-v5", columns([1.0] * 5, failures={0: reason}))
+    size: Any = {"width": 360, "height": 800}
+    with browser.new_context(viewport=size) as context:
+        for page in watched(context.new_page()):
+            open_report(page, tmp_path, contents(named))
+            outcome = page.locator("#episodes-table tbody tr").first.locator(".bad")
+            expect(outcome).to_have_text(f"failed: {reason.strip()}")
+            box = outcome.bounding_box()
+            assert box is not None
+            assert box["x"] + box["width"] <= 360
 
 
 def test_an_episodes_video_is_one_click_away(usual: Page) -> None:

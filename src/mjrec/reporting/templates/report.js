@@ -244,13 +244,14 @@
       name.className = "name";
       name.textContent = t.name;
       cell(row, "").append(name);
+      // Here, because on a phone the columns to the right are out of sight.
+      const outcome = cell(row, outcomes[t.outcome[i]] || DASH);
+      if (t.failures[i]) outcome.textContent += `: ${t.failures[i]}`;
+      if (outcomes[t.outcome[i]] === "failed") outcome.className = "bad";
       cell(row, t.runs ? t.runs[t.run[i]] : t.run[i]).dir = "auto";
       cell(row, t.episode[i], true);
       cell(row, shown[taskOf[n]](t.total_reward[i]), true);
       cell(row, whole(t.length[i]), true);
-      const outcome = cell(row, outcomes[t.outcome[i]] || DASH);
-      if (t.failures[i]) outcome.textContent += `: ${t.failures[i]}`;
-      if (outcomes[t.outcome[i]] === "failed") outcome.className = "bad";
       if (hasSuccesses) cell(row, t.success[i] < 0 ? DASH : t.success[i] ? "yes" : "no");
       const videos = cell(row, "");
       (t.videos[i] ?? []).forEach((place, k) => {
