@@ -489,6 +489,11 @@ def test_a_directory_without_recordings_is_an_error(tmp_path: Path) -> None:
     write_journal(tmp_path / "deep" / "deeper", "0.a", "X-v0", [entry(0)])
     with pytest.raises(InvalidArgument, match="holds no recordings"):
         gather(tmp_path)
+    named = tmp_path / "my runs; $(x)"
+    named.mkdir()
+    with pytest.raises(InvalidArgument, match="--out") as error:
+        gather(named)
+    assert f"--out {shlex.quote(str(named))}`" in str(error.value)
     with pytest.raises(InvalidArgument, match="is not there"):
         gather(tmp_path / "nowhere")
     with pytest.raises(InvalidArgument, match="is a file"):

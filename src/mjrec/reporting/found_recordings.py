@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,8 +73,8 @@ def _recordings_of(directory: Path) -> list[FoundRecordings]:
     if not found:
         raise InvalidArgument(
             f"{directory} holds no recordings, and neither do the folders directly in "
-            f"it. `mjrec record ENV --out {directory}` makes some; `mjrec evaluate` "
-            "makes some of many episodes."
+            f"it. `mjrec record ENV --out {shlex.quote(str(directory))}` makes some; "
+            "`mjrec evaluate` makes some of many episodes."
         )
     return found
 

@@ -13,6 +13,7 @@ import importlib.metadata
 import logging
 import os
 import platform
+import shlex
 import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -297,9 +298,10 @@ class _Gathering:
         expected = results.columns[task].videos.keys()
         missing = len(expected - {index for _, index in placed})
         if missing:
+            named = shlex.quote(str(folder))
             self._problems.append(
                 f"{missing} of {len(expected)} videos of {task} are not there. Where "
-                f"they are pending, `mjrec render {folder}` makes them."
+                f"they are pending, `mjrec render {named}` makes them."
             )
 
     # Monitor directories.
