@@ -403,6 +403,16 @@ def test_a_learning_curve_is_in_the_order_of_time() -> None:
     )
 
 
+def test_the_summary_has_the_standard_deviation() -> None:
+    """With n - 1, beside the mean; one episode has none."""
+    one, several = columns([7.0]), columns([1.0, 2.0, 4.5])
+    page = page_of(contents(task("a", several), task("b", one)))
+    body = page.split('<table id="summary-table">')[1].split("</table>")[0]
+    assert 'title="standard deviation">SD</abbr>' in body
+    assert ">1.803</td>" in body
+    assert 'data-value="">\N{EN DASH}</td>' in body
+
+
 def test_what_is_left_out_is_said_with_its_own_reason() -> None:
     """Which need not be that a task has no scale."""
     told = AcrossTasks(tasks=("a",), left_out={"b": "no episode was completed"})

@@ -265,6 +265,7 @@ class _Row(NamedTuple):
 
     name: str
     mean: _Figure
+    std: _Figure
     iqm: _Figure
     median: _Figure
     minimum: _Figure
@@ -290,6 +291,7 @@ def _row(summary: TaskSummary, name: str) -> _Row:
     return _Row(
         name=name,
         mean=figure(summary.mean, summary.mean_interval),
+        std=figure(summary.std),
         iqm=figure(summary.iqm, summary.iqm_interval),
         median=figure(summary.median),
         minimum=figure(summary.minimum),
