@@ -359,6 +359,18 @@ def test_a_phone_shows_which_episodes_failed(browser: Browser, tmp_path: Path) -
             assert box["x"] + box["width"] <= 360
 
 
+def test_the_summary_fits_on_paper(browser: Browser, tmp_path: Path) -> None:
+    """With all of its columns, on A4 with margins of a centimetre."""
+    known = {"success_known": 50, "success_rate": 0.5, "warnings": {"BADQACC": 12}}
+    made = contents()
+    tasks = [replace(t, summary=replace(t.summary, **known)) for t in made.tasks]
+    with browser.new_context(viewport={"width": 718, "height": 900}) as context:
+        for page in watched(context.new_page()):
+            page.emulate_media(media="print")
+            open_report(page, tmp_path, replace(made, tasks=tasks))
+            assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
+
+
 def test_an_episodes_video_is_one_click_away(usual: Page) -> None:
     """Also where the gallery's filter has hidden it."""
     usual.get_by_role("radio", name="Worst").click()
