@@ -71,7 +71,7 @@ def test_python_block_runs(name: str, checkout: Path) -> None:
 def needed_by(line: str) -> list[str]:
     """Return the lines that make what a line is about, in order."""
     command, subject = (*line.split(), "")[1:3]
-    made_by = {"list": "--out", "render": "--out", "recover": "--out", "pack": "--out"}
+    made_by = dict.fromkeys(("list", "render", "recover", "pack", "report"), "--out")
     option = {**made_by, "verify": "-o"}.get(command)
     if option is None:
         return []

@@ -85,7 +85,7 @@ def write_report(
         InvalidArgument: a directory has no recordings; `path` is something else than
             a report; or the page alone is larger than `max_single_file_bytes`.
         UnreadableFile: one of `verifications`.
-        MissingDependency: Jinja2, matplotlib or scipy is not installed.
+        MissingDependency: Jinja2 or matplotlib is not installed.
         FileNotWritten, DirectoryNotWritable: the disk is full, or read-only.
     """
     target = Path(os.path.realpath(path))
