@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import sys
@@ -26,6 +25,8 @@ from ..evaluation.evaluation import Evaluation, EvaluationProgress
 from ..evaluation.summaries import Interval, TaskSummary
 from ..evaluation.summaries_json import summary_to_json
 from ..evaluation.task_sets import tasks_from
+from .counted import counted
+from .environment_options import kwargs_of
 from .help_text import flowing_help
 from .view_options import camera_of, size_of
 
@@ -144,7 +145,7 @@ def evaluate(
                 width=width,
                 max_fps=max_fps,
                 quality=quality,
-                env_kwargs=_kwargs_of(env_kwargs),
+                env_kwargs=kwargs_of(env_kwargs),
                 score_ranges=ranges,
                 on_progress=progress.show,
             )
@@ -260,25 +261,13 @@ def _seeds_of(text: str | None) -> list[int] | None:
     return [int(number) for number in text.split(",")]
 
 
-def _kwargs_of(text: str) -> dict[str, Any]:
-    try:
-        kwargs = json.loads(text)
-    except ValueError as error:
-        raise InvalidArgument(
-            f"--env-kwargs must be a JSON object, got {text!r}: {error}."
-        ) from None
-    if not isinstance(kwargs, dict):
-        raise InvalidArgument(f"--env-kwargs must be a JSON object, got {text!r}.")
-    return kwargs
-
-
 def _shortfalls(evaluation: Evaluation, least: Mapping[str, float]) -> list[_Shortfall]:
     found = []
     for task, value in least.items():
         summary = evaluation.summary(task)
         if summary.failed:
             found.append(
-                _Shortfall(task, f"{_count(summary.failed, 'episode')} failed")
+                _Shortfall(task, f"{counted(summary.failed, 'episode')} failed")
             )
         elif summary.mean is None:
             found.append(_Shortfall(task, "it has no mean return"))
@@ -353,7 +342,7 @@ def _across_lines(evaluation: Evaluation) -> list[str]:
         ]
     )
     return [
-        f"Over {_count(len(across.tasks), 'task')}, as scores from 0 to 1: {figures}",
+        f"Over {counted(len(across.tasks), 'task')}, as scores from 0 to 1: {figures}",
         *(
             f"  without {task}: {_printable(reason)}"
             for task, reason in across.left_out.items()
@@ -365,7 +354,7 @@ def _failure_lines(evaluation: Evaluation) -> list[str]:
     failed = evaluation.failed
     if not failed:
         return []
-    count = f"{len(failed)} of {_count(len(evaluation.results), 'episode')} failed:"
+    count = f"{len(failed)} of {counted(len(evaluation.results), 'episode')} failed:"
     by_reason: dict[str, list[str]] = {}
     for each in failed:
         name = f"{each.task} seed {each.seed} episode {each.episode}"
@@ -382,12 +371,12 @@ def _failure_lines(evaluation: Evaluation) -> list[str]:
 def _video_lines(evaluation: Evaluation) -> list[str]:
     lines = []
     if evaluation.videos:
-        lines.append(f"{_count(len(evaluation.videos), 'video')}:")
+        lines.append(f"{counted(len(evaluation.videos), 'video')}:")
         lines += [f"  {path}" for path in evaluation.videos[:_SHOWN]]
         rest = len(evaluation.videos) - _SHOWN
         lines += [f"  and {rest} more"] if rest > 0 else []
     if evaluation.pending:
-        lines.append(f"{_count(len(evaluation.pending), 'video')} could not be drawn:")
+        lines.append(f"{counted(len(evaluation.pending), 'video')} could not be drawn:")
         by_reason: dict[str, list[str]] = {}
         for path, reason in evaluation.pending.items():
             by_reason.setdefault(reason, []).append(path.name)
@@ -437,10 +426,6 @@ def _share(value: float | None) -> str:
 
 def _and_more(number: int) -> str:
     return f" and {number} more" if number else ""
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _printable(text: str) -> str:

@@ -4,17 +4,15 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import secrets
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import rich.console
 import tyro
 
 from .. import json_text
-from ..errors import InvalidArgument
 from ..formats.video_metadata import finished_videos
 from ..sessions import (
     Session,
@@ -22,6 +20,8 @@ from ..sessions import (
     record_session,
     with_chosen_videos,
 )
+from .counted import counted
+from .environment_options import kwargs_of
 from .help_text import flowing_help
 from .progress import EpisodeProgress
 from .view_options import camera_of, number_or_name, size_of
@@ -126,7 +126,7 @@ def record(
         render=render,
         workers=workers,
         quality=quality,
-        env_kwargs=_kwargs(env_kwargs),
+        env_kwargs=kwargs_of(env_kwargs),
     )
     console = rich.console.Console(quiet=as_json)
     recorded, interrupted = _run(session, console)
@@ -173,10 +173,10 @@ def _print_summary(
     files = [name for video in videos for name in _files(video)]
     shown = session.directory.absolute()
     lines = [
-        f"{_count(len(recorded), 'episode')} of {session.environment}, "
+        f"{counted(len(recorded), 'episode')} of {session.environment}, "
         f"seed {session.seed}, in",
         f"  {shown}",
-        _count(len(files), "video") + (":" if files else ""),
+        counted(len(files), "video") + (":" if files else ""),
         *(f"  {name}" for name in files),
     ]
     # Names must survive copying, so no line is folded.
@@ -211,19 +211,3 @@ def _files(video: Path) -> list[str]:
     if video.exists():
         return [name for name, _ in finished_videos(video)]
     return [f"{video.name}  (pending: mjrec render {video.parent})"]
-
-
-def _kwargs(text: str) -> dict[str, Any]:
-    try:
-        kwargs = json.loads(text)
-    except ValueError as error:
-        raise InvalidArgument(
-            f"--env-kwargs must be a JSON object, got {text!r}: {error}."
-        ) from None
-    if not isinstance(kwargs, dict):
-        raise InvalidArgument(f"--env-kwargs must be a JSON object, got {text!r}.")
-    return kwargs
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -27,6 +27,7 @@ from ..rendering.outcomes import Outcome
 from ..rendering.pending import EpisodeKey, RecordingKey, key_of, recordings
 from ..rendering.views import View
 from ..simulation.model_trust import trusting_all_models
+from .counted import counted
 from .help_text import flowing_help
 from .view_options import camera_of, size_of
 
@@ -253,7 +254,7 @@ def _collect(
         for outcome in outcomes:
             report.add(outcome)
             if outcome.is_video:
-                frames = _count(outcome.frame_count, "frame")
+                frames = counted(outcome.frame_count, "frame")
                 for name in (outcome.name, *outcome.further_videos):
                     _print(console, f"{name}: {frames}")
     except KeyboardInterrupt:
@@ -287,10 +288,10 @@ def _print_summary(report: _Report, console: rich.console.Console) -> None:
         _print(console, f"Nothing is pending in {shown}.")
     if report.videos:
         _print(
-            console, f"{_count(len(report.videos), 'video')} rendered, in\n  {shown}"
+            console, f"{counted(len(report.videos), 'video')} rendered, in\n  {shown}"
         )
     if report.elsewhere:
-        what = _count(len(report.elsewhere), "video")
+        what = counted(len(report.elsewhere), "video")
         _print(console, f"{what} left to another process, which is rendering now.")
     _print_reasons("could not be rendered:", report.failures, console)
     _print_reasons("rendered, with nothing to be seen:", report.blank, console)
@@ -300,7 +301,7 @@ def _print_reasons(
     what: str, failures: Mapping[str, str], console: rich.console.Console
 ) -> None:
     if failures:
-        _print(console, f"{_count(len(failures), 'video')} {what}")
+        _print(console, f"{counted(len(failures), 'video')} {what}")
     for reason in dict.fromkeys(failures.values()):
         names = [name for name, why in failures.items() if why == reason]
         _print(console, "\n".join(f"  {name}" for name in names))
@@ -324,7 +325,3 @@ def _print_json(report: _Report) -> None:
 def _print(console: rich.console.Console, text: str) -> None:
     # Names must survive copying, so no line is folded.
     console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
