@@ -19,10 +19,10 @@ from ..evaluation.comparing import Comparison, TaskComparison
 from ..evaluation.comparing import compare as compare_evaluations
 from ..evaluation.summaries import Bootstrap, Interval
 from .help_text import flowing_help
+from .terminal import printable, result_console
 
 __all__ = ["compare"]
 
-_LOG_WIDTH = 160
 _USUAL = Bootstrap()
 
 
@@ -64,10 +64,7 @@ def compare(
 
 
 def _show(comparison: Comparison) -> None:
-    console = rich.console.Console()
-    if not console.is_terminal:
-        # A log has no width, and a folded name cannot be copied.
-        console = rich.console.Console(width=_LOG_WIDTH)
+    console = result_console()
     for line in _lines_before(comparison):
         _print(console, line)
     console.print(_table(comparison))
@@ -76,7 +73,7 @@ def _show(comparison: Comparison) -> None:
 
 
 def _print(console: rich.console.Console, line: str) -> None:
-    console.print(_printable(line), highlight=False, markup=False, soft_wrap=True)
+    console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
 
 def _lines_before(comparison: Comparison) -> list[str]:
@@ -101,7 +98,7 @@ def _table(comparison: Comparison) -> rich.table.Table:
         table.add_column(name, justify="right")
     for each in comparison.tasks:
         cells = _cells(each, has_pairs=has_pairs)
-        table.add_row(*(rich.markup.escape(_printable(cell)) for cell in cells))
+        table.add_row(*(rich.markup.escape(printable(cell)) for cell in cells))
     return table
 
 
@@ -189,11 +186,6 @@ def _share(value: float | None, interval: Interval | None, *, digits: int = 2) -
     if interval is None:
         return text
     return f"{text} ({interval.low:.{digits}f} to {interval.high:.{digits}f})"
-
-
-def _printable(text: str) -> str:
-    """Return a text out of a file without what a terminal would take for orders."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _fields(comparison: Comparison) -> dict[str, Any]:

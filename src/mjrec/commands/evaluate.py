@@ -28,6 +28,7 @@ from ..evaluation.task_sets import tasks_from
 from .counted import counted
 from .environment_options import kwargs_of
 from .help_text import flowing_help
+from .terminal import printable, result_console
 from .view_options import camera_of, size_of
 
 __all__ = ["evaluate"]
@@ -36,7 +37,6 @@ T = TypeVar("T")
 
 _FAILED = 1
 _INTERRUPTED = 130
-_LOG_WIDTH = 160
 _SHOWN = 10
 
 
@@ -281,10 +281,7 @@ def _shortfalls(evaluation: Evaluation, least: Mapping[str, float]) -> list[_Sho
 
 
 def _show(evaluation: Evaluation, short: Sequence[_Shortfall]) -> None:
-    console = rich.console.Console()
-    if not console.is_terminal:
-        # A log has no width, and a folded name cannot be copied.
-        console = rich.console.Console(width=_LOG_WIDTH)
+    console = result_console()
     console.print(_table(evaluation))
     for line in _lines(evaluation, short):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -344,7 +341,7 @@ def _across_lines(evaluation: Evaluation) -> list[str]:
     return [
         f"Over {counted(len(across.tasks), 'task')}, as scores from 0 to 1: {figures}",
         *(
-            f"  without {task}: {_printable(reason)}"
+            f"  without {task}: {printable(reason)}"
             for task, reason in across.left_out.items()
         ),
     ]
@@ -360,7 +357,7 @@ def _failure_lines(evaluation: Evaluation) -> list[str]:
         name = f"{each.task} seed {each.seed} episode {each.episode}"
         by_reason.setdefault(str(each.failure), []).append(name)
     lines = [
-        f"  {_printable(names[0])}{_and_more(len(names) - 1)}: {_printable(reason)}"
+        f"  {printable(names[0])}{_and_more(len(names) - 1)}: {printable(reason)}"
         for reason, names in by_reason.items()
     ]
     rest = len(lines) - _SHOWN
@@ -381,7 +378,7 @@ def _video_lines(evaluation: Evaluation) -> list[str]:
         for path, reason in evaluation.pending.items():
             by_reason.setdefault(reason, []).append(path.name)
         lines += [
-            f"  {names[0]}{_and_more(len(names) - 1)}: {_printable(reason)}"
+            f"  {names[0]}{_and_more(len(names) - 1)}: {printable(reason)}"
             for reason, names in by_reason.items()
         ]
     return lines
@@ -426,8 +423,3 @@ def _share(value: float | None) -> str:
 
 def _and_more(number: int) -> str:
     return f" and {number} more" if number else ""
-
-
-def _printable(text: str) -> str:
-    """Return a text of foreign code without what a terminal would take for orders."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

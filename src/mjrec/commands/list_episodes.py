@@ -20,11 +20,9 @@ from ..formats.monitor_directory import iter_monitor_files
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
 from .help_text import flowing_help
+from .terminal import result_console
 
 __all__ = ["episode_table", "list_episodes"]
-
-
-_LOG_WIDTH = 160
 
 
 @flowing_help
@@ -45,10 +43,7 @@ def list_episodes(
         for episode in episodes:
             sys.stdout.write(json_text.dumps(_fields(episode)) + "\n")
         return 0
-    console = rich.console.Console()
-    if not console.is_terminal:
-        # A log has no width, and a folded name cannot be copied.
-        console = rich.console.Console(width=_LOG_WIDTH)
+    console = result_console()
     shown: list[Episode] = []
     console.print(episode_table(_kept(episodes, shown)))
     others = _other_videos(directory, shown)

@@ -21,11 +21,11 @@ from ..evidence.verification import Check, Level, Verdict, Verification
 from ..evidence.verifying import VerificationProgress
 from ..evidence.verifying import verify as verify_archive
 from .help_text import flowing_help
+from .terminal import printable, result_console
 
 __all__ = ["verify"]
 
 _FAILED = 1
-_LOG_WIDTH = 160
 _MOST_SHOWN = 50
 
 _QUESTIONS: Final[Mapping[Level, str]] = {
@@ -120,10 +120,7 @@ def _progress_on(
 
 
 def _show(verification: Verification) -> None:
-    console = rich.console.Console()
-    if not console.is_terminal:
-        # A log has no width, and a folded name cannot be copied.
-        console = rich.console.Console(width=_LOG_WIDTH)
+    console = result_console()
     for level in verification.level.included:
         checks = [check for check in verification.checks if check.level is level]
         console.print(_table(level, checks))
@@ -180,13 +177,8 @@ def _texts(group: list[Check]) -> tuple[tuple[str, str], ...]:
 
 
 def _cell(text: tuple[str, str]) -> str:
-    words = rich.markup.escape(_printable(text[0]))
+    words = rich.markup.escape(printable(text[0]))
     return f"[{text[1]}]{words}[/]" if text[1] else words
-
-
-def _printable(text: str) -> str:
-    """Return a text out of a file without what a terminal would take for orders."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _verdict(verification: Verification) -> str:

@@ -117,9 +117,9 @@ def evaluate(
         protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
             `"suite"`: each task and seed has one random stream, seeded with s, that
             goes on from episode to episode.
-        resume: go on with the evaluation in the directory. Other tasks, seeds and
-            episodes may be asked for (with the protocol `"suite"` not episodes); what
-            is done already is not repeated. An episode whose worker had died is.
+        resume: go on with the evaluation in the directory. Other tasks and seeds, and
+            more episodes, may be asked for (with the protocol `"suite"` not episodes);
+            what is done already is not repeated. An episode whose worker had died is.
         max_steps: ends an episode as truncated; None is the environment's own limit,
             and 1000 where it has none.
         camera: of the videos; None is the model's tracking camera where there is one.
