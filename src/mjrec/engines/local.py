@@ -3,33 +3,33 @@
 
 from __future__ import annotations
 
-import collections
-import json
+import itertools
 import logging
 import os
 import selectors
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from ..carried_errors import unpacked
 from ..child_python import environment_of_child
 from ..errors import ClosedError, Error, InvalidArgument
+from ..gl.given_gpu import CUDA_VISIBLE_DEVICES, visible_gpus
 from ..machine import usable_cpus
+from .gpu_shares import GpuShare
+from .job_book import JobBook, Task, as_json
 from .local_process import WorkerProcess
 from .local_worker import SECONDS_TO_CLOSE
 from .work import Job, JobOutcome, Work
 
-__all__ = ["LocalEngine", "LocalRun"]
+__all__ = ["LocalEngine", "LocalRun", "check_worker_count"]
 
 logger = logging.getLogger(__name__)
 
-# Once may be chance, such as the system's killer of processes that need much memory;
-# so may twice, on a machine that has too little of it. Three times is the job.
-_TRIES = 3
 _ENDS_AT_ONCE = 2
 
 
@@ -38,22 +38,29 @@ class LocalEngine:
 
     Args:
         workers: how many at most; None is one for each CPU that may be used.
+        gpus: how much of a GPU each worker gets: with 0.25 four share one. They are
+            given those that `CUDA_VISIBLE_DEVICES` names, else all of the machine.
+        require_gpu: a worker that renders in software though it was given a GPU is an
+            error, and not only a warning.
 
     Raises:
-        InvalidArgument: `workers` is not a whole number of at least 1.
+        InvalidArgument: `workers` is not a whole number of at least 1, or `gpus` is no
+            share of GPUs.
     """
 
-    def __init__(self, workers: int | None = None) -> None:
-        if workers is None:
-            workers = usable_cpus()
-        if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
-            raise InvalidArgument(
-                f"workers must be a whole number of at least 1, got {workers!r}."
-            )
-        self.workers = workers
+    def __init__(
+        self,
+        workers: int | None = None,
+        *,
+        gpus: float = 0.0,
+        require_gpu: bool = False,
+    ) -> None:
+        self.workers = check_worker_count(workers) or usable_cpus()
+        self.share = GpuShare(each=gpus, required=require_gpu)
 
     def __repr__(self) -> str:
-        return f"LocalEngine(workers={self.workers})"
+        gpus = f", gpus={self.share.each:g}" if self.share.asked_for else ""
+        return f"LocalEngine(workers={self.workers}{gpus})"
 
     def begin(self, work: Work) -> LocalRun:
         """Begin a run. Workers are started when there are jobs.
@@ -62,7 +69,8 @@ class LocalEngine:
             InvalidArgument: the settings are no JSON.
             Error: the system grants no memory for the payload.
         """
-        return LocalRun(work, self.workers)
+        gpus = visible_gpus() if self.share.asked_for else []
+        return LocalRun(work, self.workers, share=self.share, gpus=gpus)
 
 
 class LocalRun:
@@ -80,26 +88,42 @@ class LocalRun:
     Args:
         work: what the workers do.
         workers: how many at most.
+        share: what each gets of GPUs; None is nothing.
+        gpus: those that there are, as `CUDA_VISIBLE_DEVICES` names them.
+        directory: their working directory; this process's, if None.
 
     Raises:
         InvalidArgument: the settings are no JSON.
         Error: the system grants no memory for the payload.
     """
 
-    def __init__(self, work: Work, workers: int) -> None:
+    def __init__(
+        self,
+        work: Work,
+        workers: int,
+        *,
+        share: GpuShare | None = None,
+        gpus: Sequence[str] = (),
+        directory: Path | None = None,
+    ) -> None:
         self._most = workers
+        self._share = share or GpuShare()
+        self._gpus = gpus
+        self._directory = directory
         self._environ = environment_of_child({**os.environ, **work.environ})
-        self._work = _written(work)
+        self._work = _written(work, self._share)
         self._forget_work = weakref.finalize(self, os.close, self._work)
         self._selector = selectors.DefaultSelector()
         self._workers: list[_Worker] = []
-        self._keys: set[str] = set()
-        self._given_out = 0
-        self._waiting: collections.deque[_Task] = collections.deque()
-        self._outcomes: collections.deque[JobOutcome] = collections.deque()
+        self._book = JobBook()
         self._ends_at_once = 0
         self._cancelled = False
         self._process_id = os.getpid()
+
+    @property
+    def workers(self) -> int:
+        """How many there are at most."""
+        return self._most
 
     def submit(self, job: Job) -> None:
         """Hand out a job; also while results come.
@@ -109,19 +133,12 @@ class LocalRun:
             ClosedError: the run is cancelled, or another process's.
         """
         self._check_usable()
-        if job.key in self._keys:
-            raise InvalidArgument(f"There was a job {job.key!r} in this run already.")
-        line = _as_json(
-            {"key": job.key, "arguments": dict(job.arguments)},
-            what=f"The arguments of the job {job.key!r}",
-        )
-        self._keys.add(job.key)
-        self._waiting.append(_Task(job.key, line))
+        self._book.add(job)
 
     @property
     def unfinished(self) -> int:
         """How many jobs have been submitted whose outcome has not been given out."""
-        return len(self._keys) - self._given_out
+        return self._book.unfinished
 
     def results(
         self, *, patience_s: float | None = None
@@ -189,14 +206,13 @@ class LocalRun:
             self._hand_out()
             rest = None if patience_s is None else last + patience_s - time.monotonic()
             # Also where there are outcomes: the workers shall not wait for the caller.
-            self._listen(
-                0 if self._outcomes or (rest is not None and rest <= 0) else rest
-            )
+            is_over = rest is not None and rest <= 0
+            self._listen(0 if self._book.has_outcome or is_over else rest)
             self._hand_out()
-            if self._outcomes:
-                self._given_out += 1
-                yield self._outcomes.popleft()
-            elif rest is not None and rest <= 0:
+            outcome = self._book.next_outcome()
+            if outcome is not None:
+                yield outcome
+            elif is_over:
                 yield None
             else:
                 continue
@@ -205,15 +221,21 @@ class LocalRun:
     def _hand_out(self) -> None:
         """Give jobs to whoever is idle; start no more workers than there are jobs."""
         idle = [worker for worker in self._workers if worker.is_idle]
-        while self._waiting and idle:
-            idle.pop().begin(self._waiting.popleft())
+        while self._book.waiting and idle:
+            idle.pop().begin(self._book.take())
         starting = sum(not worker.is_ready for worker in self._workers)
-        while len(self._waiting) > starting and len(self._workers) < self._most:
+        while self._book.waiting > starting and len(self._workers) < self._most:
             self._start()
             starting += 1
 
     def _start(self) -> None:
-        worker = _Worker(WorkerProcess(self._work, self._environ))
+        taken = {worker.seat for worker in self._workers}
+        seat = next(n for n in itertools.count() if n not in taken)
+        environ = self._environ
+        if (gpu := self._share.of(seat, self._gpus)) is not None:
+            environ = {**environ, CUDA_VISIBLE_DEVICES: gpu}
+        process = WorkerProcess(self._work, environ, directory=self._directory)
+        worker = _Worker(process, seat)
         self._workers.append(worker)
         for end in (worker.process.answers, worker.process.words):
             self._selector.register(end, selectors.EVENT_READ, worker)
@@ -245,7 +267,11 @@ class LocalRun:
                 self._dismiss(worker)
                 raise unpacked(answer["error"])
             else:
-                self._outcomes.append(worker.finish(answer))
+                self._book.finish(
+                    worker.end_task(),
+                    value=answer.get("value"),
+                    failure=answer.get("failure"),
+                )
 
     def _replace(self, worker: _Worker) -> None:
         """See what is to be done about one that has ended."""
@@ -259,22 +285,7 @@ class LocalRun:
                 raise Error(f"No worker can begin. The last one {how}")
             logger.warning("A worker could not begin, and is replaced. It %s", how)
         elif worker.task is not None:
-            self._begin_again(worker.task, how)
-
-    def _begin_again(self, task: _Task, how: str) -> None:
-        """Put a job whose worker has died behind the others, or give it up."""
-        if task.tries < _TRIES:
-            logger.warning(
-                "A worker died at the job %s, which is begun again. It %s",
-                task.key,
-                how,
-            )
-            self._waiting.append(task)
-            return
-        failure = f"Its worker died, which was try {task.tries} of {_TRIES}: it {how}"
-        self._outcomes.append(
-            JobOutcome(key=task.key, value=None, failure=failure, tries=task.tries)
-        )
+            self._book.begin_again(worker.task, how)
 
     def _let_workers_end(self) -> None:
         for worker in self._workers:
@@ -300,55 +311,56 @@ class LocalRun:
         worker.process.end()
 
 
-@dataclass
-class _Task:
-    """A job that has no outcome yet."""
-
-    key: str
-    line: bytes
-    tries: int = 0
-
-
 @dataclass(eq=False)
 class _Worker:
     """A process, and what it is at."""
 
     process: WorkerProcess
+    seat: int
     is_ready: bool = False
-    task: _Task | None = None
+    task: Task | None = None
 
     @property
     def is_idle(self) -> bool:
         return self.is_ready and self.task is None
 
-    def begin(self, task: _Task) -> None:
-        task.tries += 1
+    def begin(self, task: Task) -> None:
         self.task = task
         # Its last words shall be about this job.
         self.process.listen()
         self.process.forget_words()
         self.process.send(task.line)
 
-    def finish(self, answer: dict[str, Any]) -> JobOutcome:
+    def end_task(self) -> Task:
         task, self.task = self.task, None
         assert task is not None
-        return JobOutcome(
-            key=task.key,
-            value=answer.get("value"),
-            failure=answer.get("failure"),
-            tries=task.tries,
+        return task
+
+
+def check_worker_count(workers: int | None) -> int | None:
+    """Return `workers` if it is a number of workers, or None.
+
+    Raises:
+        InvalidArgument: it is something else.
+    """
+    whole = isinstance(workers, int) and not isinstance(workers, bool)
+    if workers is not None and not (whole and workers >= 1):
+        raise InvalidArgument(
+            f"workers must be a whole number of at least 1, got {workers!r}."
         )
+    return workers
 
 
-def _written(work: Work) -> int:
+def _written(work: Work, share: GpuShare) -> int:
     """Write work for all workers, once; return the file's descriptor."""
     payload = work.payload
     facts = {
         "entry": work.entry,
         "settings": dict(work.settings),
+        "gpu": {"required": share.required} if share.asked_for else None,
         "payload": None if payload is None else len(payload),
     }
-    line = _as_json(facts, what="The settings of the work")
+    line = as_json(facts, what="The settings of the work")
     try:
         # It has no name: nothing has to be removed, and nobody else can read it.
         descriptor = os.memfd_create("mjrec-work")
@@ -367,10 +379,3 @@ def _write_whole(descriptor: int, data: bytes) -> None:
     rest = memoryview(data)
     while rest:
         rest = rest[os.write(descriptor, rest) :]
-
-
-def _as_json(said: dict[str, Any], *, what: str) -> bytes:
-    try:
-        return json.dumps(said).encode()
-    except (TypeError, ValueError) as error:
-        raise InvalidArgument(f"{what} cannot be written as JSON: {error}.") from error

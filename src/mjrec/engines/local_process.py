@@ -10,6 +10,7 @@ import subprocess
 import sys
 import weakref
 from collections.abc import Mapping
+from pathlib import Path
 from typing import IO, Any
 
 from ..child_python import how_it_ended, python_command, said_in
@@ -29,8 +30,8 @@ _LONGEST_LINE = 1 << 13
 class WorkerProcess:
     """A process that does jobs; `local_worker` says what is spoken.
 
-    It has a session of its own, so that Ctrl-C in the terminal reaches only the parent,
-    and the caller's working directory. What it prints is passed on to the standard
+    It has a session of its own, so that Ctrl-C in the terminal reaches only the parent.
+    What it prints is passed on to the standard
     error, whole lines at a time, and the end of it is kept. It ends at `end`, when this
     object is garbage collected, at interpreter exit, and soon after the parent's death,
     whatever that died of.
@@ -38,18 +39,25 @@ class WorkerProcess:
     Args:
         work: descriptor of the file that says what is to be done.
         environ: all of its environment variables.
+        directory: its working directory; the caller's, if None.
 
     Raises:
         Error: it cannot be started.
     """
 
-    def __init__(self, work: int, environ: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        work: int,
+        environ: Mapping[str, str],
+        *,
+        directory: Path | None = None,
+    ) -> None:
         self._rest = b""
         self._line = b""
         self._said = b""
         self._has_ended = False
         try:
-            self.answers, self._process = _started(work, environ)
+            self.answers, self._process = _started(work, environ, directory)
         except OSError as error:
             raise Error(
                 f"No worker could be started: {sys.executable!r}: {error}."
@@ -164,7 +172,7 @@ os.register_at_fork(after_in_child=_leave_all_to_parent)
 
 
 def _started(
-    work: int, environ: Mapping[str, str]
+    work: int, environ: Mapping[str, str], directory: Path | None
 ) -> tuple[socket.socket, subprocess.Popen[bytes]]:
     ours, theirs = socket.socketpair()
     with theirs:
@@ -176,6 +184,7 @@ def _started(
                     *map(str, descriptors),
                 ],
                 env=environ,
+                cwd=directory,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,

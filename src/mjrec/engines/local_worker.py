@@ -2,8 +2,9 @@
 """A process that does jobs: `python -m mjrec.engines.local_worker SOCKET WORK`.
 
 Both are file descriptors. WORK is a file: a line of JSON with `entry` and `settings` of
-the `Work` and the size of its `payload`, or null, then that payload. On the socket both
-sides say one JSON object a line. It is told one job after the other::
+the `Work`, the size of its `payload`, or null, and `gpu`: null, or, where workers are
+given GPUs, `{"required": false}`; then that payload. On the socket both sides say one
+JSON object a line. It is told one job after the other::
 
     {"key": "a", "arguments": {...}}
 
@@ -40,6 +41,7 @@ from typing import Any, cast
 
 from ..carried_errors import carried
 from ..child_python import say_stacks_when_asked
+from ..gl.given_gpu import render_on_given_gpu
 from ..signals import Terminated, exiting_on_signals, received
 from .work import Handler
 
@@ -152,6 +154,9 @@ def _handler(work: int, parent: _Parent) -> Handler:
     """Make the handler; tell the parent why there is none."""
     try:
         facts, payload = _read_work(work)
+        if facts["gpu"] is not None:
+            # Before the handler's module, which may import mujoco.
+            render_on_given_gpu(required=facts["gpu"]["required"])
         module, _, name = facts["entry"].partition(":")
         make = operator.attrgetter(name)(importlib.import_module(module))
         handler: Handler = make(facts["settings"], payload)

@@ -11,10 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-__all__ = ["Engine", "Handler", "Job", "JobOutcome", "Run", "Work"]
+__all__ = ["WORK_FOLDER", "Engine", "Handler", "Job", "JobOutcome", "Run", "Work"]
+
+# In `Work.shared_directory`: where an engine keeps what it needs while work is done.
+WORK_FOLDER = ".mjrec.work"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,12 +31,16 @@ class Work:
         settings: for all of its jobs; JSON.
         payload: bytes that each worker is given once, such as a policy; None for none.
         environ: environment variables of the workers, besides those of this process.
+        shared_directory: one that all workers see, wherever they are, and this process
+            too; an engine may keep what it needs in a folder of it, and removes that
+            at the end. None where there is none. It need not be there yet.
     """
 
     entry: str
     settings: Mapping[str, Any] = field(default_factory=dict)
     payload: bytes | None = None
     environ: Mapping[str, str] = field(default_factory=dict)
+    shared_directory: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +86,10 @@ class Handler(Protocol):
 
 class Run(Protocol):
     """Work that has been begun. Leaving `with` cancels what is not done."""
+
+    @property
+    def workers(self) -> int:
+        """How many jobs are done at once, at most, as far as that is known."""
 
     def submit(self, job: Job) -> None:
         """Hand out a job; also while results come.

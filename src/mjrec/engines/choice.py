@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An engine from its name and what was said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ..errors import InvalidArgument, UnknownName
+from .local import LocalEngine
+from .ray import RayEngine
+from .slurm import SlurmEngine
+from .work import Engine
+
+__all__ = ["ENGINES", "engine_from"]
+
+ENGINES = ("local", "ray", "slurm")
+
+
+def engine_from(
+    name: str,
+    *,
+    workers: int | None = None,
+    address: str | None = None,
+    gpus: float = 0.0,
+    require_gpu: bool = False,
+    options: Mapping[str, str] | None = None,
+) -> Engine:
+    """Return an engine.
+
+    Args:
+        name: `"local"`, `"ray"` or `"slurm"`.
+        workers: how many at most; None is what the engine takes by itself.
+        address: of a Ray cluster; None is the one that `RAY_ADDRESS` names or that runs
+            on this machine, else one that is started for the run.
+        gpus: how much of a GPU each worker gets.
+        require_gpu: a worker that renders in software is an error.
+        options: what belongs to one engine only, as texts: parameters of `SlurmEngine`.
+
+    Raises:
+        UnknownName: there is no such engine, or no such option.
+        InvalidArgument: one of them cannot be, or belongs to another engine.
+        MissingDependency: what the engine needs is not installed.
+    """
+    if name not in ENGINES:
+        raise UnknownName("engine", name, ENGINES)
+    if address is not None and name != "ray":
+        raise InvalidArgument(
+            f"The address {address} would be a Ray cluster's, and the engine is {name}."
+        )
+    if options and name != "slurm":
+        raise InvalidArgument(
+            f"The engine {name} has no options of its own, got "
+            f"{', '.join(sorted(options))}. Those of Slurm need --engine slurm."
+        )
+    if name == "ray":
+        return RayEngine(workers, address=address, gpus=gpus, require_gpu=require_gpu)
+    if name == "slurm":
+        return SlurmEngine.from_texts(
+            options or {}, workers=workers, gpus=gpus, require_gpu=require_gpu
+        )
+    return LocalEngine(workers, gpus=gpus, require_gpu=require_gpu)
