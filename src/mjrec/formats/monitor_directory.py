@@ -37,6 +37,7 @@ monitors ever share one in a directory. Names that start with a dot and end in
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -90,16 +91,20 @@ _CLIP = rf"openaigym\.clip\.{_INFIX_PART}\.step(?P<step>[0-9]{{9,18}})"
 _CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})\.log")
 
 _MANIFEST = re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json")
-_PATTERNS = (
-    re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json~*"),
-    re.compile(rf"openaigym\.episode_batch\.{_INFIX_PART}\.stats\.json~*"),
-    re.compile(rf"openaigym\.episodes\.{_INFIX_PART}\.jsonl"),
-    re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
-    re.compile(rf"{_TRAJECTORY}\.(log|h5|log\.damaged)"),
-    _CLIP_PART,
-    re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
-    re.compile(rf"openaigym\.results\.{_INFIX_PART}\.monitor\.csv"),
-)
+# By what stands behind `openaigym.`: a directory may hold a million names, and each
+# is compared with one pattern and not with all.
+_VISIBLE = {
+    "manifest": re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json~*"),
+    "episode_batch": re.compile(
+        rf"openaigym\.episode_batch\.{_INFIX_PART}\.stats\.json~*"
+    ),
+    "episodes": re.compile(rf"openaigym\.episodes\.{_INFIX_PART}\.jsonl"),
+    "video": re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
+    "trajectory": re.compile(rf"{_TRAJECTORY}\.(log|h5|log\.damaged)"),
+    "clip": _CLIP_PART,
+    "model": re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
+    "results": re.compile(rf"openaigym\.results\.{_INFIX_PART}\.monitor\.csv"),
+}
 _HIDDEN = (
     re.compile(rf"\.{_VIDEO}\.lock"),
     re.compile(rf"\.{_CLIP}\.lock"),
@@ -260,20 +265,15 @@ def is_manifest(name: str) -> bool:
 
 def infix_of(name: str) -> str | None:
     """Return the infix in the name of a monitor file; None where there is none."""
-    for pattern in (*_PATTERNS, *_HIDDEN):
-        match = pattern.fullmatch(name)
-        if match:
-            return match.groupdict().get("infix")
-    return None
+    match = _match(name)
+    return None if match is None else match.groupdict().get("infix")
 
 
 def episode_of(name: str) -> int | None:
     """Return the episode's number in a file's name; None where there is none."""
-    for pattern in (*_PATTERNS, *_HIDDEN):
-        match = pattern.fullmatch(name)
-        if match and match.groupdict().get("episode"):
-            return int(match["episode"])
-    return None
+    match = _match(name)
+    number = None if match is None else match.groupdict().get("episode")
+    return None if number is None else int(number)
 
 
 def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Path]:
@@ -287,9 +287,33 @@ def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Pat
             nothing.
         hidden: also locks and unfinished files.
     """
-    patterns = _PATTERNS + (_HIDDEN if hidden else ())
     if not directory.is_dir():
         return
-    for path in sorted(directory.iterdir()):
-        if any(p.fullmatch(path.name) for p in patterns) and path.is_file():
-            yield path
+    for name in sorted(_names(directory, hidden=hidden)):
+        yield directory / name
+
+
+def _names(directory: Path, *, hidden: bool) -> Iterator[str]:
+    # What kind of file an entry is comes with its name: a network file system is asked
+    # once for many entries, and not once for each.
+    with os.scandir(directory) as entries:
+        for entry in entries:
+            is_wanted = hidden or not entry.name.startswith(".")
+            if is_wanted and _match(entry.name) is not None and _is_file(entry):
+                yield entry.name
+
+
+def _is_file(entry: os.DirEntry[str]) -> bool:
+    # What a link leads to is asked of the path: a link to itself is no error there.
+    return Path(entry).is_file() if entry.is_symlink() else entry.is_file()
+
+
+def _match(name: str) -> re.Match[str] | None:
+    """Return what tells a name to be a monitor file's; None for other files."""
+    if name.startswith("."):
+        matches = (pattern.fullmatch(name) for pattern in _HIDDEN)
+        return next((match for match in matches if match is not None), None)
+    _, _, rest = name.partition(".")
+    kind, _, _ = rest.partition(".")
+    visible = _VISIBLE.get(kind)
+    return None if visible is None else visible.fullmatch(name)
