@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container
 from typing import Final
 
 import numpy as np
@@ -36,20 +36,11 @@ _EARLIEST: Final = 315_532_800.0
 
 
 class EpisodeRows:
-    """Episodes of monitors, as they are read.
+    """Episodes of monitors, one monitor after the other, as they are read."""
 
-    Args:
-        infixes: of the monitors.
-        numbered: for each of them the numbers of episodes whose place is to be known,
-            such as those that have a video.
-    """
-
-    def __init__(
-        self, infixes: Sequence[str], numbered: Mapping[str, Iterable[int]]
-    ) -> None:
-        self._infixes = list(infixes)
-        self._number = {infix: index for index, infix in enumerate(infixes)}
-        self._wanted = {infix: frozenset(ids) for infix, ids in numbered.items()}
+    def __init__(self) -> None:
+        self._infixes: list[str] = []
+        self._wanted: Container[int] = ()
         self._places: dict[tuple[str, int], int] = {}
         self._run = array("q")
         self._episode = array("q")
@@ -67,14 +58,25 @@ class EpisodeRows:
         """Of how many monitors there are episodes."""
         return len(set(self._run))
 
+    def begin(self, infix: str, wanted: Container[int]) -> None:
+        """Go on with the next monitor.
+
+        Args:
+            infix: the monitor's.
+            wanted: the numbers of episodes whose place is to be known, such as those
+                that have a video.
+        """
+        self._infixes.append(infix)
+        self._wanted = wanted
+
     def add(self, episode: Episode) -> None:
-        """Add an episode of one of the monitors."""
+        """Add an episode of the monitor that was begun last."""
         number = episode.episode_id
         # One whose number is not certain has none of these, and gets no video.
         files = episode.video or episode.metadata or episode.trajectory
-        if files and number in self._wanted.get(episode.monitor, ()):
+        if files and number in self._wanted:
             self._places[episode.monitor, number] = len(self._run)
-        self._run.append(self._number[episode.monitor])
+        self._run.append(len(self._infixes) - 1)
         self._episode.append(number)
         self._total_reward.append(episode.reward)
         self._length.append(episode.length)

@@ -20,8 +20,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from ..errors import UnreadableFile
 from ..evaluation.results_files import ReadResults, read_results, read_summaries
 from ..evaluation.summaries import AcrossTasks, Bootstrap, TaskSummary
@@ -38,7 +36,12 @@ from .episode_columns import (
     what_disagrees,
 )
 from .found_recordings import FoundRecordings, find_recordings
-from .provenance import provenance_of_evaluation, provenance_of_monitors
+from .provenance import (
+    MonitorOrigin,
+    origin_of,
+    provenance_of_evaluation,
+    provenance_of_monitors,
+)
 from .recorded_videos import RecordedVideo, recorded_videos, report_video
 from .verdicts import VERIFICATION_NAME, read_verdict
 
@@ -82,6 +85,53 @@ class _Task:
 
     task: ReportTask
     videos: Sequence[tuple[RecordedVideo, int | None]]
+
+
+class _Monitors:
+    """Monitors that recorded the same, of whose files little is kept.
+
+    Args:
+        problems: is added to where something cannot be read.
+        reads_episodes: whether their episodes are wanted.
+    """
+
+    def __init__(self, problems: list[str], *, reads_episodes: bool) -> None:
+        self.origins: list[MonitorOrigin] = []
+        self.videos: list[RecordedVideo] = []
+        self._rows = EpisodeRows() if reads_episodes else None
+        self._problems = problems
+
+    def add(self, monitor: MonitorResults) -> None:
+        """Add what is shown of a monitor."""
+        self.origins.append(origin_of(monitor))
+        videos = recorded_videos(monitor, self._problems)
+        self.videos += videos
+        if self._rows is not None:
+            numbers = (video.episode_id for video in videos)
+            self._rows.begin(monitor.files.infix, {n for n in numbers if n is not None})
+            self._read_episodes(monitor, self._rows)
+
+    def recorded(self) -> _Recorded:
+        """Return the episodes, and which of them the videos show."""
+        assert self._rows is not None
+        columns, places = self._rows.columns()
+        placed = [
+            (video, places.get((video.infix, video.episode_id or 0)))
+            if video.episode_id is not None
+            else (video, None)
+            for video in self.videos
+        ]
+        return _Recorded(columns, placed, self._rows.run_count)
+
+    def _read_episodes(self, monitor: MonitorResults, rows: EpisodeRows) -> None:
+        before = len(rows)
+        try:
+            for episode in episodes_of(monitor):
+                rows.add(episode)
+        except UnreadableFile as error:
+            read = len(rows) - before
+            kept = f" {read} episodes before that are shown." if read else ""
+            self._problems.append(f"{error}{kept}")
 
 
 @dataclass(frozen=True)
@@ -208,9 +258,8 @@ class _Gathering:
             columns = columns_of_results(results.columns[task])
             self._note_disagreement(source, summary, columns)
             folder = results.folder(task)
-            monitors = self._monitors(folder)
-            videos = self._videos(monitors)
-            placed = _placed_in_results(results, task, videos)
+            monitors = self._monitors_of(folder, reads_episodes=False)
+            placed = _placed_in_results(results, task, monitors.videos)
             self._note_missing(results, task, folder, placed)
             self._tasks.append(
                 _Task(
@@ -221,7 +270,7 @@ class _Gathering:
                         summary=summary,
                         episodes=columns,
                         provenance=provenance_of_evaluation(
-                            results, task, monitors, videos, columns
+                            results, task, monitors.origins, monitors.videos, columns
                         ),
                     ),
                     placed,
@@ -245,9 +294,8 @@ class _Gathering:
         self._add_figures(results)
         for summary in results.summaries:
             folder = results.folder(summary.task)
-            monitors = self._monitors(folder)
-            videos = self._videos(monitors)
-            recorded = self._recorded(monitors, videos)
+            monitors = self._monitors_of(folder, reads_episodes=True)
+            recorded = monitors.recorded()
             self._tasks.append(
                 _Task(
                     ReportTask(
@@ -257,7 +305,11 @@ class _Gathering:
                         summary=summary,
                         episodes=recorded.columns,
                         provenance=provenance_of_evaluation(
-                            results, summary.task, monitors, videos, recorded.columns
+                            results,
+                            summary.task,
+                            monitors.origins,
+                            monitors.videos,
+                            recorded.columns,
                         ),
                     ),
                     recorded.placed,
@@ -307,10 +359,12 @@ class _Gathering:
     # Monitor directories.
 
     def _add_monitors(self, directory: Path) -> None:
-        monitors = self._monitors(directory)
-        groups: dict[str, list[MonitorResults]] = {}
-        for monitor in monitors:
-            groups.setdefault(self._environment(monitor), []).append(monitor)
+        groups: dict[str, _Monitors] = {}
+        for monitor in self._monitors(directory):
+            name = self._environment(monitor)
+            if name not in groups:
+                groups[name] = _Monitors(self._problems, reads_episodes=True)
+            groups[name].add(monitor)
         before = len(self._tasks)
         for name, group in groups.items():
             self._add_group(directory, name, group)
@@ -321,13 +375,14 @@ class _Gathering:
                 f"{', '.join(names)}: each is shown by itself."
             )
 
-    def _add_group(
-        self, directory: Path, name: str, monitors: Sequence[MonitorResults]
-    ) -> None:
-        videos = self._videos(monitors)
-        recorded = self._recorded(monitors, videos)
+    def _add_group(self, directory: Path, name: str, group: _Monitors) -> None:
+        recorded = group.recorded()
         columns = recorded.columns
-        if name == _UNKNOWN_ENVIRONMENT and not len(columns.run) and not videos:
+        if (
+            name == _UNKNOWN_ENVIRONMENT
+            and not len(columns.run)
+            and not recorded.placed
+        ):
             # Files that nothing can be read from.
             return
         bootstrap = next(iter(self._bootstraps.values()), Bootstrap())
@@ -341,61 +396,34 @@ class _Gathering:
                         name, columns, runs=recorded.runs, bootstrap=bootstrap
                     ),
                     episodes=columns,
-                    provenance=provenance_of_monitors(name, monitors, videos, columns),
+                    provenance=provenance_of_monitors(
+                        name, group.origins, group.videos, columns
+                    ),
                 ),
                 recorded.placed,
             )
         )
 
-    def _recorded(
-        self, monitors: Sequence[MonitorResults], videos: Sequence[RecordedVideo]
-    ) -> _Recorded:
-        """Return the episodes of monitors, and which of them their videos show."""
-        numbered: dict[str, set[int]] = {}
-        for video in videos:
-            if video.episode_id is not None:
-                numbered.setdefault(video.infix, set()).add(video.episode_id)
-        rows = EpisodeRows([monitor.files.infix for monitor in monitors], numbered)
-        for monitor in monitors:
-            self._read_episodes(monitor, rows)
-        columns, places = rows.columns()
-        placed = [
-            (video, places.get((video.infix, video.episode_id or 0)))
-            if video.episode_id is not None
-            else (video, None)
-            for video in videos
-        ]
-        return _Recorded(columns, placed, rows.run_count)
+    def _monitors_of(self, folder: Path, *, reads_episodes: bool) -> _Monitors:
+        """Return the monitors of a task."""
+        monitors = _Monitors(self._problems, reads_episodes=reads_episodes)
+        for monitor in self._monitors(folder):
+            monitors.add(monitor)
+        return monitors
 
-    def _read_episodes(self, monitor: MonitorResults, rows: EpisodeRows) -> None:
-        before = len(rows)
-        try:
-            for episode in episodes_of(monitor):
-                rows.add(episode)
-        except UnreadableFile as error:
-            read = len(rows) - before
-            kept = f" {read} episodes before that are shown." if read else ""
-            self._problems.append(f"{error}{kept}")
+    def _monitors(self, directory: Path) -> Iterator[MonitorResults]:
+        """Yield the monitors of a directory; whoever asks keeps none of them.
 
-    def _monitors(self, directory: Path) -> list[MonitorResults]:
+        A manifest says much of the machine, of which a page shows little.
+        """
         try:
-            return [
-                MonitorResults(files)
-                for files in monitors_of(directory)
-                if _has_something(files)
-            ]
+            found = monitors_of(directory)
         except OSError as error:
             self._problems.append(
                 f"{directory} cannot be looked into: {error.strerror}."
             )
-            return []
-
-    def _videos(self, monitors: Iterable[MonitorResults]) -> list[RecordedVideo]:
-        return [
-            video
-            for monitor in monitors
-            for video in recorded_videos(monitor, self._problems)
-        ]
+            return
+        yield from map(MonitorResults, filter(_has_something, found))
 
     def _environment(self, monitor: MonitorResults) -> str:
         try:
@@ -438,19 +466,21 @@ def _placed_in_results(
 ) -> list[tuple[RecordedVideo, int | None]]:
     """Return videos with the indices of the episodes that they show."""
     columns = results.columns[task]
+    shown = list(videos)
     number = {infix: index for index, infix in enumerate(columns.monitors)}
-    placed: list[tuple[RecordedVideo, int | None]] = []
-    for video in videos:
-        monitor = number.get(video.infix)
-        if monitor is None or video.episode_id is None:
-            # Of a batch that was begun, killed and done again.
-            continue
-        found = np.flatnonzero(
-            (columns.monitor == monitor) & (columns.episode_id == video.episode_id)
-        )
-        if len(found):
-            placed.append((video, int(found[0])))
-    return placed
+    keys = [(number.get(video.infix), video.episode_id) for video in shown]
+    wanted = set(keys)
+    index: dict[tuple[int | None, int | None], int] = {}
+    recorded = zip(columns.monitor, columns.episode_id, strict=True)
+    for row, key in enumerate(recorded if wanted else ()):
+        if key in wanted:
+            index.setdefault(key, row)
+    # Others are of a batch that was begun, killed and done again.
+    return [
+        (video, index[key])
+        for video, key in zip(shown, keys, strict=True)
+        if None not in key and key in index
+    ]
 
 
 def _in_order(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -22,7 +23,12 @@ from ..results.sources import MonitorResults
 from .contents import EpisodeColumns
 from .recorded_videos import RecordedVideo
 
-__all__ = ["provenance_of_evaluation", "provenance_of_monitors"]
+__all__ = [
+    "MonitorOrigin",
+    "origin_of",
+    "provenance_of_evaluation",
+    "provenance_of_monitors",
+]
 
 Rows = list[tuple[str, str]]
 
@@ -52,9 +58,45 @@ _LONGEST_TEXT: Final = 1000
 _MOST_LISTED: Final = 20
 
 
+@dataclass(frozen=True)
+class MonitorOrigin:
+    """What a monitor says of how its recordings came about.
+
+    What it does not say is None.
+
+    Attributes:
+        infix: its own.
+        policy: the file of the policy.
+        schedule: by which rule videos were chosen.
+        versions: of the packages.
+        gym: the version of gym, where that wrote the files.
+        machine: CPU and system.
+    """
+
+    infix: str
+    policy: str | None
+    schedule: str | None
+    versions: str | None
+    gym: str | None
+    machine: str | None
+
+
+def origin_of(monitor: MonitorResults) -> MonitorOrigin:
+    """Return what a monitor says of how its recordings came about."""
+    details = _details(monitor)
+    return MonitorOrigin(
+        infix=monitor.files.infix,
+        policy=_policy(details),
+        schedule=_schedule(details),
+        versions=_versions(details),
+        gym=_gym(monitor),
+        machine=_machine(details),
+    )
+
+
 def provenance_of_monitors(
     environment: str,
-    monitors: Sequence[MonitorResults],
+    monitors: Sequence[MonitorOrigin],
     videos: Iterable[RecordedVideo],
     columns: EpisodeColumns,
 ) -> Rows:
@@ -62,19 +104,19 @@ def provenance_of_monitors(
 
     Args:
         environment: what it is called.
-        monitors: that recorded it.
+        monitors: what those say that recorded it.
         videos: of these monitors.
         columns: their episodes.
     """
-    details = [_details(monitor) for monitor in monitors]
+    versions = [*(m.versions for m in monitors), *(m.gym for m in monitors)]
     return [
         ("Environment", environment),
-        ("Monitors", ", ".join(_some(m.files.infix for m in monitors))),
-        *_row("Policy", map(_policy, details)),
-        *_row("Selection of videos", map(_schedule, details)),
-        *_row("Versions", [*map(_versions, details), *map(_gym, monitors)]),
+        ("Monitors", ", ".join(_some(m.infix for m in monitors))),
+        *_row("Policy", (m.policy for m in monitors)),
+        *_row("Selection of videos", (m.schedule for m in monitors)),
+        *_row("Versions", versions),
         *_row("OpenGL of the videos", map(_renderer, videos)),
-        *_row("Recorded on", map(_machine, details)),
+        *_row("Recorded on", (m.machine for m in monitors)),
         *_row("Recorded", [_times(columns)]),
     ]
 
@@ -82,7 +124,7 @@ def provenance_of_monitors(
 def provenance_of_evaluation(
     results: ReadResults,
     task: str,
-    monitors: Iterable[MonitorResults],
+    monitors: Iterable[MonitorOrigin],
     videos: Iterable[RecordedVideo],
     columns: EpisodeColumns,
 ) -> Rows:
@@ -91,12 +133,11 @@ def provenance_of_evaluation(
     Args:
         results: of the evaluation.
         task: its name.
-        monitors: of the task's folder.
+        monitors: what those of the task's folder say.
         videos: of these monitors.
         columns: the episodes.
     """
     plan = results.plan
-    details = [_details(monitor) for monitor in monitors]
     return [
         ("Environment", task),
         *_row("Arguments of the environment", [_arguments(plan)]),
@@ -108,7 +149,7 @@ def provenance_of_evaluation(
         ("Selection of videos", _rule(plan.keep)),
         *_row("Versions", [_in_words(results.versions)]),
         *_row("OpenGL of the videos", map(_renderer, videos)),
-        *_row("Recorded on", map(_machine, details)),
+        *_row("Recorded on", (monitor.machine for monitor in monitors)),
         *_row("Recorded", [_times(columns)]),
     ]
 

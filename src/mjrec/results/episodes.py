@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -212,25 +212,18 @@ def _is_pending(results: MonitorResults, episode_id: int) -> bool:
     files = results.files
     trajectory = files.trajectories.get(episode_id)
     # Metadata without a video is what is left of one that could not be made.
-    if trajectory is None or episode_id in (*files.videos, *files.metadata):
+    if trajectory is None or episode_id in files.videos or episode_id in files.metadata:
         return False
     known = _episode_number(results.details.get("next_episode_id")) or 0
     # The last one was running when the manifest was written that it outlived.
     if episode_id < known - (results.is_behind and results.saved is not None):
-        return episode_id in _pending_ids(results.details)
+        return episode_id in results.pending_ids
     # Its monitor is open, or was killed.
     return trajectory.suffix == ".h5" or _says_deferred(trajectory)
 
 
 def _episode_number(value: object) -> int | None:
     return value if type(value) is int and 0 <= value <= MOST_EPISODES else None
-
-
-def _pending_ids(details: Mapping[str, Any]) -> list[Any]:
-    entries = details.get("pending")
-    if not isinstance(entries, list):
-        return []
-    return [entry.get("episode_id") for entry in entries if isinstance(entry, dict)]
 
 
 def _says_deferred(log: Path) -> bool:

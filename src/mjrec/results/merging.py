@@ -83,13 +83,11 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
         logger.error("There are no manifests in %s, and no journals.", directory)
         return None
     # In the order of the manifests' names, as gym has it.
-    results = [MonitorResults(files) for files in sorted(monitors, key=_gyms_order)]
-    paths = [_path(monitor) for monitor in results]
-    stats = [monitor.stats() for monitor in results]
-    merged = _merge(stats)
+    kept = [_kept(MonitorResults(files)) for files in sorted(monitors, key=_gyms_order)]
+    merged = _merge([each.stats for each in kept])
     return {
-        "manifests": paths,
-        "env_info": _env_info(directory, paths, results, stats),
+        "manifests": [each.path for each in kept],
+        "env_info": _env_info(directory, kept),
         "data_sources": merged.data_sources,
         "timestamps": merged.timestamps,
         "episode_lengths": merged.episode_lengths,
@@ -97,7 +95,7 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
         "episode_types": merged.episode_types,
         "initial_reset_timestamps": merged.initial_reset_timestamps,
         "initial_reset_timestamp": merged.initial_reset_timestamp,
-        "videos": _videos(directory, results),
+        "videos": _videos(directory, kept),
     }
 
 
@@ -110,6 +108,24 @@ def merge_stats_files(paths: Iterable[str | os.PathLike[str]]) -> MergedStats:
         UnreadableFile: a file is missing or damaged.
     """
     return _merge([read_stats_file(Path(path)) for path in paths])
+
+
+class _Kept(NamedTuple):
+    """What is kept of a monitor, of whose manifest that is a small part."""
+
+    path: str
+    stats: StatsFile
+    env_info: Mapping[str, Any] | None
+    videos: list[tuple[str, str]]
+
+
+def _kept(results: MonitorResults) -> _Kept:
+    return _Kept(
+        path=str(results.files.manifest or results.files.journal),
+        stats=results.stats(),
+        env_info=results.env_info,
+        videos=_names_of_videos(results),
+    )
 
 
 class _Row(NamedTuple):
@@ -166,31 +182,22 @@ def _gyms_order(files: MonitorFiles) -> str:
     return f"{files.infix}.manifest.json"
 
 
-def _path(results: MonitorResults) -> str:
-    return str(results.files.manifest or results.files.journal)
-
-
-def _env_info(
-    directory: Path,
-    paths: Sequence[str],
-    results: Sequence[MonitorResults],
-    stats: Sequence[StatsFile],
-) -> dict[str, Any]:
-    said = [(index, monitor.env_info) for index, monitor in enumerate(results)]
+def _env_info(directory: Path, monitors: Sequence[_Kept]) -> dict[str, Any]:
     # Of a killed monitor there may be nothing left that says it.
-    known = {index: info for index, info in said if info is not None}
+    known = [each for each in monitors if each.env_info is not None]
     if not known:
         return {"gym_version": GYM_VERSION}
-    newest = max(known, key=lambda index: _last_time(stats[index]))
-    if any(info != known[newest] for info in known.values()):
+    newest = max(known, key=lambda each: _last_time(each.stats))
+    infos = [each.env_info or {} for each in known]
+    if any(info != newest.env_info for info in infos):
         logger.warning(
             "The monitors of %s recorded different things: %s. Their results are "
             "merged; env_info is that of %s.",
             directory,
-            _differences([paths[index] for index in known], [*known.values()]),
-            Path(paths[newest]).name,
+            _differences([each.path for each in known], infos),
+            Path(newest.path).name,
         )
-    return dict(known[newest])
+    return dict(newest.env_info or {})
 
 
 def _last_time(stats: StatsFile) -> float:
@@ -217,13 +224,11 @@ def _difference(
     return f"{key} is " + ", ".join(f"{v} in {name}" for v, name in values.items())
 
 
-def _videos(
-    directory: Path, results: Sequence[MonitorResults]
-) -> list[tuple[str, str]]:
+def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]:
     listed = [
         (directory / video, directory / metadata)
-        for monitor in results
-        for video, metadata in _names_of_videos(monitor)
+        for monitor in monitors
+        for video, metadata in monitor.videos
     ]
     gone = [video.name for video, _ in listed if not video.is_file()]
     if gone:
@@ -244,7 +249,8 @@ def _names_of_videos(results: MonitorResults) -> list[tuple[str, str]]:
     if manifest is None or results.is_behind:
         found = _finished_videos(results.files)
         # A video gets its name when it is whole, and its metadata after that.
-        listed += [pair for pair in found if pair not in listed]
+        known = set(listed)
+        listed += [pair for pair in found if pair not in known]
     return listed
 
 

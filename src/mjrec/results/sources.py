@@ -84,6 +84,17 @@ class MonitorResults:
         manifest = self.manifest
         return {} if manifest is None or manifest.mjrec is None else manifest.mjrec
 
+    @functools.cached_property
+    def pending_ids(self) -> frozenset[int]:
+        """The numbers of the episodes whose videos the manifest calls pending."""
+        entries = self.details.get("pending")
+        numbers = (
+            entry.get("episode_id")
+            for entry in (entries if isinstance(entries, list) else ())
+            if isinstance(entry, dict)
+        )
+        return frozenset(number for number in numbers if type(number) is int)
+
     @property
     def env_info(self) -> Mapping[str, Any] | None:
         """What was recorded; None where nothing says it."""
