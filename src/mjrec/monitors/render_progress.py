@@ -25,7 +25,7 @@ class RenderProgress:
         self._bar = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}{task.fields[videos]}"),
             rich.progress.BarColumn(bar_width=20),
-            rich.progress.TextColumn("{task.completed}/{task.total} frames"),
+            rich.progress.TextColumn("{task.fields[frames]}"),
             rich.progress.TimeElapsedColumn(),
             rich.progress.TextColumn("left:"),
             rich.progress.TimeRemainingColumn(),
@@ -33,7 +33,7 @@ class RenderProgress:
             disable=not console.is_terminal,
             transient=True,
         )
-        self._task = self._bar.add_task(title, total=0, videos="")
+        self._task = self._bar.add_task(title, total=0, videos="", frames="")
 
     def __enter__(self) -> RenderProgress:
         self._bar.start()
@@ -48,10 +48,13 @@ class RenderProgress:
         self._bar.stop()
 
     def show(self, progress: Progress) -> None:
-        """Show how far it is."""
+        """Show how far it is: by its frames, or by videos where nobody counts those."""
+        done, total = progress.frames_done, progress.frames
+        frames = f"{done} frames" if total is None else f"{done}/{total} frames"
         self._bar.update(
             self._task,
-            completed=progress.frames_done,
-            total=progress.frames,
+            completed=progress.videos_done if total is None else done,
+            total=progress.videos if total is None else total,
             videos=f"{progress.videos_done}/{progress.videos} videos",
+            frames=frames,
         )

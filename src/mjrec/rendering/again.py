@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any, Self
 
 from ..errors import BlankVideo, Error, GLError, InvalidArgument
 from ..formats.video_names import camera_part, name_part
@@ -18,10 +21,10 @@ from .progress import Progress
 from .recorded_facts import open_for_rendering
 from .recorded_pictures import chosen_frames
 from .videos import further_video_paths, render_video
-from .views import View
+from .views import PlainCamera, View, plain_camera
 from .workers import DrawingWorkers
 
-__all__ = ["Variant", "render_again"]
+__all__ = ["Variant", "render_again", "render_one_again", "videos_of_variant"]
 
 logger = logging.getLogger(__name__)
 
@@ -55,14 +58,14 @@ class Variant:
 
         It is the original's with what is other before its extension, such as
         `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. A camera whose
-        name could be another of these parts is there as `camera-draft`. Readers of a
-        directory never take it for the original, and those who clear the directory
-        remove it too.
+        name could be another of these parts is there as `camera-draft`, and one that
+        has none by a hash of its members. Readers of a directory never take it for the
+        original, and those who clear the directory remove it too.
         """
         view = self.view
         size = "x".join(str(side or "") for side in (view.width, view.height))
         parts = (
-            "" if view.camera is None else camera_part(view.camera),
+            "" if view.camera is None else _camera_name(view.camera),
             "" if size == "x" else size,
             view.quality or "",
             "" if self.max_fps is None else f"max{_rate_name(self.max_fps)}fps",
@@ -72,6 +75,21 @@ class Variant:
         key = EpisodeKey.of(trajectory.name)
         stem = trajectory.stem if key is None else Path(key.video_name).stem
         return ".".join([stem, *filter(None, parts), "mp4"])
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what JSON can hold, for `from_json` in another process."""
+        return {
+            "view": self.view.as_json(),
+            "max_fps": _plain_rate(self.max_fps),
+            "fps": _plain_rate(self.fps),
+            "annotate": self.annotate,
+        }
+
+    @classmethod
+    def from_json(cls, said: Mapping[str, Any]) -> Self:
+        """Return what another process of ours said with `as_json`."""
+        rates = {name: _rate_of(said[name]) for name in ("max_fps", "fps")}
+        return cls(view=View(**said["view"]), annotate=said["annotate"], **rates)
 
 
 def render_again(
@@ -103,7 +121,7 @@ def render_again(
             stands for several.
     """
     paths = list(trajectories)
-    outs = [_out_for(path, variant, out, alone=len(paths) == 1) for path in paths]
+    outs = videos_of_variant(paths, variant, out)
     counts = [_frame_count(path, variant) for path in paths]
     now = Progress(videos=len(paths), frames=sum(counts))
 
@@ -121,7 +139,7 @@ def render_again(
             # Where nothing can be drawn, each would take as long to find that out.
             if gl_failure is None:
                 try:
-                    outcome = _render(
+                    outcome = render_one_again(
                         trajectory,
                         variant,
                         video,
@@ -138,16 +156,41 @@ def render_again(
             yield outcome
 
 
-def _render(
+def videos_of_variant(
+    trajectories: Sequence[Path], variant: Variant, out: Path | None
+) -> list[Path]:
+    """Return the videos that `render_again` would write.
+
+    Args:
+        trajectories: of the episodes.
+        variant: what is to be other.
+        out: as of `render_again`.
+
+    Raises:
+        InvalidArgument: as `render_again`.
+    """
+    alone = len(trajectories) == 1
+    return [_out_for(path, variant, out, alone=alone) for path in trajectories]
+
+
+def render_one_again(
     trajectory: Path,
     variant: Variant,
     video: Path,
     *,
     workers: DrawingWorkers,
     strict: bool,
-    on_frame: Callable[[], object],
+    on_frame: Callable[[], object] = lambda: None,
 ) -> Outcome:
-    """Render one, and return what became of it.
+    """Render one recorded episode another way, and return what became of it.
+
+    Args:
+        trajectory: of the episode.
+        variant: what is to be other.
+        video: what is written, as `videos_of_variant` says.
+        workers: who draws.
+        strict: as of `render_again`.
+        on_frame: called after every frame.
 
     Raises:
         GLError: nothing can be drawn here.
@@ -239,6 +282,22 @@ def _frame_count(trajectory: Path, variant: Variant) -> int:
     except Error:
         # It is told when its turn comes.
         return 0
+
+
+def _camera_name(camera: PlainCamera) -> str:
+    if not isinstance(camera, Mapping):
+        return camera_part(camera)
+    members = json.dumps(plain_camera(camera), sort_keys=True)
+    return f"camera-{hashlib.sha256(members.encode()).hexdigest()[:8]}"
+
+
+def _plain_rate(rate: float | Fraction | None) -> str | None:
+    # As a text it stays exact.
+    return rate if rate is None else str(to_rate(rate))
+
+
+def _rate_of(said: str | None) -> Fraction | None:
+    return said if said is None else Fraction(said)
 
 
 def _rate_name(rate: float | Fraction) -> str:

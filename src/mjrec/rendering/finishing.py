@@ -38,7 +38,7 @@ from .rendered_manifests import reconcile, update_manifest
 from .videos import render_video
 from .workers import DrawingWorkers
 
-__all__ = ["EpisodeFinisher", "finish_pending"]
+__all__ = ["EpisodeFinisher", "bring_up_to_date", "finish_pending", "note_failure"]
 
 logger = logging.getLogger(__name__)
 
@@ -87,8 +87,35 @@ def finish_pending(
         while finisher:
             _, outcome = finisher.finish_next()
             yield outcome
+    bring_up_to_date(directory)
+
+
+def bring_up_to_date(directory: Path) -> None:
+    """Give videos their second names, and keep manifests true.
+
+    To be called when videos of a directory have been finished. It also does what an
+    earlier run could not.
+
+    Raises:
+        UnreadableFile: a manifest is damaged.
+    """
     give_all_second_names(directory)
     reconcile(directory)
+
+
+def note_failure(
+    directory: Path, key: RecordingKey, reasons: Mapping[str, str]
+) -> None:
+    """Let the manifest say why videos of a recording are still pending.
+
+    Args:
+        directory: the monitor directory.
+        key: which recording.
+        reasons: by the videos' names.
+    """
+    # Whatever stands in the way of that is told by `reconcile`.
+    with contextlib.suppress(Error, OSError):
+        update_manifest(directory, key.infix, reasons=reasons)
 
 
 class EpisodeFinisher:
@@ -213,13 +240,8 @@ class EpisodeFinisher:
         except Exception as error:
             logger.exception("%s cannot be finished.", key.recording_name)
             reason = f"{type(error).__name__}: {error}"
-        self._note_failure(key, {nothing.name: reason})
+        note_failure(self._directory, key, {nothing.name: reason})
         return replace(nothing, failure=reason)
-
-    def _note_failure(self, key: RecordingKey, reasons: Mapping[str, str]) -> None:
-        # Whatever stands in the way of that is told by `reconcile`.
-        with contextlib.suppress(Error, OSError):
-            update_manifest(self._directory, key.infix, reasons=reasons)
 
     def _finish_clip(self, clip: PendingClip) -> Outcome:
         outcome = Outcome(name=clip.parts[0].name, directory=self._directory)

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Self
 
 __all__ = ["Outcome"]
 
@@ -34,3 +36,23 @@ class Outcome:
     is_elsewhere: bool = False
     further_videos: tuple[str, ...] = ()
     blank_video: str | None = None
+
+    @property
+    def is_trajectory(self) -> bool:
+        """Whether no video was wanted: a trajectory got its final form."""
+        return not (self.is_video or self.is_elsewhere or self.failure is not None)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what JSON can hold, for `from_json` in another process."""
+        return {**asdict(self), "directory": str(self.directory)}
+
+    @classmethod
+    def from_json(cls, said: Mapping[str, Any]) -> Self:
+        """Return what another process of ours said with `as_json`."""
+        return cls(
+            **{
+                **said,
+                "directory": Path(said["directory"]),
+                "further_videos": tuple(said["further_videos"]),
+            }
+        )

@@ -26,6 +26,7 @@ from ..formats.monitor_directory import (
     infix_of,
     iter_monitor_files,
     lock_name,
+    names_in,
     trajectory_prefix,
     video_lock_name,
     video_prefix,
@@ -44,6 +45,7 @@ __all__ = [
     "claim",
     "key_of",
     "look_at",
+    "may_be_left",
     "recorded_episodes",
     "recordings",
     "remove_unfinished",
@@ -174,14 +176,28 @@ def look_at(directory: Path, key: RecordingKey) -> PendingRecording | None:
     return _look_at_episode(directory, key)
 
 
-def _look_at_episode(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
+def may_be_left(directory: Path, key: RecordingKey) -> bool:
+    """Tell whether anything may be left to do about a recording, opening no file.
+
+    Where it is not, `look_at` returns None.
+    """
+    return isinstance(key, ClipKey) or _not_done(directory, key) is not None
+
+
+def _not_done(directory: Path, key: EpisodeKey) -> Path | None:
+    """Return the trajectory of an episode; None where there is nothing left to do."""
     trajectory = find_trajectory(directory, key.infix, key.episode_id)
+    if trajectory is None or trajectory.with_suffix(".log").exists():
+        return trajectory
+    return None if is_done(directory / key.video_name) else trajectory
+
+
+def _look_at_episode(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
+    # Most of a directory is done, and need not be opened.
+    trajectory = _not_done(directory, key)
     if trajectory is None:
         return None
     is_log = trajectory.with_suffix(".log").exists()
-    if not is_log and is_done(directory / key.video_name):
-        # Most of a directory is done, and need not be opened.
-        return None
     with open_for_rendering(trajectory) as reader:
         facts = reader.header.facts
         if is_log and _is_monitors(facts) and _is_open(directory, key.infix):
@@ -220,12 +236,15 @@ def remove_unfinished(video: Path) -> None:
 
     To be called by who holds the recording's lock, so that nobody else is at it.
     """
-    ends = (video, frame_hash_path(video), metadata_path(video))
-    for path in video.parent.iterdir():
-        for final in ends:
-            begin = f".{final.name}."
-            if path.name.startswith(begin) and _PART.fullmatch(path.name, len(begin)):
-                path.unlink(missing_ok=True)
+    finals = (video, frame_hash_path(video), metadata_path(video))
+    begins = tuple(f".{final.name}." for final in finals)
+    # Many names, of whole directories, are compared once for each video.
+    for name in names_in(video.parent):
+        if name.startswith(begins) and any(
+            name.startswith(begin) and _PART.fullmatch(name, len(begin))
+            for begin in begins
+        ):
+            video.with_name(name).unlink(missing_ok=True)
 
 
 def _is_monitors(facts: Mapping[str, Any]) -> bool:

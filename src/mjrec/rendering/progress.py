@@ -16,10 +16,12 @@ class Progress:
         videos_done: how many videos are over, be it as failures.
         videos: how many there are, as far as is known.
         frames_done: how many frames of these videos are drawn.
-        frames: how many frames these videos have.
+        frames: how many frames these videos have; None where nobody has counted them:
+            the frames of a video that an engine's worker draws are known when it is
+            over.
     """
 
     videos_done: int = 0
     videos: int = 0
     frames_done: int = 0
-    frames: int = 0
+    frames: int | None = 0
