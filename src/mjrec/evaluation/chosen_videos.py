@@ -4,18 +4,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ..formats.monitor_directory import Infix
-from ..rendering.finishing import finish_pending
+from ..rendering.finishing import bring_up_to_date, finish_pending
 from ..rendering.pending import EpisodeKey
 from ..rendering.progress import Progress
 from .evaluation import EvaluationProgress
 from .following import TaskRun
 
-__all__ = ["ChosenVideos", "render_chosen"]
+__all__ = ["ChosenVideos", "drawn_by_workers", "render_chosen"]
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +50,7 @@ def render_chosen(
         tell: is told how far it is.
     """
     videos = ChosenVideos()
-    keys = {of.task.folder: _keys(of) for of in runs}
+    keys = {of.task.folder: of.chosen_keys for of in runs}
     total = sum(map(len, keys.values()))
     before = 0
     for of in runs:
@@ -64,7 +63,7 @@ def render_chosen(
                     videos_done=before + progress.videos_done,
                     videos=total,
                     frames_done=progress.frames_done,
-                    frames=progress.frames,
+                    frames=progress.frames or 0,
                 )
             )
 
@@ -75,14 +74,24 @@ def render_chosen(
     return videos
 
 
-def _keys(of: TaskRun) -> list[EpisodeKey]:
-    """Return the chosen episodes of a task, each once."""
-    keys: dict[EpisodeKey, None] = {}
-    for result, _ in of.chosen:
-        infix = Infix.parse(result.monitor or "")
-        if infix is not None and result.episode_id is not None:
-            keys[EpisodeKey(infix, result.episode_id)] = None
-    return list(keys)
+def drawn_by_workers(directory: Path, runs: Sequence[TaskRun]) -> ChosenVideos:
+    """Return what came of the chosen episodes, which the workers have drawn.
+
+    Args:
+        directory: of the evaluation.
+        runs: its tasks, of which every video is over.
+
+    Raises:
+        UnreadableFile: a manifest is damaged.
+    """
+    videos = ChosenVideos()
+    for of in runs:
+        folder = directory / of.task.folder
+        if of.chosen_keys:
+            bring_up_to_date(folder)
+            reasons = _told(folder, of.not_drawn)
+            _sort(videos, folder, of.chosen_keys, reasons, of.problem)
+    return videos
 
 
 def _render(
@@ -98,6 +107,11 @@ def _render(
         for outcome in outcomes
         if outcome.failure is not None or outcome.is_elsewhere
     }
+    return _told(folder, reasons)
+
+
+def _told(folder: Path, reasons: Mapping[str, str]) -> dict[str, str]:
+    """Log why videos are not there; return it with what is to be done."""
     for reason in dict.fromkeys(reasons.values()):
         names = [name for name in reasons if reasons[name] == reason]
         logger.warning(
@@ -118,7 +132,7 @@ def _sort(
     videos: ChosenVideos,
     folder: Path,
     keys: Sequence[EpisodeKey],
-    reasons: dict[str, str],
+    reasons: Mapping[str, str],
     problem: str | None,
 ) -> None:
     for key in keys:

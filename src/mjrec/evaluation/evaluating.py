@@ -13,11 +13,12 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..engines.local import LocalEngine
-from ..engines.work import Engine, Work
+from ..engines.work import WORK_FOLDER, Engine, Work
 from ..errors import (
     DirectoryInUse,
     DirectoryNotWritable,
@@ -27,7 +28,9 @@ from ..errors import (
 from ..formats.locks import try_lock
 from ..gl.choice import choose
 from ..recorder.versions import versions
-from .chosen_videos import ChosenVideos, render_chosen
+from ..rendering.on_engine import given_engine
+from ..rendering.video_jobs import environ_for_drawing
+from .chosen_videos import ChosenVideos, drawn_by_workers, render_chosen
 from .evaluation import Evaluation, EvaluationProgress
 from .following import TaskRun, check_tasks, run_tasks
 from .kept_episodes import keep_rule
@@ -85,7 +88,7 @@ def evaluate(
     score_ranges: Mapping[str, tuple[float, float]] | None = None,
     bootstrap: Bootstrap | None = None,
     on_progress: _Tell | None = None,
-    engine: Engine | None = None,
+    engine: Engine | str | None = None,
 ) -> Evaluation:
     """Run so many episodes of each task, and write down what came of them.
 
@@ -110,7 +113,8 @@ def evaluate(
         seeds: of the runs.
         num_seeds: how many, from 0 on, instead; 5 if neither is given.
         workers: how many processes run, and later draw; one for each usable CPU, if
-            None. The results do not depend on it.
+            None. The results do not depend on it. Where `engine` is a name, how many
+            it has.
         keep: which episodes of each task get a video: `best[:N]`, `median`,
             `worst[:N]` and `failures[:N]`, separated by commas; or `cubic`, `all` or
             `none`. See `evaluation.kept_episodes`.
@@ -132,20 +136,25 @@ def evaluate(
             over all tasks. Those of the dm_control suite have theirs.
         bootstrap: how confidence intervals are made.
         on_progress: called several times a second with how far it is.
-        engine: where the work runs, instead of `workers` processes of this machine.
+        engine: where the work runs, instead of processes of this one: an engine, or
+            `"local"`, `"ray"` or `"slurm"`. Its workers draw the videos, too, those of
+            a task as soon as its episodes are over. All of them see the directory
+            under the same name. The results do not depend on it.
 
     Returns:
         What came of it, which stands in the directory too: `results.json`,
         `results.csv` and `timing.csv`.
 
     Raises:
-        MissingDependency: the framework of a task is not installed.
+        MissingDependency: the framework of a task, or what the engine needs, is not
+            installed.
         DifferentEvaluation: what is resumed was begun in another way.
         DirectoryInUse: another evaluation writes into the directory.
         PolicyError: the policy cannot be built, or not be sent to other processes.
         Error: an argument, a task or the policy cannot be. All of these are told
             before anything is run or written.
     """
+    given = given_engine(engine, workers)
     local = LocalEngine(workers)
     place = Path(directory)
     begun = _begun(place, resume=resume)
@@ -172,26 +181,31 @@ def evaluate(
     if begun is not None:
         check_continues(place, begun, plan)
     tell = on_progress or (lambda _: None)
+    results = _Results(plan, place, ranges=ranges, bootstrap=bootstrap or Bootstrap())
     with contextlib.ExitStack() as stack:
         runs = _run(
-            engine or local,
+            given or local,
             plan,
             sent,
             place,
             is_begun=begun is not None,
-            workers=local.workers,
+            draws=given is not None,
+            # Before the videos, which take long, and may not be possible here.
+            on_results=results.take,
             tell=tell,
             stack=stack,
         )
-        return _written(
-            plan,
-            place,
-            runs,
-            ranges=ranges,
-            bootstrap=bootstrap or Bootstrap(),
-            workers=local.workers,
-            tell=tell,
-        )
+        videos = ChosenVideos()
+        if any(of.chosen for of in runs):
+            videos = (
+                render_chosen(
+                    place, runs, workers=local.workers, over=results.over, tell=tell
+                )
+                if given is None
+                else drawn_by_workers(place, runs)
+            )
+            results.write()
+        return results.evaluation(videos)
 
 
 def _begun(directory: Path, *, resume: bool) -> EvaluationPlan | None:
@@ -214,10 +228,10 @@ def _begun(directory: Path, *, resume: bool) -> EvaluationPlan | None:
             "more seeds or episodes: resume=True (--resume). For another one, use a "
             "directory of its own."
         )
-    names = sorted(path.name for path in directory.iterdir())
-    if names and names != [_LOCK_NAME]:
+    names = {path.name for path in directory.iterdir()} - {_LOCK_NAME, WORK_FOLDER}
+    if names:
         raise InvalidArgument(
-            f"{directory} holds something that is no evaluation ({names[0]} "
+            f"{directory} holds something that is no evaluation ({min(names)} "
             f"{'and others' if len(names) > 1 else 'only'}). An evaluation needs a "
             "directory of its own, which is empty or new."
         )
@@ -235,11 +249,24 @@ def _run(
     directory: Path,
     *,
     is_begun: bool,
-    workers: int,
+    draws: bool,
+    on_results: Callable[[Sequence[TaskRun]], object],
     tell: _Tell,
     stack: contextlib.ExitStack,
 ) -> list[TaskRun]:
-    """Run all tasks; the directory is held until `stack` ends."""
+    """Run all tasks; the directory is held until `stack` ends.
+
+    Args:
+        engine: whose workers run them.
+        plan: what is evaluated.
+        sent: the policy.
+        directory: of the evaluation.
+        is_begun: whether it goes on with what is there.
+        draws: whether the workers draw, too.
+        on_results: as of `run_tasks`.
+        tell: likewise.
+        stack: see above.
+    """
     if is_begun:
         stack.enter_context(_held(directory))
     done = {
@@ -248,9 +275,15 @@ def _run(
     }
     work = Work(
         entry=_WORKER,
-        settings={"directory": str(directory.absolute()), "plan": plan_to_json(plan)},
+        settings={
+            "directory": str(directory.absolute()),
+            "plan": plan_to_json(plan),
+            # What works here may not work where an engine has its workers.
+            "chooses_gl": draws,
+        },
         payload=sent.payload,
-        environ=_environ_of_workers(draws=not keep_rule(plan.keep).keeps_none),
+        environ=_environ_of_workers(plan, draws=draws),
+        shared_directory=directory.absolute(),
     )
     with engine.begin(work) as run:
         left = [task for task in plan.tasks if _is_left(plan, done[task.name])]
@@ -265,14 +298,20 @@ def _run(
             directory,
             done=done,
             work=amounts,
-            workers=workers,
+            draws=draws,
+            on_results=on_results,
             tell=tell,
         )
 
 
-def _environ_of_workers(*, draws: bool) -> dict[str, str]:
+def _environ_of_workers(plan: EvaluationPlan, *, draws: bool) -> dict[str, str]:
     wanted = dict.fromkeys(_ONE_THREAD_EACH, "1")
-    if draws and _GL not in os.environ:
+    if draws:
+        return {
+            **{name: os.environ.get(name, value) for name, value in wanted.items()},
+            **environ_for_drawing(),
+        }
+    if not keep_rule(plan.keep).keeps_none and _GL not in os.environ:
         # A task that is drawn live needs a backend that works.
         with contextlib.suppress(GLError):
             wanted[_GL] = choose().backend
@@ -312,68 +351,90 @@ def _held(directory: Path) -> Iterator[None]:
         lock.release()
 
 
-def _written(
-    plan: EvaluationPlan,
-    directory: Path,
-    runs: Sequence[TaskRun],
-    *,
-    ranges: Mapping[str, tuple[float, float]],
-    bootstrap: Bootstrap,
-    workers: int,
-    tell: _Tell,
-) -> Evaluation:
-    """Write down the results, draw the videos, and write down which those are."""
-    summaries, across = _summarized(plan, runs, ranges, bootstrap)
-    results = [result for of in runs for result in of.results]
-    selection = {
-        of.task.name: [
-            ChosenEpisode(result.seed, result.episode, role)
-            for result, role in of.chosen
-        ]
-        for of in runs
-    }
+class _Results:
+    """What an evaluation comes to, in its directory.
 
-    def write() -> None:
-        files = {
-            of.task.name: RecordedFiles(
-                directory / of.task.folder, {result.unit for result, _ in of.chosen}
-            )
+    Args:
+        plan: what is evaluated.
+        directory: of the evaluation.
+        ranges: the returns that count as 0 and as 1, by task.
+        bootstrap: how intervals are made.
+    """
+
+    def __init__(
+        self,
+        plan: EvaluationPlan,
+        directory: Path,
+        *,
+        ranges: Mapping[str, tuple[float, float]],
+        bootstrap: Bootstrap,
+    ) -> None:
+        self._plan = plan
+        self._directory = directory
+        self._ranges = ranges
+        self._bootstrap = bootstrap
+        self._evaluation: Evaluation | None = None
+
+    def take(self, runs: Sequence[TaskRun]) -> None:
+        """Take in what came of the tasks, which are settled, and write it down."""
+        summaries, across = _summarized(self._plan, runs, self._ranges, self._bootstrap)
+        selection = {
+            of.task.name: [
+                ChosenEpisode(result.seed, result.episode, role)
+                for result, role in of.chosen
+            ]
             for of in runs
         }
-        write_results(
-            directory,
-            plan=plan,
-            results=results,
+        self._evaluation = Evaluation(
+            directory=self._directory,
+            plan=self._plan,
+            results=[result for of in runs for result in of.results],
             summaries=summaries,
             across=across,
-            bootstrap=bootstrap,
+            bootstrap=self._bootstrap,
             selection=selection,
+        )
+        self.write()
+
+    @property
+    def over(self) -> EvaluationProgress:
+        """How far an evaluation is of which only videos are left."""
+        results = self._known.results
+        return EvaluationProgress(
+            done=len(results), failed=len(self._known.failed), total=len(results)
+        )
+
+    def evaluation(self, videos: ChosenVideos) -> Evaluation:
+        """Return all of it."""
+        return replace(self._known, videos=videos.there, pending=videos.pending)
+
+    def write(self) -> None:
+        """Write it down, with the files that are there now."""
+        known = self._known
+        files = {
+            task.name: RecordedFiles(
+                self._directory / task.folder,
+                {(each.seed, each.episode) for each in known.selection[task.name]},
+            )
+            for task in self._plan.tasks
+        }
+        write_results(
+            self._directory,
+            plan=self._plan,
+            results=known.results,
+            summaries=known.summaries,
+            across=known.across,
+            bootstrap=self._bootstrap,
+            selection=known.selection,
             versions=versions(),
             files=lambda result: files[result.task].of(result),
         )
 
-    # Before the videos, which take long, and may not be possible here.
-    write()
-    videos = ChosenVideos()
-    if any(of.chosen for of in runs):
-        over = EvaluationProgress(
-            done=len(results),
-            failed=sum(each.failure is not None for each in results),
-            total=len(results),
-        )
-        videos = render_chosen(directory, runs, workers=workers, over=over, tell=tell)
-        write()
-    return Evaluation(
-        directory=directory,
-        plan=plan,
-        results=results,
-        summaries=summaries,
-        across=across,
-        bootstrap=bootstrap,
-        selection=selection,
-        videos=videos.there,
-        pending=videos.pending,
-    )
+    @property
+    def _known(self) -> Evaluation:
+        # `run_tasks` ends when all tasks have been taken in.
+        assert self._evaluation is not None
+        return self._evaluation
 
 
 def _summarized(

@@ -26,8 +26,9 @@ class EvaluationProgress:
         total: how many there are.
         videos_done: how many videos are over.
         videos: how many there are, as far as is known.
-        frames_done: how many frames of the present task's videos are drawn.
-        frames: how many frames these videos have.
+        frames_done: how many frames of the present task's videos are drawn; 0 where
+            the workers of an engine draw.
+        frames: how many frames these videos have; likewise.
     """
 
     done: int = 0

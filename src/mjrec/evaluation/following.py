@@ -4,14 +4,14 @@
 Tasks are checked first: who names one that cannot be made shall know before anything is
 written. Then batches of episodes are handed out, and as soon as all episodes of a task
 are over, those that get a video are chosen, and its recordings are settled, while other
-tasks still run.
+tasks still run. Where the workers draw, too, its videos come next.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,11 @@ from typing import Any
 from ..carried_errors import unpacked
 from ..engines.work import Job, JobOutcome, Run
 from ..errors import EnvironmentNotMade, PicturesDiffer
+from ..formats.monitor_directory import Infix
+from ..rendering.finishing import note_failure
+from ..rendering.outcomes import Outcome
+from ..rendering.pending import EpisodeKey, may_be_left
+from ..rendering.video_jobs import outcome_of
 from .episode_results import EpisodeResult
 from .evaluation import EvaluationProgress
 from .kept_episodes import Chosen, KeepRule, keep_rule
@@ -48,7 +53,11 @@ class TaskRun:
         reasons: why episodes are not in any ledger, by seed and number.
         results: of all its episodes, in the order of the plan, when they are over.
         chosen: of those, which get a video, each with its role.
+        unsettled: how many of its recordings are being settled.
         problem: why its recordings could not be settled; None where they were.
+        videos: how many videos of it workers draw.
+        videos_done: how many of these are over.
+        not_drawn: why workers could not draw videos, by their names.
     """
 
     task: EvaluatedTask
@@ -56,7 +65,21 @@ class TaskRun:
     reasons: dict[tuple[int, int], str] = field(default_factory=dict)
     results: list[EpisodeResult] = field(default_factory=list)
     chosen: list[Chosen] = field(default_factory=list)
+    unsettled: int = 0
     problem: str | None = None
+    videos: int = 0
+    videos_done: int = 0
+    not_drawn: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def chosen_keys(self) -> list[EpisodeKey]:
+        """The chosen episodes as their recording knows them, each once."""
+        keys: dict[EpisodeKey, None] = {}
+        for result, _ in self.chosen:
+            infix = Infix.parse(result.monitor or "")
+            if infix is not None and result.episode_id is not None:
+                keys[EpisodeKey(infix, result.episode_id)] = None
+        return list(keys)
 
 
 def check_tasks(
@@ -92,7 +115,8 @@ def run_tasks(
     *,
     done: _Done,
     work: Mapping[str, int],
-    workers: int,
+    draws: bool,
+    on_results: Callable[[Sequence[TaskRun]], object],
     tell: _Tell,
 ) -> list[TaskRun]:
     """Run all that is not done, and return what came of each task.
@@ -103,13 +127,18 @@ def run_tasks(
         directory: of the evaluation.
         done: the results of what was done before, by task.
         work: how much a step of each task is that is not done, as `check_tasks` says.
-        workers: how many processes it is for.
+        draws: whether the workers draw the videos of the chosen episodes, too.
+        on_results: called once, with the tasks, when all are settled: what is left
+            then are videos.
         tell: is told how far it is.
 
     Raises:
         Error: workers cannot be started, or a ledger is damaged.
     """
-    return _Runner(run, plan, directory, tell).run(done, work, workers)
+    runner = _Runner(
+        run, plan, directory, draws=draws, on_results=on_results, tell=tell
+    )
+    return runner.run(done, work)
 
 
 def _checked(task: str, outcome: JobOutcome, rule: KeepRule) -> Mapping[str, Any]:
@@ -136,23 +165,36 @@ class _Runner:
         run: see `run_tasks`; so with all of these.
         plan: likewise.
         directory: likewise.
+        draws: likewise.
+        on_results: likewise.
         tell: likewise.
     """
 
     def __init__(
-        self, run: Run, plan: EvaluationPlan, directory: Path, tell: _Tell
+        self,
+        run: Run,
+        plan: EvaluationPlan,
+        directory: Path,
+        *,
+        draws: bool,
+        on_results: Callable[[Sequence[TaskRun]], object],
+        tell: _Tell,
     ) -> None:
         self._run = run
         self._plan = plan
         self._directory = directory
+        self._draws = draws
+        self._on_results = on_results
         self._tell = tell
         self._rule = keep_rule(plan.keep)
         self._tasks = {task.folder: TaskRun(task) for task in plan.tasks}
+        self._settled: list[TaskRun] = []
         self._batches: dict[str, Batch] = {}
+        self._recordings: dict[str, EpisodeKey] = {}
         self._counts = LedgerCounts(directory / task.folder for task in plan.tasks)
 
-    def run(self, done: _Done, work: Mapping[str, int], workers: int) -> list[TaskRun]:
-        batches = batches_of(self._plan, done, workers=workers)
+    def run(self, done: _Done, work: Mapping[str, int]) -> list[TaskRun]:
+        batches = batches_of(self._plan, done, workers=self._run.workers)
         # What takes long comes first, so that all workers end at about the same time.
         for batch in sorted(batches, key=lambda batch: -work.get(batch.task, 0)):
             self._submit_batch(batch)
@@ -184,7 +226,9 @@ class _Runner:
             case "recover":
                 self._take_recovered(of, outcome)
             case "settle":
-                _note_problem(of, outcome)
+                self._take_settled(of, outcome)
+            case "draw":
+                self._take_drawn(of, outcome)
 
     def _take_batch(self, of: TaskRun, outcome: JobOutcome) -> None:
         batch = self._batches[outcome.key]
@@ -208,17 +252,62 @@ class _Runner:
         if folder.is_dir():
             name = of.task.folder
             self._submit(f"recover/{name}", {"folder": name})
+        else:
+            self._note_settled(of)
 
     def _take_recovered(self, of: TaskRun, outcome: JobOutcome) -> None:
         _note_problem(of, outcome)
         facts = _facts_by_monitor(of)
-        for monitor in (outcome.value or {}).get("monitors", ()):
+        monitors = (outcome.value or {}).get("monitors", ())
+        of.unsettled = len(monitors)
+        if not monitors:
+            self._note_settled(of)
+        for monitor in monitors:
             name = of.task.folder
             chosen = facts.get(monitor, [])
             self._submit(
                 f"settle/{name}/{monitor}",
                 {"folder": name, "monitor": monitor, "chosen": chosen},
             )
+
+    def _take_settled(self, of: TaskRun, outcome: JobOutcome) -> None:
+        _note_problem(of, outcome)
+        of.unsettled -= 1
+        if not of.unsettled:
+            self._note_settled(of)
+
+    def _note_settled(self, of: TaskRun) -> None:
+        self._settled.append(of)
+        if self._draws:
+            self._submit_videos(of)
+        if len(self._settled) == len(self._tasks):
+            self._on_results(list(self._tasks.values()))
+
+    def _submit_videos(self, of: TaskRun) -> None:
+        folder = of.task.folder
+        keys = of.chosen_keys
+        of.videos = len(keys)
+        for key in keys:
+            if not may_be_left(self._directory / folder, key):
+                of.videos_done += 1
+                continue
+            job = f"draw/{folder}/{key.told_name}"
+            self._recordings[job] = key
+            self._submit(job, {"folder": folder, "recording": key.told_name})
+
+    def _take_drawn(self, of: TaskRun, outcome: JobOutcome) -> None:
+        key = self._recordings[outcome.key]
+        folder = self._directory / of.task.folder
+        of.videos_done += 1
+        drawn = outcome_of(outcome, Outcome(name=key.told_name, directory=folder))
+        if drawn is None:
+            return
+        reason = "Another process is drawing it." if drawn.is_elsewhere else None
+        if (reason := drawn.failure or reason) is not None:
+            of.not_drawn[drawn.name] = reason
+        if outcome.failure is not None:
+            # Its worker has died, and could not.
+            note_failure(folder, key, {drawn.name: outcome.failure})
 
     def _progress(self) -> EvaluationProgress:
         plan = self._plan
@@ -228,7 +317,11 @@ class _Runner:
             done, failed = self._counts.look()
         # An episode that was run twice is still one.
         return EvaluationProgress(
-            done=min(done, total), failed=min(failed, total), total=total
+            done=min(done, total),
+            failed=min(failed, total),
+            total=total,
+            videos_done=sum(of.videos_done for of in self._settled),
+            videos=sum(of.videos for of in self._settled),
         )
 
 

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a worker process of an evaluation does.
 
-Settings: `{"directory": DIR, "plan": <the plan as JSON>}`; payload: the pickled policy,
-where it is an object. Jobs, by their `kind`, each of which may be done again:
+Settings: `{"directory": DIR, "plan": <the plan as JSON>}`, and `"chooses_gl": true`
+where the worker is to choose an OpenGL backend that works on its machine, if episodes
+get videos; payload: the pickled policy, where it is an object. Jobs, by their `kind`,
+each of which may be done again:
 
 `check`    `{"task"}`: makes the environment and the policy, and takes no step. Returns
            `{"env_id", "step_limit", "deferrable", "reason", "velocities"}`, the last
@@ -15,28 +17,37 @@ where it is an object. Jobs, by their `kind`, each of which may be done again:
            `{"monitors": infixes of those that are left to settle}`.
 `settle`   `{"folder", "monitor", "chosen": [[number, facts], ...]}`, see `settling`.
            Returns `{}`.
+`draw`     `{"folder", "recording"}`: finishes a recording, see
+           `rendering.video_jobs`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..carried_errors import carried
-from ..errors import Error
+from ..errors import Error, GLError
+from ..gl import use_gl
 from ..recorder.options import DEFERRED
 from ..simulation.inside import simulation_in
 from .plan import Batch
 from .plan_json import plan_from_json
 from .running import Evaluation, make_acting, rendering_of, run_batch
 
+if TYPE_CHECKING:
+    from ..rendering.video_jobs import VideoWorker
+
 __all__ = ["EvaluationWorker"]
 
 logger = logging.getLogger(__name__)
+
+_GL = "MUJOCO_GL"
 
 
 class EvaluationWorker:
@@ -58,11 +69,15 @@ class EvaluationWorker:
             "run": self._run,
             "recover": self._recover,
             "settle": self._settle,
+            "draw": self._draw,
         }
+        self._videos: VideoWorker | None = None
         # dm_control tries GLFW where no other backend was found, and complains of the
         # display that a machine without a screen has not got. Where that matters,
         # drawing says so.
         warnings.filterwarnings("ignore", message=r"\(65550\) b'X11")
+        if settings.get("chooses_gl") and self._evaluation.draws:
+            _choose_gl()
 
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Do a job.
@@ -73,7 +88,9 @@ class EvaluationWorker:
         return self._by_kind[arguments["kind"]](arguments)
 
     def close(self) -> None:
-        """Do nothing: nothing is held between jobs."""
+        """End what draws."""
+        if self._videos is not None:
+            self._videos.close()
 
     def _check(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         try:
@@ -128,8 +145,25 @@ class EvaluationWorker:
         )
         return {}
 
+    def _draw(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        from ..rendering.pending import key_of
+        from ..rendering.video_jobs import VideoWorker, finishing_job
+
+        key = key_of(arguments["recording"])
+        assert key is not None
+        if self._videos is None:
+            self._videos = VideoWorker()
+        return dict(self._videos(finishing_job(self._folder(arguments), key)))
+
     def _folder(self, arguments: Mapping[str, Any]) -> Path:
         return self._evaluation.directory / str(arguments["folder"])
+
+
+def _choose_gl() -> None:
+    if _GL not in os.environ:
+        # What cannot be drawn says so when its turn comes.
+        with contextlib.suppress(GLError):
+            use_gl()
 
 
 def _velocities(environment: Any) -> int:
