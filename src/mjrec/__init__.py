@@ -46,6 +46,9 @@ from .errors import (
 )
 
 if TYPE_CHECKING:
+    from .engines.local import LocalEngine as LocalEngine
+    from .engines.ray import RayEngine as RayEngine
+    from .engines.slurm import SlurmEngine as SlurmEngine
     from .evaluation.comparing import Comparison as Comparison
     from .evaluation.comparing import compare as compare
     from .evaluation.evaluating import evaluate as evaluate
@@ -66,6 +69,8 @@ if TYPE_CHECKING:
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
     from .recovery import Recovery as Recovery
     from .recovery import recover as recover
+    from .rendering.directory_videos import RenderedVideos as RenderedVideos
+    from .rendering.directory_videos import render_videos as render_videos
     from .rendering.pictures import render as render
     from .rendering.pictures import render_states as render_states
     from .reporting.film_strips import film_strip as film_strip
@@ -91,8 +96,12 @@ _LAZY = {
     "Episode": "results",
     "Evaluation": "evaluation.evaluation",
     "GymnasiumMonitor": "monitors.gymnasium_monitor",
+    "LocalEngine": "engines.local",
     "Monitor": "monitors",
+    "RayEngine": "engines.ray",
     "Recovery": "recovery",
+    "RenderedVideos": "rendering.directory_videos",
+    "SlurmEngine": "engines.slurm",
     "StatsRecorder": "recorder.stats_recorder",
     "Terminated": "signals",
     "Trajectory": "simulation.trajectories",
@@ -117,6 +126,7 @@ _LAZY = {
     "recover": "recovery",
     "render": "rendering.pictures",
     "render_states": "rendering.pictures",
+    "render_videos": "rendering.directory_videos",
     "save_video": "formats.frames_to_videos",
     "use_gl": "gl",
     "verify": "evidence.verifying",
@@ -150,6 +160,7 @@ __all__ = [
     "IdentityLeft",
     "InvalidArgument",
     "InvalidFrame",
+    "LocalEngine",
     "MissingDependency",
     "Monitor",
     "NoPictures",
@@ -157,10 +168,13 @@ __all__ = [
     "PackError",
     "PicturesDiffer",
     "PolicyError",
+    "RayEngine",
     "Recovery",
     "RenderError",
+    "RenderedVideos",
     "ResetNeeded",
     "ResetNotAllowed",
+    "SlurmEngine",
     "StatsRecorder",
     "Terminated",
     "Trajectory",
@@ -190,6 +204,7 @@ __all__ = [
     "recover",
     "render",
     "render_states",
+    "render_videos",
     "save_video",
     "use_gl",
     "verify",

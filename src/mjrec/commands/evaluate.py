@@ -26,6 +26,7 @@ from ..evaluation.summaries import Interval, TaskSummary
 from ..evaluation.summaries_json import summary_to_json
 from ..evaluation.task_sets import tasks_from
 from .counted import counted
+from .engine_options import NO_ENGINE, EngineOptions
 from .environment_options import kwargs_of
 from .help_text import flowing_help
 from .terminal import printable, result_console
@@ -78,6 +79,9 @@ def evaluate(
     score_range: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     fail_under: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    engine_options: Annotated[
+        tyro.conf.OmitArgPrefixes[EngineOptions], tyro.conf.arg(name="engine")
+    ] = NO_ENGINE,
 ) -> int:
     """Evaluate a policy: so many episodes of each task, and what came of them.
 
@@ -95,7 +99,7 @@ def evaluate(
         seeds: of the runs, such as 0,1,2.
         num_seeds: how many, from 0 on, instead of --seeds; 5, if neither is given.
         workers: how many processes; one for each CPU, if it is not given. The results
-            do not depend on it.
+            do not depend on it. With --engine, how many workers it has.
         keep: which episodes of each task get a video: best, best:N, median, worst,
             worst:N, failures and failures:N, separated by commas; or cubic, all or
             none.
@@ -117,6 +121,8 @@ def evaluate(
         fail_under: TASK=VALUE. The exit status is 1 where the mean return of this task
             is below, or an episode of it failed. May be given several times.
         as_json: print one JSON object at the end, and nothing else.
+        engine_options: where episodes are run and videos are drawn, in place of
+            processes of this command.
     """
     height, width = size_of(size)
     ranges = _by_task("--score-range", score_range, _range_of, "TASK=LOW:HIGH")
@@ -125,6 +131,7 @@ def evaluate(
     for task in least:
         if task not in names:
             raise UnknownName("task for --fail-under in this evaluation", task, names)
+    engine = engine_options.chosen(workers)
     console = rich.console.Console(stderr=True, quiet=as_json)
     try:
         with _Progress(console) as progress:
@@ -135,7 +142,8 @@ def evaluate(
                 episodes=episodes,
                 seeds=_seeds_of(seeds),
                 num_seeds=num_seeds,
-                workers=workers,
+                workers=workers if engine is None else None,
+                engine=engine,
                 keep=keep,
                 protocol=protocol,
                 resume=resume,

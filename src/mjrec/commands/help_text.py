@@ -9,14 +9,16 @@ from typing import TypeVar
 
 __all__ = ["flowing_help"]
 
-C = TypeVar("C", bound=Callable[..., int])
+C = TypeVar("C", bound=Callable[..., object])
 
 # The lines of an argument's description after its first, in a Google-style docstring.
 _CONTINUATION = re.compile(r"\n {12,}(?=\S)")
 
 
 def flowing_help(command: C) -> C:
-    """Make each description in a command's docstring one line, and return the command.
+    """Make each description in a docstring one line, and return what it is of.
+
+    Of a command, or of a class that holds options of several commands.
 
     tyro breaks a description where the docstring does, and again where the terminal
     ends.

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,18 +14,13 @@ import tyro
 from .. import json_text
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
-from ..formats.monitor_directory import iter_monitor_files
-from ..formats.trajectory_file import find_trajectory
-from ..machine import usable_cpus
 from ..monitors.render_progress import RenderProgress
-from ..rendering.again import Variant, render_again
-from ..rendering.cpu_slots import check_workers
-from ..rendering.finishing import finish_pending
+from ..rendering.again import Variant
+from ..rendering.directory_videos import RenderedVideos, iter_rendered_videos
 from ..rendering.outcomes import Outcome
-from ..rendering.pending import EpisodeKey, RecordingKey, key_of, recordings
 from ..rendering.views import View
-from ..simulation.model_trust import trusting_all_models
 from .counted import counted
+from .engine_options import NO_ENGINE, EngineOptions
 from .help_text import flowing_help
 from .view_options import camera_of, size_of
 
@@ -35,51 +28,6 @@ __all__ = ["render"]
 
 _FAILED = 1
 _INTERRUPTED = 130
-_SHOWN = 20
-
-
-@dataclass(kw_only=True)
-class _Report:
-    """What came of it."""
-
-    directory: Path
-    # Each with the number of its frames.
-    videos: dict[str, int] = field(default_factory=dict)
-    trajectories: list[str] = field(default_factory=list)
-    # Those that are there, and show nothing.
-    blank: dict[str, str] = field(default_factory=dict)
-    failures: dict[str, str] = field(default_factory=dict)
-    elsewhere: list[str] = field(default_factory=list)
-    interrupted: bool = False
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether there was nothing to do."""
-        done = self.videos or self.trajectories or self.failures or self.elsewhere
-        return not (done or self.interrupted)
-
-    def add(self, outcome: Outcome) -> None:
-        """Add what became of one."""
-        self.directory = outcome.directory
-        if outcome.is_video:
-            self.videos[outcome.name] = outcome.frame_count
-            further = dict.fromkeys(outcome.further_videos, outcome.frame_count)
-            self.videos.update(further)
-            if outcome.failure is not None:
-                self.blank[outcome.blank_video or outcome.name] = outcome.failure
-        elif outcome.failure is not None:
-            self.failures[outcome.name] = outcome.failure
-        elif outcome.is_elsewhere:
-            self.elsewhere.append(outcome.name)
-        else:
-            self.trajectories.append(outcome.name)
-
-    @property
-    def exit_status(self) -> int:
-        """The command's."""
-        if self.interrupted:
-            return _INTERRUPTED
-        return _FAILED if self.failures or self.blank else 0
 
 
 @flowing_help
@@ -101,6 +49,9 @@ def render(
     strict: bool = False,
     trust_models: bool = False,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    engine_options: Annotated[
+        tyro.conf.OmitArgPrefixes[EngineOptions], tyro.conf.arg(name="engine")
+    ] = NO_ENGINE,
 ) -> int:
     """Render the pending videos of a directory, or recorded episodes again.
 
@@ -129,13 +80,14 @@ def render(
         no_annotate: leave the frames without that, where it was recorded so.
         out: the file to write, for one episode; its ending says which kind.
         workers: how many processes draw; one for each CPU that is free, if it is not
-            given.
+            given. With --engine, how many workers it has.
         strict: fail where a video shows nothing: black, of one colour, or without any
             movement; it is kept.
         trust_models: load compiled models also where another user, or another machine,
             has written them, as is needed where their sources are not there. A crafted
             one can do anything to whoever loads it.
         as_json: print one JSON object at the end, and nothing else.
+        engine_options: where it is done, in place of processes of this command.
     """
     height, width = size_of(size)
     variant = Variant(
@@ -146,120 +98,62 @@ def render(
         fps=fps,
         annotate=_annotation(annotate, no_annotate),
     )
-    is_again = variant != Variant() or out is not None
-    if pending and is_again:
+    if pending and (variant != Variant() or out is not None):
         raise InvalidArgument(
             "--pending renders videos as they were to be. To render an episode another "
             "way, leave it out."
         )
-    check_workers(workers)
-    directory, keys = _episodes(target, episode)
+    engine = engine_options.chosen(workers)
     console = rich.console.Console(quiet=as_json)
-    trust = trusting_all_models() if trust_models else contextlib.nullcontext()
-    with trust, RenderProgress(console) as progress:
-        if is_again:
-            outcomes = render_again(
-                _trajectories(target, keys),
-                variant,
-                workers=workers or usable_cpus(),
-                out=out,
-                strict=strict,
-                on_progress=progress.show,
-            )
-        else:
-            outcomes = finish_pending(
-                directory,
-                keys,
-                workers=workers,
-                strict=strict,
-                on_progress=progress.show,
-            )
-        report = _collect(outcomes, directory, console)
-    if report.is_empty and (episode is not None or not target.is_dir()):
+    with RenderProgress(console) as progress:
+        outcomes = iter_rendered_videos(
+            target,
+            variant,
+            episode=episode,
+            out=out,
+            workers=workers if engine is None else None,
+            strict=strict,
+            trust_models=trust_models,
+            engine=engine,
+            on_progress=progress.show,
+        )
+        done, is_interrupted = _collect(outcomes, console)
+    report = RenderedVideos.of(done, target if target.is_dir() else target.parent)
+    nothing = report.is_empty and not is_interrupted
+    if nothing and (episode is not None or not target.is_dir()):
         raise InvalidArgument(
             f"No video of {_what(target, episode)} is pending. To render it again, say "
             "what is to be other (--camera, --size, --max-fps, --quality, --fps, "
             "--annotate) or where to write it (--out)."
         )
     if as_json:
-        _print_json(report)
+        _print_json(report, is_interrupted=is_interrupted)
     else:
-        _print_summary(report, console)
-    return report.exit_status
-
-
-def _episodes(target: Path, episode: int | None) -> tuple[Path, list[RecordingKey]]:
-    """Return a directory and those of its episodes and clips that were asked for.
-
-    Raises:
-        InvalidArgument: there are none.
-    """
-    if not target.exists():
-        raise InvalidArgument(f"There is no directory or file {target}.")
-    if not target.is_dir():
-        key = key_of(target.name)
-        return target.parent, [] if key is None else [key]
-    if not any(iter_monitor_files(target)):
-        raise InvalidArgument(
-            f"{target} holds no recordings. `mjrec record ENV --out {target}` makes "
-            "some."
-        )
-    keys = recordings(target)
-    if episode is None:
-        return target, keys
-    of_episodes = [key for key in keys if isinstance(key, EpisodeKey)]
-    chosen: list[RecordingKey] = [
-        key for key in of_episodes if key.episode_id == episode
-    ]
-    if not chosen:
-        numbers = sorted({key.episode_id for key in of_episodes})
-        listed = ", ".join(map(str, numbers[:_SHOWN])) or "none"
-        raise InvalidArgument(
-            f"{target} has no recorded states of {_what(target, episode)}. It has "
-            f"those of {listed}{' ...' * (len(numbers) > _SHOWN)}."
-        )
-    return target, chosen
-
-
-def _trajectories(target: Path, keys: Iterable[RecordingKey]) -> list[Path]:
-    """Return the trajectories that were asked for.
-
-    Raises:
-        InvalidArgument: there are none.
-    """
-    if not target.is_dir() and target.suffix in (".log", ".h5"):
-        # Whatever its name is otherwise.
-        return [target]
-    directory = target if target.is_dir() else target.parent
-    found = (
-        find_trajectory(directory, key.infix, key.episode_id)
-        for key in keys
-        if isinstance(key, EpisodeKey)
-    )
-    trajectories = [path for path in found if path is not None]
-    if not trajectories:
-        raise InvalidArgument(
-            f"There are no recorded states of {target}, from which it could be "
-            "rendered again."
-        )
-    return trajectories
+        _print_summary(report, console, is_interrupted=is_interrupted)
+    if is_interrupted:
+        return _INTERRUPTED
+    return _FAILED if report.failures or report.blank else 0
 
 
 def _collect(
-    outcomes: Iterable[Outcome], directory: Path, console: rich.console.Console
-) -> _Report:
-    """Return what became of all, having said so of each video."""
-    report = _Report(directory=directory)
+    outcomes: Iterable[Outcome], console: rich.console.Console
+) -> tuple[list[Outcome], bool]:
+    """Say of each video that it is there; return what became of all.
+
+    Returns:
+        That, and whether Ctrl-C came before the end.
+    """
+    done = []
     try:
         for outcome in outcomes:
-            report.add(outcome)
+            done.append(outcome)
             if outcome.is_video:
                 frames = counted(outcome.frame_count, "frame")
                 for name in (outcome.name, *outcome.further_videos):
                     _print(console, f"{name}: {frames}")
     except KeyboardInterrupt:
-        report.interrupted = True
-    return report
+        return done, True
+    return done, False
 
 
 def _annotation(annotate: bool, no_annotate: bool) -> bool | None:
@@ -280,11 +174,13 @@ def _what(target: Path, episode: int | None) -> str:
     return target.name if episode is None else f"episode {episode}"
 
 
-def _print_summary(report: _Report, console: rich.console.Console) -> None:
+def _print_summary(
+    report: RenderedVideos, console: rich.console.Console, *, is_interrupted: bool
+) -> None:
     shown = report.directory.absolute()
-    if report.interrupted:
+    if is_interrupted:
         _print(console, "Interrupted. What is not done stays as it was.")
-    if report.is_empty:
+    elif report.is_empty:
         _print(console, f"Nothing is pending in {shown}.")
     if report.videos:
         _print(
@@ -308,7 +204,7 @@ def _print_reasons(
         _print(console, "\n".join(f"    {line}" for line in reason.splitlines()))
 
 
-def _print_json(report: _Report) -> None:
+def _print_json(report: RenderedVideos, *, is_interrupted: bool) -> None:
     content = {
         "directory": str(report.directory.absolute()),
         "videos": [
@@ -317,7 +213,7 @@ def _print_json(report: _Report) -> None:
         "failures": report.failures,
         "blank": report.blank,
         "elsewhere": report.elsewhere,
-        "interrupted": report.interrupted,
+        "interrupted": is_interrupted,
     }
     sys.stdout.write(json_text.dumps(content) + "\n")
 

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the options of an engine say, on any command's line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import tyro
+
+from ..engines.choice import engine_from
+from ..engines.work import Engine
+from ..errors import InvalidArgument
+from .help_text import flowing_help
+
+__all__ = ["NO_ENGINE", "EngineOptions"]
+
+_LOCAL = "local"
+
+
+@flowing_help
+@dataclass(frozen=True, kw_only=True)
+class EngineOptions:
+    """Where the work runs.
+
+    Attributes:
+        engine: local, processes of this machine; ray, a Ray cluster; slurm, jobs of a
+            Slurm cluster. All machines see the directory under the same name.
+        gpus: how much of a GPU each worker gets; with 0.25 four share one.
+        require_gpu: fail where a worker would draw in software.
+        address: of the Ray cluster; the one that RAY_ADDRESS names or that runs here,
+            else one that is started for this command, if it is not given.
+        engine_option: KEY=VALUE, what only this engine has, such as
+            partition=gpu of Slurm. May be given several times.
+    """
+
+    engine: Literal["local", "ray", "slurm"] | None = None
+    gpus: float | None = None
+    require_gpu: bool = False
+    address: str | None = None
+    engine_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+
+    def chosen(self, workers: int | None) -> Engine | None:
+        """Return the engine that was asked for; None where none was.
+
+        Args:
+            workers: how many it has.
+
+        Raises:
+            InvalidArgument: options contradict each other, or are of another engine.
+            UnknownName: the engine has no such option of its own.
+            MissingDependency: what the engine needs is not installed.
+        """
+        options = _options_of(self.engine_option)
+        if self.engine is None and self.address is not None:
+            raise InvalidArgument(
+                f"--address {self.address} is that of a Ray cluster: use it with "
+                "--engine ray."
+            )
+        if self.engine is None and options:
+            raise InvalidArgument(
+                f"--engine-option {next(iter(options))} is of an engine: say which, "
+                "such as --engine slurm."
+            )
+        if self.engine is None and self.gpus is None and not self.require_gpu:
+            return None
+        return engine_from(
+            self.engine or _LOCAL,
+            workers=workers,
+            address=self.address,
+            gpus=self.gpus or 0.0,
+            require_gpu=self.require_gpu,
+            options=options,
+        )
+
+
+def _options_of(given: Sequence[str]) -> dict[str, str]:
+    options: dict[str, str] = {}
+    for text in given:
+        key, equals, value = text.partition("=")
+        if not (key and equals):
+            raise InvalidArgument(
+                f"--engine-option is KEY=VALUE, such as partition=gpu, got {text!r}."
+            )
+        if key in options:
+            raise InvalidArgument(f"--engine-option {key} was given twice.")
+        options[key] = value
+    return options
+
+
+# What is asked for where nothing is said.
+NO_ENGINE = EngineOptions()

@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The videos of a monitor directory: those that are pending, or recorded ones again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Self
+
+from ..annotation import check_annotation
+from ..engines.work import Engine
+from ..errors import InvalidArgument
+from ..formats.monitor_directory import iter_monitor_files
+from ..formats.trajectory_file import find_trajectory
+from ..machine import usable_cpus
+from ..simulation.model_trust import trusting_all_models
+from .again import Variant, render_again
+from .cpu_slots import check_workers
+from .finishing import finish_pending
+from .on_engine import finish_on_engine, given_engine, render_again_on_engine
+from .outcomes import Outcome
+from .pending import EpisodeKey, RecordingKey, key_of, recordings
+from .progress import Progress
+from .views import View, plain_camera
+
+__all__ = ["RenderedVideos", "iter_rendered_videos", "render_videos"]
+
+_SHOWN = 20
+
+_OnProgress = Callable[[Progress], object]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderedVideos:
+    """What became of the videos that were to be rendered, by the names of files.
+
+    Attributes:
+        directory: where they are.
+        videos: those that were rendered, each with the number of its frames.
+        trajectories: of episodes without a video, which got their final form.
+        failures: why videos could not be rendered.
+        blank: what videos that were rendered do not show, where `strict` asked.
+        elsewhere: those that another process is rendering.
+    """
+
+    directory: Path
+    videos: Mapping[str, int] = field(default_factory=dict)
+    trajectories: Sequence[str] = ()
+    failures: Mapping[str, str] = field(default_factory=dict)
+    blank: Mapping[str, str] = field(default_factory=dict)
+    elsewhere: Sequence[str] = ()
+
+    @classmethod
+    def of(cls, outcomes: Iterable[Outcome], directory: Path) -> Self:
+        """Return what outcomes come to.
+
+        Args:
+            outcomes: what `iter_rendered_videos` yields.
+            directory: where the videos are, if there are no outcomes that say it.
+        """
+        videos: dict[str, int] = {}
+        blank: dict[str, str] = {}
+        failures: dict[str, str] = {}
+        trajectories, elsewhere = [], []
+        for outcome in outcomes:
+            directory = outcome.directory
+            if outcome.is_video:
+                names = (outcome.name, *outcome.further_videos)
+                videos.update(dict.fromkeys(names, outcome.frame_count))
+                if outcome.failure is not None:
+                    blank[outcome.blank_video or outcome.name] = outcome.failure
+            elif outcome.failure is not None:
+                failures[outcome.name] = outcome.failure
+            elif outcome.is_elsewhere:
+                elsewhere.append(outcome.name)
+            else:
+                trajectories.append(outcome.name)
+        return cls(
+            directory=directory,
+            videos=videos,
+            trajectories=trajectories,
+            failures=failures,
+            blank=blank,
+            elsewhere=elsewhere,
+        )
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there was nothing to do."""
+        return not (self.videos or self.trajectories or self.failures or self.elsewhere)
+
+
+def render_videos(
+    target: str | os.PathLike[str],
+    *,
+    episode: int | None = None,
+    camera: Any = None,
+    height: int | None = None,
+    width: int | None = None,
+    max_fps: float | Fraction | None = None,
+    quality: str | None = None,
+    fps: float | Fraction | None = None,
+    annotate: bool | None = None,
+    out: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    strict: bool = False,
+    trust_models: bool = False,
+    engine: Engine | str | None = None,
+    on_progress: _OnProgress | None = None,
+) -> RenderedVideos:
+    """Render the pending videos of a directory, or recorded episodes again.
+
+    If nothing is to be other than recorded, the videos that are not there yet are
+    rendered, as they were to be; where none is pending, nothing is done. Several of
+    these calls, in any processes, share the work of a directory. Else (`camera`,
+    `height`, `width`, `max_fps`, `quality`, `fps`, `annotate`, `out`) recorded episodes
+    are rendered once more, into new files beside the originals, which nothing changes.
+
+    A video that cannot be rendered stops no other; the result says why. Ctrl-C, or what
+    else is raised, leaves what is finished.
+
+    Args:
+        target: a monitor directory; or a trajectory or video in one, for that episode
+            only.
+        episode: its number; all recorded ones, if None.
+        camera: as of `mjrec.render`; as recorded, if None. So with all of these.
+        height: in pixels.
+        width: likewise.
+        max_fps: the most frames per second of simulated time; every n-th recorded
+            frame is drawn, and the last.
+        quality: `"full"` or `"draft"`.
+        fps: frames per second written into the file; selects nothing.
+        annotate: whether episode, step, time and return are written on the frames.
+        out: the file to write, for one episode; its ending says which kind.
+        workers: how many processes draw; one for each CPU that is free, if None. Where
+            `engine` is a name, how many it has.
+        strict: whether a video that shows nothing (black, of one colour, or without any
+            movement) is among the `blank`; it is kept.
+        trust_models: load compiled models also where another user, or another machine,
+            has written them. A crafted one can do anything to whoever loads it. Until
+            the end of the call this holds for the whole process.
+        engine: where it is done, instead of processes of this one: an engine, or
+            `"local"`, `"ray"` or `"slurm"`. Each video is drawn by one worker. All
+            workers see the directory under the same name.
+        on_progress: called with how far it is: after every frame, or with an engine
+            after every video.
+
+    Returns:
+        What became of each.
+
+    Raises:
+        InvalidArgument: there are no such recordings, or an argument cannot be.
+        MissingDependency: what the engine, or writing on frames, needs is not there.
+        UnreadableFile: a manifest is damaged.
+        Error: the engine cannot do any work.
+    """
+    variant = Variant(
+        view=View(
+            camera=None if camera is None else plain_camera(camera),
+            height=height,
+            width=width,
+            quality=quality,
+        ),
+        max_fps=max_fps,
+        fps=fps,
+        annotate=annotate,
+    )
+    outcomes = iter_rendered_videos(
+        Path(target),
+        variant,
+        episode=episode,
+        out=None if out is None else Path(out),
+        workers=workers,
+        strict=strict,
+        trust_models=trust_models,
+        engine=engine,
+        on_progress=on_progress,
+    )
+    return RenderedVideos.of(outcomes, _directory_of(Path(target)))
+
+
+def iter_rendered_videos(
+    target: Path,
+    variant: Variant,
+    *,
+    episode: int | None = None,
+    out: Path | None = None,
+    workers: int | None = None,
+    strict: bool = False,
+    trust_models: bool = False,
+    engine: Engine | str | None = None,
+    on_progress: _OnProgress | None = None,
+) -> Iterator[Outcome]:
+    """Do what `render_videos` does, and yield what became of each as it is over.
+
+    What is asked for is checked before anything is begun, and before this returns.
+
+    Args:
+        target: as of `render_videos`, and so with all others.
+        variant: what is to be other.
+        episode: see there.
+        out: likewise.
+        workers: likewise.
+        strict: likewise.
+        trust_models: likewise.
+        engine: likewise.
+        on_progress: likewise.
+
+    Raises:
+        Error: as `render_videos`.
+    """
+    check_workers(workers)
+    if variant.annotate:
+        check_annotation()
+    elsewhere = given_engine(engine, workers)
+    directory, keys = _recordings_of(target, episode)
+    tell = on_progress or (lambda _: None)
+    if variant == Variant() and out is None:
+        _check_can_be_pending(target)
+        outcomes = (
+            finish_pending(
+                directory, keys, workers=workers, strict=strict, on_progress=tell
+            )
+            if elsewhere is None
+            else finish_on_engine(
+                elsewhere, directory, keys, strict=strict, on_progress=tell
+            )
+        )
+    else:
+        paths = _trajectories(target, keys)
+        outcomes = (
+            render_again(
+                paths,
+                variant,
+                workers=workers or usable_cpus(),
+                out=out,
+                strict=strict,
+                on_progress=tell,
+            )
+            if elsewhere is None
+            else render_again_on_engine(
+                elsewhere, paths, variant, out=out, strict=strict, on_progress=tell
+            )
+        )
+    return _trusting(outcomes) if trust_models else outcomes
+
+
+def _trusting(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
+    with trusting_all_models():
+        yield from outcomes
+
+
+def _directory_of(target: Path) -> Path:
+    return target if target.is_dir() else target.parent
+
+
+def _recordings_of(
+    target: Path, episode: int | None
+) -> tuple[Path, list[RecordingKey]]:
+    """Return a directory and those of its episodes and clips that were asked for.
+
+    Raises:
+        InvalidArgument: there are none.
+    """
+    if not target.exists():
+        raise InvalidArgument(f"There is no directory or file {target}.")
+    if not target.is_dir():
+        key = key_of(target.name)
+        return target.parent, [] if key is None else [key]
+    if not any(iter_monitor_files(target)):
+        raise InvalidArgument(
+            f"{target} holds no recordings. `mjrec record ENV --out {target}` makes "
+            "some."
+        )
+    keys = recordings(target)
+    if episode is None:
+        return target, keys
+    of_episodes = [key for key in keys if isinstance(key, EpisodeKey)]
+    chosen: list[RecordingKey] = [
+        key for key in of_episodes if key.episode_id == episode
+    ]
+    if not chosen:
+        numbers = sorted({key.episode_id for key in of_episodes})
+        listed = ", ".join(map(str, numbers[:_SHOWN])) or "none"
+        raise InvalidArgument(
+            f"{target} has no recorded states of episode {episode}. It has those of "
+            f"{listed}{' ...' * (len(numbers) > _SHOWN)}."
+        )
+    return target, chosen
+
+
+def _check_can_be_pending(target: Path) -> None:
+    if not target.is_dir() and key_of(target.name) is None:
+        raise InvalidArgument(
+            f"No video of {target.name} is pending: no recording has such a name. To "
+            "render it again, say what is to be other (camera, size, max_fps, quality, "
+            "fps, annotate) or where to write it (out, --out)."
+        )
+
+
+def _trajectories(target: Path, keys: Iterable[RecordingKey]) -> list[Path]:
+    """Return the trajectories that were asked for.
+
+    Raises:
+        InvalidArgument: there are none.
+    """
+    if not target.is_dir() and target.suffix in (".log", ".h5"):
+        # Whatever its name is otherwise.
+        return [target]
+    found = (
+        find_trajectory(_directory_of(target), key.infix, key.episode_id)
+        for key in keys
+        if isinstance(key, EpisodeKey)
+    )
+    trajectories = [path for path in found if path is not None]
+    if not trajectories:
+        raise InvalidArgument(
+            f"There are no recorded states of {target}, from which it could be "
+            "rendered again."
+        )
+    return trajectories
