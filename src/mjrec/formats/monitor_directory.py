@@ -62,6 +62,7 @@ __all__ = [
     "lock_name",
     "manifest_lock_name",
     "manifest_name",
+    "names_in",
     "render_lock_name",
     "stats_prefix",
     "trajectory_prefix",
@@ -291,6 +292,17 @@ def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Pat
         return
     for name in sorted(_names(directory, hidden=hidden)):
         yield directory / name
+
+
+def names_in(directory: Path) -> Iterator[str]:
+    """Yield the names of all that is in a directory, in no order.
+
+    For who looks for a few among a million, of each of which a `Path` is not worth
+    making.
+    """
+    with os.scandir(directory) as entries:
+        for entry in entries:
+            yield entry.name
 
 
 def _names(directory: Path, *, hidden: bool) -> Iterator[str]:

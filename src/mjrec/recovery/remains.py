@@ -7,6 +7,7 @@ each `resume`, in the process of the simulation.
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from ..formats.monitor_directory import (
     infix_of,
     iter_monitor_files,
     lock_name,
+    names_in,
     video_prefix,
 )
 from ..formats.unfinished_video import note_path
@@ -66,7 +68,7 @@ class Remains:
     infix: Infix
     paths: tuple[Path, ...]
 
-    @property
+    @functools.cached_property
     def files(self) -> MonitorFiles:
         """The files as results are read from them."""
         return MonitorFiles(str(self.infix), self.paths)
@@ -174,12 +176,13 @@ def remains_of(directory: Path) -> list[Remains]:
 def look_through(directory: Path, infix: Infix) -> Remains:
     """Return the files of one monitor as they are now."""
     # Many names are compared, of whole directories, once for each dead monitor.
+    own = f".{infix}."
     paths = [
         path
-        for path in directory.iterdir()
-        if f".{infix}." in path.name
-        and _infix_of(path.name) == infix
-        and path.is_file()
+        for name in names_in(directory)
+        if own in name
+        and _infix_of(name) == infix
+        and (path := directory / name).is_file()
     ]
     return Remains(directory, infix, tuple(sorted(paths)))
 
