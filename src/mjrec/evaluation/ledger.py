@@ -26,6 +26,7 @@ import io
 import logging
 import math
 import os
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,6 +63,9 @@ _VERSION = 1
 _THEN = "resuming the evaluation (--resume) goes on from there"
 _LONGEST_LINE = 1 << 24
 _LONGEST_FAILURE = 2000
+
+# Of a million results nearly all have the same, and few monitors have made them.
+_NO_WARNINGS: Mapping[str, int] = {}
 
 
 def ledger_name(name: str) -> str:
@@ -264,8 +268,8 @@ def _result(values: Mapping[str, Any], batch: _Batch) -> EpisodeResult:
         truncated=field_of(values, "truncated", optional(boolean)),
         success=field_of(values, "success", optional(boolean), default=None),
         failure=field_of(values, "failure", optional(text), default=None),
-        warnings=field_of(values, "warnings", _counts, default={}),
-        monitor=None if monitor is None else str(monitor),
+        warnings=field_of(values, "warnings", _counts, default={}) or _NO_WARNINGS,
+        monitor=None if monitor is None else sys.intern(str(monitor)),
         episode_id=field_of(values, "episode_id", optional(_count)),
         start_time=field_of(values, "start_time", optional(number)),
         seconds=field_of(values, "seconds", optional(number)),

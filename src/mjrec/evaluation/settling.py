@@ -34,7 +34,7 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.pending_videos import pending_video
-from ..formats.trajectory_file import amend_trajectory
+from ..formats.trajectory_file import amend_trajectory, find_trajectory
 from ..formats.trajectory_log_facts import append_facts
 from ..formats.video_metadata import is_done
 from ..rendering.log_finishing import finish_log
@@ -55,6 +55,7 @@ EVALUATION = "evaluation"
 
 _SECONDS = 60.0
 _MOMENT = 0.05
+_MOST_ASKED_FOR = 10_000
 
 
 def settle(
@@ -76,9 +77,11 @@ def settle(
     Raises:
         Error: see `settle_monitor`.
     """
+    own: dict[str, dict[int, Mapping[str, Any]]] = {}
+    for (infix, number), facts in chosen.items():
+        own.setdefault(infix, {})[number] = facts
     for infix in unsettled_monitors(folder):
-        own = {number: facts for (of, number), facts in chosen.items() if of == infix}
-        settle_monitor(folder, infix, own, rule=rule)
+        settle_monitor(folder, infix, own.get(infix, {}), rule=rule)
 
 
 def unsettled_monitors(folder: Path) -> list[str]:
@@ -123,11 +126,10 @@ def settle_monitor(
         return
     verdicts = _Verdicts(folder, infix, chosen, rule)
     promised: list[int] = []
-    for key in recorded_episodes(folder):
-        if key.infix == infix:
-            with _claimed(folder, key):
-                if _settle_episode(folder, key, verdicts):
-                    promised.append(key.episode_id)
+    for key in _episodes_of(folder, infix):
+        with _claimed(folder, key):
+            if _settle_episode(folder, key, verdicts):
+                promised.append(key.episode_id)
     _settle_manifest(verdicts, promised)
     # Videos that were there before are no longer pending.
     update_manifest(folder, infix)
@@ -139,9 +141,10 @@ def finish_logs(folder: Path, monitor: str) -> None:
     Raises:
         Error: as `settle_monitor`.
     """
-    for key in recorded_episodes(folder):
+    infix = Infix.parse(monitor)
+    for key in () if infix is None else _episodes_of(folder, infix):
         log = folder / f"{key.trajectory_name}.log"
-        if str(key.infix) == monitor and log.exists():
+        if log.exists():
             with _claimed(folder, key):
                 finish_log(log)
 
@@ -180,6 +183,35 @@ class _Verdicts:
     def has_video(self, episode_id: int) -> bool:
         """Tell whether there is a video of an episode already."""
         return is_done(self.folder / f"{video_prefix(self.infix, episode_id)}.mp4")
+
+
+def _episodes_of(folder: Path, infix: Infix) -> list[EpisodeKey]:
+    """Return the episodes of a monitor that have a trajectory, in order.
+
+    Its manifest says which numbers it gave: thousands of monitors may have recorded
+    into a folder, and each of them is settled by itself.
+    """
+    path = folder / manifest_name(infix)
+    numbers = _numbers_of(read_manifest(path)) if path.exists() else None
+    if numbers is None:
+        return [key for key in recorded_episodes(folder) if key.infix == infix]
+    return [
+        EpisodeKey(infix, number)
+        for number in numbers
+        if find_trajectory(folder, infix, number) is not None
+    ]
+
+
+def _numbers_of(manifest: Manifest) -> range | None:
+    details = manifest.mjrec or {}
+    first, following = (
+        details.get(key) for key in ("first_episode_id", "next_episode_id")
+    )
+    if type(first) is not int or type(following) is not int:
+        return None
+    # To be asked for one after the other; a manifest may also be anybody's.
+    is_few = 0 <= following - first <= _MOST_ASKED_FOR
+    return range(first, following) if first >= 0 and is_few else None
 
 
 def _settle_episode(folder: Path, key: EpisodeKey, verdicts: _Verdicts) -> bool:
