@@ -50,6 +50,7 @@ CONFINED = {
     "scipy": {"evaluation"},
     "matplotlib": {"reporting"},
     "rich": {"commands", "monitors"},
+    "submitit": {"engines"},
     "ray": {"engines.ray"},
     "submitit": {"engines.slurm"},
 }

@@ -1,30 +1,160 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work in jobs of a Slurm cluster."""
+"""Work in jobs of a Slurm cluster.
+
+A Slurm job is not a piece of work but a *host* of workers: it waits in Slurm's queue
+once, then does one job of the run after the other. Jobs and outcomes travel as files,
+`job_folder` says how; what runs in a Slurm job is `job_folder_host`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Self
+import contextlib
+import itertools
+import logging
+import math
+import os
+import secrets
+import shutil
+import time
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
+from ..child_python import said_in
+from ..errors import (
+    ClosedError,
+    DirectoryNotWritable,
+    Error,
+    InvalidArgument,
+    UnknownName,
+)
+from ..machine import usable_cpus
+from .driver_sign import DriverSign, is_surely_dead
 from .gpu_shares import GpuShare
+from .hosting import HomeLog, HostedWork, take_home
+from .job_book import JobBook, Task
+from .job_folder import HostState, JobFolder, Pace, TakenJob
+from .job_folder_host import GIVEN_BACK, HAD_ALL_TIME
 from .local import check_worker_count
-from .work import Run, Work
+from .local_worker import SECONDS_TO_CLOSE
+from .slurm_jobs import (
+    ClusterJobs,
+    JobRequest,
+    JobState,
+    NotSubmitted,
+    check_cluster,
+    cluster_jobs,
+)
+from .work import WORK_FOLDER, Job, JobOutcome, Run, Work
 
-__all__ = ["SlurmEngine"]
+__all__ = ["DEFAULT_WORKERS", "SlurmEngine", "SlurmRun"]
+
+logger = logging.getLogger(__name__)
+
+# What a cluster would grant is not known before; four are what nobody minds.
+DEFAULT_WORKERS = 4
+
+_FOLDER_PREFIX = "slurm."
+_SHORTEST_POLL = 0.005
+_POLLS_GROW = 1.5
+# Hosts find so many jobs each, so that none waits for the driver.
+_JOBS_AHEAD = 2
+_ENDS_AT_ONCE = 2
+_SECONDS_BETWEEN_TRIES = 30.0
+_TRIES_TO_SUBMIT = 10
+_SECONDS_BEFORE_SAYING_WHY = 60.0
+_SECONDS_TO_LEAVE = 15.0
+_END_OF_LOG = 2000
 
 
 class SlurmEngine:
-    """Runs work in jobs of a Slurm cluster."""
+    """Runs work in jobs of a Slurm cluster.
+
+    Args:
+        workers: how many at most, in all Slurm jobs together; None is 4, and one for
+            each CPU where `cluster` is `"local"`.
+        cluster: None is the Slurm cluster that this machine belongs to; `"local"` is
+            this machine, with processes in place of Slurm jobs, to try it out.
+        gpus: how much of a GPU each worker gets: with 0.25 four share one.
+        require_gpu: a worker that renders in software though it was given a GPU is an
+            error, and not only a warning.
+        cpus_per_worker: how many CPUs each worker gets.
+        workers_per_job: how many workers a Slurm job holds, on one machine; None is as
+            many as share a GPU, else one.
+        partition: in which Slurm jobs run; None is the cluster's default, for this and
+            what follows.
+        account: which they are charged to.
+        qos: their quality of service.
+        constraint: features that their nodes have.
+        time_min: their time limit in minutes. It ends no work: another takes the
+            place of one whose time is over. The longest job has to fit.
+        notice_s: so many seconds before its time limit a Slurm job takes no more
+            jobs; what it is at then can still be done.
+        mem_gb: memory of each worker, in gigabytes.
+        setup: lines of shell that run in a Slurm job before anything else.
+        sbatch: any other options of `sbatch`, by name, without their dashes.
+
+    Raises:
+        InvalidArgument: one of them cannot be.
+        MissingDependency: submitit is not installed.
+        Error: this machine has no commands of Slurm's.
+    """
 
     def __init__(
         self,
         workers: int | None = None,
         *,
+        cluster: str | None = None,
         gpus: float = 0.0,
         require_gpu: bool = False,
+        cpus_per_worker: int = 1,
+        workers_per_job: int | None = None,
+        partition: str | None = None,
+        account: str | None = None,
+        qos: str | None = None,
+        constraint: str | None = None,
+        time_min: int = 60,
+        notice_s: float = 120.0,
+        mem_gb: float | None = None,
+        setup: Sequence[str] = (),
+        sbatch: Mapping[str, str | int | bool] | None = None,
     ) -> None:
-        self.workers = check_worker_count(workers)
+        given = check_worker_count(workers)
         self.share = GpuShare(each=gpus, required=require_gpu)
+        _check_whole("cpus_per_worker", cpus_per_worker)
+        _check_whole("time_min", time_min)
+        if workers_per_job is not None:
+            _check_whole("workers_per_job", workers_per_job)
+        if mem_gb is not None and not mem_gb > 0:
+            raise InvalidArgument(f"mem_gb is more than 0, got {mem_gb!r}.")
+        if not 0 <= notice_s < 60 * time_min:
+            raise InvalidArgument(
+                f"notice_s is less than the time limit of {time_min} minutes (time_min)"
+                f", in seconds, got {notice_s!r}."
+            )
+        self.cluster = check_cluster(cluster)
+        self.workers = given or (
+            usable_cpus() if self.cluster == "local" else DEFAULT_WORKERS
+        )
+        per_job = min(workers_per_job or _sharing(self.share), self.workers)
+        self._request = JobRequest(
+            workers=per_job,
+            cpus=cpus_per_worker,
+            gpus=math.ceil(self.share.each * per_job - 1e-9),
+            time_min=time_min,
+            notice_s=notice_s,
+            memory_gb=None if mem_gb is None else mem_gb * per_job,
+            partition=partition,
+            account=account,
+            qos=qos,
+            constraint=constraint,
+            setup=tuple(setup),
+            sbatch=dict(sbatch or {}),
+        )
+        self._pace = Pace()
 
     @classmethod
     def from_texts(
@@ -35,9 +165,645 @@ class SlurmEngine:
         gpus: float = 0.0,
         require_gpu: bool = False,
     ) -> Self:
-        """Return an engine from options as the command line has them."""
-        return cls(workers, gpus=gpus, require_gpu=require_gpu)
+        """Return an engine from options as the command line has them.
+
+        Args:
+            options: parameters of the class by name, as texts; `sbatch.NAME` is an
+                option of `sbatch`, and `setup` one line.
+            workers: as of the class.
+            gpus: likewise.
+            require_gpu: likewise.
+
+        Raises:
+            UnknownName: there is no such option.
+            InvalidArgument: one of them cannot be.
+            MissingDependency: submitit is not installed.
+            Error: this machine has no commands of Slurm's.
+        """
+        known: dict[str, Any] = {}
+        sbatch: dict[str, str | int | bool] = {}
+        for name, text in options.items():
+            if name.startswith(_SBATCH):
+                sbatch[name.removeprefix(_SBATCH)] = text or True
+            elif name in _FROM_TEXT:
+                known[name] = _value_of(name, text)
+            else:
+                raise UnknownName(
+                    "option of Slurm's",
+                    name,
+                    [*_FROM_TEXT, f"{_SBATCH}NAME"],
+                    hint=f"Any other option of sbatch is {_SBATCH}NAME=VALUE.",
+                )
+        return cls(workers, gpus=gpus, require_gpu=require_gpu, sbatch=sbatch, **known)
+
+    def __repr__(self) -> str:
+        gpus = f", gpus={self.share.each:g}" if self.share.asked_for else ""
+        where = ", cluster='local'" if self.cluster == "local" else ""
+        return f"SlurmEngine(workers={self.workers}{where}{gpus})"
 
     def begin(self, work: Work) -> Run:
-        """Begin a run. Workers are started when there are jobs."""
-        raise NotImplementedError
+        """Begin a run. Slurm jobs are submitted when there are jobs.
+
+        What an earlier run with the same shared directory has left behind, because its
+        driver was killed, is told to end.
+
+        Raises:
+            InvalidArgument: the settings are no JSON, or the work has no shared
+                directory.
+            DirectoryNotWritable: that directory.
+        """
+        return SlurmRun(
+            work,
+            workers=self.workers,
+            share=self.share,
+            cluster=self.cluster,
+            request=self._request,
+            pace=self._pace,
+        )
+
+
+class SlurmRun:
+    """Work that has been begun.
+
+    Slurm jobs are submitted, and jobs handed out, while `results` is iterated over. One
+    that ends is replaced as long as there is work for it. A job whose worker dies is
+    begun again in the same Slurm job; one whose Slurm job ends in another, which counts
+    as a try where the job itself may be to blame.
+
+    For one thread at a time, and for the process that began it.
+
+    Args:
+        work: what the workers do.
+        workers: how many at most.
+        share: what each gets of GPUs.
+        cluster: where Slurm jobs are submitted to.
+        request: what each of them is asked for with.
+        pace: how often files and the cluster are looked at.
+
+    Raises:
+        InvalidArgument: the settings are no JSON, or the work has no shared directory.
+        DirectoryNotWritable: that directory.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        *,
+        workers: int,
+        share: GpuShare,
+        cluster: str,
+        request: JobRequest,
+        pace: Pace,
+    ) -> None:
+        if work.shared_directory is None:
+            raise InvalidArgument(
+                "Workers in Slurm jobs need a directory that all machines see, and "
+                "this work names none (shared_directory)."
+            )
+        self._most = workers
+        self._request = request
+        self._pace = pace
+        self._place = _Place(work.shared_directory)
+        self._folder = self._place.make(HostedWork.of(work, share), work.payload)
+        self._jobs = cluster_jobs(cluster, self._folder, request, pace)
+        self._sign = DriverSign(self._folder, cluster, every_s=pace.beat_s)
+        self._earlier = [
+            _EarlierRun(folder, request, pace) for folder in self._place.others()
+        ]
+        self._hosts = _Hosts(self._folder, self._jobs, pace)
+        self._book = JobBook()
+        self._log = HomeLog()
+        self._out: dict[int, Task] = {}
+        self._numbers = itertools.count(1)
+        self._looked = -math.inf
+        self._cancelled = False
+        self._process_id = os.getpid()
+        self._leave = weakref.finalize(
+            self, _abandon, self._folder, self._jobs, self._sign, os.getpid()
+        )
+        self._see_earlier_runs()
+
+    @property
+    def workers(self) -> int:
+        """How many there are at most."""
+        return self._most
+
+    def submit(self, job: Job) -> None:
+        """Hand out a job; also while results come.
+
+        Raises:
+            InvalidArgument: there was one with that key, or its arguments are no JSON.
+            ClosedError: the run is cancelled, or another process's.
+        """
+        self._check_usable()
+        self._book.add(job)
+
+    @property
+    def unfinished(self) -> int:
+        """How many jobs have been submitted whose outcome has not been given out."""
+        return self._book.unfinished
+
+    def results(
+        self, *, patience_s: float | None = None
+    ) -> Iterator[JobOutcome | None]:
+        """Yield outcomes as they come, until none is outstanding or all is cancelled.
+
+        Args:
+            patience_s: None is yielded whenever no outcome has come for so long; never,
+                if it is None.
+
+        Raises:
+            InvalidArgument: `patience_s` is no positive number.
+            ClosedError: the run is cancelled, or another process's.
+            Error: Slurm takes no jobs, they end again and again before they have done
+                anything, or what makes the handler raised. What it raised, if that is
+                one of ours.
+        """
+        self._check_usable()
+        if patience_s is not None and not patience_s > 0:
+            raise InvalidArgument(
+                f"patience_s must be a positive number of seconds, got {patience_s!r}."
+            )
+        return self._results(patience_s)
+
+    def cancel(self) -> None:
+        """End all Slurm jobs; jobs that are not done stay so. Idempotent.
+
+        Workers are told to end (SIGTERM), so that what they are at can close its
+        files, and are killed where they have not done so after some seconds.
+        """
+        if self._cancelled or os.getpid() != self._process_id:
+            return
+        self._cancelled = True
+        try:
+            self._hosts.end_all()
+        finally:
+            self._leave()
+            for run in self._earlier:
+                run.tidy_up()
+            self._place.tidy_up(keep=self._hosts.logs_to_keep)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.cancel()
+
+    def _check_usable(self) -> None:
+        if os.getpid() != self._process_id:
+            raise ClosedError(
+                f"The run belongs to process {self._process_id}: begin one in the "
+                "process that uses it."
+            )
+        if self._cancelled:
+            raise ClosedError("The run is cancelled.")
+
+    def _results(self, patience_s: float | None) -> Iterator[JobOutcome | None]:
+        last, pause = time.monotonic(), _SHORTEST_POLL
+        while self.unfinished and not self._cancelled:
+            if self._turn():
+                pause = _SHORTEST_POLL
+            outcome = self._book.next_outcome()
+            rest = None if patience_s is None else last + patience_s - time.monotonic()
+            if outcome is not None:
+                yield outcome
+            elif rest is not None and rest <= 0:
+                yield None
+            else:
+                time.sleep(pause if rest is None else min(pause, rest))
+                pause = min(pause * _POLLS_GROW, self._pace.poll_s)
+                continue
+            last = time.monotonic()
+
+    def _turn(self) -> bool:
+        """Do what there is to do now; return whether there were outcomes."""
+        any_came = self._hear()
+        now = time.monotonic()
+        if now - self._looked >= self._pace.look_s:
+            self._looked = now
+            self._look()
+        self._hand_out()
+        return any_came
+
+    def _hear(self) -> bool:
+        came = False
+        for answer in self._folder.answers():
+            came = True
+            self._take_in(answer.number, answer.host, answer.line)
+        return came
+
+    def _take_in(self, number: int, host: str, line: bytes) -> None:
+        """Note what a host says of a job, if nobody has done so before."""
+        task = self._out.pop(number, None)
+        if task is None:
+            return
+        said = said_in(line)
+        if not said:
+            self._book.put_back(task)
+        elif GIVEN_BACK in said:
+            self._log.tell(said)
+            self._take_back(task, said[GIVEN_BACK], is_try=said[HAD_ALL_TIME])
+        else:
+            take_home(line, task, self._book, self._log)
+            self._hosts.has_done_something(host)
+
+    def _take_back(self, task: Task, why: str, *, is_try: bool) -> None:
+        if is_try:
+            limit = f"{self._request.time_min} minutes (time_min)"
+            self._book.begin_again(
+                task, f"was at it for the whole time of a Slurm job, {limit}: {why}"
+            )
+        else:
+            logger.info("The job %s is done elsewhere: %s.", task.key, why)
+            self._book.put_back(task)
+
+    def _look(self) -> None:
+        """See what became of Slurm jobs, and do again what died with them."""
+        dead = self._hosts.look()
+        if dead:
+            # What they have said before they died.
+            self._hear()
+            for job in self._folder.taken():
+                if (end := dead.get(job.host)) is not None:
+                    self._bury(job, end)
+        self._hosts.check()
+        self._see_earlier_runs()
+
+    def _bury(self, job: TakenJob, end: HostEnd) -> None:
+        self._folder.forget(job)
+        task = self._out.pop(job.number, None)
+        if task is None:
+            return
+        if end.is_to_blame:
+            self._book.begin_again(task, end.how)
+        else:
+            logger.info("The job %s is done elsewhere: its host %s", task.key, end.how)
+            self._book.put_back(task)
+
+    def _hand_out(self) -> None:
+        """Lay down jobs, and see that there are hosts to do them."""
+        ahead = self._most * (1 + _JOBS_AHEAD)
+        while self._book.waiting and len(self._out) < ahead:
+            task, number = self._book.take(), next(self._numbers)
+            self._out[number] = task
+            self._folder.put(number, task.line)
+        left = min(self._most, self._book.waiting + len(self._out))
+        self._hosts.want(math.ceil(left / self._request.workers))
+
+    def _see_earlier_runs(self) -> None:
+        for run in self._earlier:
+            run.look()
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostEnd:
+    """How a host has ended that has not said so itself.
+
+    Attributes:
+        how: as a part of a sentence.
+        is_to_blame: whether what it did may be the cause.
+    """
+
+    how: str
+    is_to_blame: bool
+
+
+@dataclass(eq=False)
+class _SlurmJob:
+    """One that was submitted, and is not over."""
+
+    number: str
+    submitted: float
+    has_begun: bool = False
+    takes_more: bool = True
+    has_done_something: bool = False
+
+
+class _Hosts:
+    """The Slurm jobs of a run, and the hosts in them.
+
+    Args:
+        folder: of the run.
+        jobs: on the cluster.
+        pace: how often they are looked at.
+    """
+
+    def __init__(self, folder: JobFolder, jobs: ClusterJobs, pace: Pace) -> None:
+        self._folder = folder
+        self._jobs = jobs
+        self._pace = pace
+        self._all: dict[str, _SlurmJob] = {}
+        self._ends_at_once = 0
+        self._last_end = ""
+        self._refused = 0
+        self._not_before = -math.inf
+        self._why_said = -math.inf
+        self.logs_to_keep = False
+
+    def want(self, count: int) -> None:
+        """Have so many hosts that take jobs, once the cluster grants them.
+
+        Raises:
+            NotSubmitted: the cluster takes no jobs.
+        """
+        missing = count - sum(job.takes_more for job in self._all.values())
+        now = time.monotonic()
+        if missing <= 0 or now < self._not_before or self._ends_too_often:
+            return
+        try:
+            numbers = self._jobs.submit(missing)
+        except NotSubmitted as error:
+            self._refused += 1
+            if not self._all or self._refused >= _TRIES_TO_SUBMIT:
+                raise
+            logger.warning("%s. It is tried again.", error)
+            self._not_before = now + _SECONDS_BETWEEN_TRIES
+            return
+        self._refused = 0
+        logger.info("Submitted: %s.", ", ".join(numbers))
+        self._all.update((n, _SlurmJob(number=n, submitted=now)) for n in numbers)
+
+    def has_done_something(self, host: str) -> None:
+        """Note that a host has done a job."""
+        job = self._all.get(_job_of(host))
+        if job is not None and not job.has_done_something:
+            job.has_done_something = True
+            self._ends_at_once = 0
+
+    def look(self) -> dict[str, HostEnd]:
+        """See what became of all; return hosts that have died, and how."""
+        states = self._jobs.states(self._all)
+        hosts = self._folder.hosts()
+        dead: dict[str, HostEnd] = {}
+        for number, state in states.items():
+            ours = sorted((h for h in hosts if _job_of(h) == number), key=_begun)
+            self._note(self._all[number], state, [hosts[host] for host in ours])
+            last = ours if state.is_over or state.is_waiting else ours[:-1]
+            end = self._end_of(number, state)
+            dead |= {host: end for host in last if hosts[host] is not HostState.ENDED}
+            if state.is_over:
+                self._see_off(number, end, said=[hosts[host] for host in ours])
+        self._say_why_none_begins(states)
+        return dead
+
+    def check(self) -> None:
+        """Raise where hosts end again and again without having done anything.
+
+        Raises:
+            Error: they do, and there are no others.
+        """
+        if self._ends_too_often and not any(
+            job.has_done_something for job in self._all.values()
+        ):
+            raise Error(
+                f"No Slurm job can do anything. The last one {self._last_end} Their "
+                f"logs are in {self._folder.logs}."
+            )
+
+    def end_all(self) -> None:
+        """Let all hosts end by themselves, and see to it that they have."""
+        self._folder.stop()
+        waiting = [n for n, s in self._jobs.states(self._all).items() if s.is_waiting]
+        self._jobs.end(waiting)
+        deadline = time.monotonic() + SECONDS_TO_CLOSE + _SECONDS_TO_LEAVE
+        self._wait_until(deadline, self._have_said_so)
+        self._wait_until(deadline, self._are_over)
+        if self._all:
+            logger.warning(
+                "%d Slurm jobs have not ended by themselves, and are cancelled.",
+                len(self._all),
+            )
+            self._jobs.end(self._all)
+
+    @property
+    def _ends_too_often(self) -> bool:
+        return self._ends_at_once >= _ENDS_AT_ONCE
+
+    def _note(
+        self, job: _SlurmJob, state: JobState, hosts: Sequence[HostState]
+    ) -> None:
+        job.has_begun = job.has_begun or bool(hosts)
+        # One that begins again, begins to take jobs again.
+        job.takes_more = state.is_waiting or not (
+            state.is_over or (hosts and hosts[-1] is not HostState.WORKING)
+        )
+
+    def _end_of(self, number: str, state: JobState) -> HostEnd:
+        how = f"was in the Slurm job {number}, which is {state.name}."
+        if state.is_to_blame:
+            how = f"{how} The end of its log: {self._end_of_log(number)}"
+        return HostEnd(how=how, is_to_blame=state.is_to_blame)
+
+    def _see_off(self, number: str, end: HostEnd, *, said: list[HostState]) -> None:
+        """Note that a Slurm job is over."""
+        job = self._all.pop(number)
+        if (said and said[-1] is HostState.ENDED) or not end.is_to_blame:
+            return
+        self.logs_to_keep = True
+        self._last_end = end.how
+        if not job.has_done_something:
+            self._ends_at_once += 1
+        logger.warning("A Slurm job has died: it %s", end.how)
+
+    def _end_of_log(self, number: str) -> str:
+        with contextlib.suppress(OSError):
+            said = self._jobs.log_of(number).read_bytes()
+            return said[-_END_OF_LOG:].decode(errors="replace").strip() or "(nothing)"
+        return f"(there is none, {self._jobs.log_of(number)})"
+
+    def _say_why_none_begins(self, states: Mapping[str, JobState]) -> None:
+        now = time.monotonic()
+        waiting = [job for job in self._all.values() if not job.has_begun]
+        if (
+            len(waiting) < len(self._all)
+            or not waiting
+            or now - waiting[0].submitted < _SECONDS_BEFORE_SAYING_WHY
+            or now - self._why_said < 10 * _SECONDS_BEFORE_SAYING_WHY
+        ):
+            return
+        self._why_said = now
+        first = waiting[0].number
+        state = states.get(first, JobState(name="UNKNOWN"))
+        logger.warning(
+            "%d Slurm jobs wait for their turn. What Slurm says of %s: %s (%s).",
+            len(waiting),
+            first,
+            state.name,
+            state.reason or "no reason",
+        )
+
+    def _wait_until(self, deadline: float, is_so: Callable[[], bool]) -> None:
+        pause = _SHORTEST_POLL
+        while not is_so() and time.monotonic() < deadline:
+            time.sleep(pause)
+            pause = min(pause * _POLLS_GROW, self._pace.poll_s)
+
+    def _have_said_so(self) -> bool:
+        """Whether all hosts that have begun say that they have ended."""
+        states = self._folder.hosts().values()
+        return all(state is HostState.ENDED for state in states)
+
+    def _are_over(self) -> bool:
+        """Forget those that are over; return whether all are."""
+        for number, state in self._jobs.states(self._all).items():
+            if state.is_over:
+                del self._all[number]
+        return not self._all
+
+
+class _EarlierRun:
+    """What a driver that was killed has left in the same shared directory.
+
+    Args:
+        folder: of that run.
+        request: of this one, which is not used up.
+        pace: of this one.
+    """
+
+    def __init__(self, folder: JobFolder, request: JobRequest, pace: Pace) -> None:
+        self._folder = folder
+        self._sign = folder.sign()
+        self._seen = time.monotonic()
+        self._patience = 3 * pace.beat_s
+        facts = said_in(self._sign) if self._sign else {}
+        self._jobs = cluster_jobs(facts.get("cluster", ""), folder, request, pace)
+        self._is_stopped = False
+        self._is_alive = False
+
+    def look(self) -> None:
+        """End its Slurm jobs, once it is clear that its driver is dead."""
+        if self._is_stopped or self._is_alive:
+            return
+        sign = self._folder.sign()
+        if sign != self._sign:
+            # Somebody else's, who works in the same directory.
+            self._is_alive = True
+        elif is_surely_dead(sign) or time.monotonic() - self._seen > self._patience:
+            self._is_stopped = True
+            logger.info("The run in %s has no driver, and is ended.", self._folder.path)
+            self._folder.stop()
+            waiting = self._jobs.states(self._folder.submitted())
+            self._jobs.end([n for n, state in waiting.items() if state.is_waiting])
+
+    def tidy_up(self) -> None:
+        """Remove its folder, if nothing of it runs any more."""
+        if self._is_stopped:
+            submitted = self._folder.submitted()
+            states = self._jobs.states(submitted)
+            if all(n in states and states[n].is_over for n in submitted):
+                shutil.rmtree(self._folder.path, ignore_errors=True)
+
+
+class _Place:
+    """Where runs keep their folders, in a shared directory."""
+
+    def __init__(self, shared: Path) -> None:
+        self._shared = shared.absolute()
+        self._runs = self._shared / WORK_FOLDER
+        self._made = not self._shared.exists()
+        self._name = f"{_FOLDER_PREFIX}{secrets.token_hex(4)}"
+
+    def make(self, hosted: HostedWork, payload: bytes | None) -> JobFolder:
+        """Return the folder of a new run.
+
+        Raises:
+            DirectoryNotWritable: it cannot be made.
+        """
+        try:
+            return JobFolder.make(self._runs / self._name, hosted, payload)
+        except OSError as error:
+            raise DirectoryNotWritable(self._shared, error.strerror) from error
+
+    def others(self) -> list[JobFolder]:
+        """Return the folders of other runs."""
+        return [
+            JobFolder(path)
+            for path in sorted(self._runs.glob(f"{_FOLDER_PREFIX}*"))
+            if path.name != self._name and (path / "driver.json").exists()
+        ]
+
+    def tidy_up(self, *, keep: bool) -> None:
+        """Remove the run's folder, but for its logs where they are kept.
+
+        What this run has made above it goes with it, where nothing else is there.
+        """
+        folder = JobFolder(self._runs / self._name)
+        if keep:
+            for path in folder.path.iterdir():
+                if path == folder.logs:
+                    continue
+                if path.is_dir():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
+            logger.warning("What Slurm jobs have said is in %s.", folder.logs)
+        else:
+            shutil.rmtree(folder.path, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            self._runs.rmdir()
+            if self._made:
+                self._shared.rmdir()
+
+
+def _abandon(
+    folder: JobFolder, jobs: ClusterJobs, sign: DriverSign, owner: int
+) -> None:
+    """Let a run end that nobody waits for."""
+    # A forked child's copies; the run is its parent's.
+    if os.getpid() != owner:
+        return
+    sign.stop()
+    folder.stop()
+    submitted = folder.submitted()
+    states = jobs.states(submitted)
+    jobs.end([n for n in submitted if n not in states or not states[n].is_over])
+
+
+def _job_of(host: str) -> str:
+    return host.rpartition("-")[0]
+
+
+def _begun(host: str) -> int:
+    return int(host.rpartition("-")[2])
+
+
+def _sharing(share: GpuShare) -> int:
+    return max(1, math.floor(1 / share.each + 1e-9)) if share.asked_for else 1
+
+
+def _check_whole(name: str, value: object) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise InvalidArgument(
+            f"{name} must be a whole number of at least 1, got {value!r}."
+        )
+
+
+_SBATCH = "sbatch."
+
+_FROM_TEXT: Mapping[str, Callable[[str], Any]] = {
+    "cluster": str,
+    "cpus_per_worker": int,
+    "workers_per_job": int,
+    "partition": str,
+    "account": str,
+    "qos": str,
+    "constraint": str,
+    "time_min": int,
+    "notice_s": float,
+    "mem_gb": float,
+    "setup": lambda line: (line,),
+}
+
+
+def _value_of(name: str, text: str) -> Any:
+    try:
+        return _FROM_TEXT[name](text)
+    except ValueError as error:
+        raise InvalidArgument(
+            f"The option {name} of Slurm's is a number, got {text!r}."
+        ) from error

@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Doing the jobs of a folder on this machine, until it is told to end."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import logging
+import signal
+import time
+from collections.abc import Iterable, Iterator
+from types import FrameType
+
+from ..gl.given_gpu import visible_gpus
+from .hosting import Host
+from .job_folder import HostState, JobFolder, Pace, TakenJob
+from .local_worker import SECONDS_TO_CLOSE
+
+__all__ = ["GIVEN_BACK", "HAD_ALL_TIME", "Notice", "heard_signals", "serve"]
+
+logger = logging.getLogger(__name__)
+
+# In an answer, instead of an outcome: why the job is not done, through no fault of its
+# own; and whether it had all the time that this host had.
+GIVEN_BACK = "given_back"
+HAD_ALL_TIME = "had_all_time"
+
+# What is left of the notice after the workers have closed their files.
+_SECONDS_LEFT = 5.0
+_SHORTEST_POLL = 0.01
+_POLLS_GROW = 1.5
+
+
+@dataclasses.dataclass
+class Notice:
+    """What this process has been told by signals.
+
+    Attributes:
+        ends: it has to end at once.
+        ends_soon: when, by `time.monotonic`, it was told that its time will be over;
+            None if it was not.
+    """
+
+    ends: bool = False
+    ends_soon: float | None = None
+
+
+@contextlib.contextmanager
+def heard_signals(*, end: Iterable[int], end_soon: Iterable[int]) -> Iterator[Notice]:
+    """Yield what signals say from now on; they do nothing else.
+
+    A flag and no exception: between any two instructions, of submitit's too, nothing
+    is torn apart.
+
+    Args:
+        end: those that ask for an end.
+        end_soon: those that say that the time will be over.
+    """
+    notice = Notice()
+
+    def take_end(signum: int, frame: FrameType | None) -> None:
+        notice.ends = True
+
+    def take_end_soon(signum: int, frame: FrameType | None) -> None:
+        notice.ends_soon = time.monotonic()
+
+    handlers = {
+        **dict.fromkeys(end, take_end),
+        **dict.fromkeys(end_soon, take_end_soon),
+    }
+    before = {signum: signal.signal(signum, take) for signum, take in handlers.items()}
+    # The driver may have blocked them while this process was started.
+    mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, handlers)
+    try:
+        yield notice
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
+
+
+def serve(
+    folder: JobFolder,
+    *,
+    host: str,
+    workers: int,
+    notice: Notice,
+    notice_s: float,
+    pace: Pace,
+) -> None:
+    """Do jobs of a folder until the run is over, or this process has to end.
+
+    It ends by itself when the folder says so, when the driver is dead, when no worker
+    can begin here, and where there is nothing to do. What it has then taken and not
+    done it gives back.
+
+    Args:
+        folder: of the run.
+        host: a name of this host that no other has had.
+        workers: how many jobs are done at once.
+        notice: what signals say.
+        notice_s: how long after being told that its time will be over this process
+            is ended.
+        pace: how often it looks.
+    """
+    if folder.is_stopped:
+        return
+    folder.note_host(host, HostState.WORKING)
+    work = folder.work()
+    with Host(
+        work, folder.payload(), workers=workers, gpus=visible_gpus()
+    ) as local_host:
+        serving = _Serving(
+            folder,
+            local_host,
+            name=host,
+            workers=workers,
+            notice=notice,
+            grace_s=notice_s - SECONDS_TO_CLOSE - _SECONDS_LEFT,
+            pace=pace,
+        )
+        why = serving.until_the_end()
+    # Closed by now: whoever does these jobs next finds no file open.
+    serving.give_back(why)
+    folder.note_host(host, HostState.ENDED)
+
+
+class _Serving:
+    """Takes jobs of a folder to the workers of a host, and outcomes back."""
+
+    def __init__(
+        self,
+        folder: JobFolder,
+        host: Host,
+        *,
+        name: str,
+        workers: int,
+        notice: Notice,
+        grace_s: float,
+        pace: Pace,
+    ) -> None:
+        self._folder = folder
+        self._host = host
+        self._name = name
+        self._workers = workers
+        self._notice = notice
+        self._grace_s = grace_s
+        self._pace = pace
+        self._driver = _Driver(folder, silent_s=pace.silent_s)
+        self._taken: dict[str, TakenJob] = {}
+        self._begun: set[str] = set()
+        # Those that were begun with.
+        self._first: set[str] = set()
+        self._any_is_done = False
+        self._takes_more = True
+        self._cannot_begin = False
+
+    def until_the_end(self) -> str:
+        """Do jobs; return why no more are done."""
+        poll = _SHORTEST_POLL
+        looked = idle_since = time.monotonic()
+        while not (why := self._why_it_ends(idle_since)):
+            took = self._takes_more and self._take()
+            heard = self._hear(poll)
+            now = time.monotonic()
+            if took or heard:
+                poll = _SHORTEST_POLL
+            else:
+                poll = min(poll * _POLLS_GROW, self._pace.poll_s)
+            if self._taken:
+                idle_since = now
+            if now - looked >= self._pace.poll_s:
+                looked = now
+                self._driver.look()
+            self._see_whether_to_leave()
+        return why
+
+    def give_back(self, why: str) -> None:
+        """Let others do what was taken and is not done."""
+        for key, job in self._taken.items():
+            said = {
+                GIVEN_BACK: why,
+                HAD_ALL_TIME: key in self._first and self._notice.ends_soon is not None,
+            }
+            self._folder.answer(job, json.dumps(said).encode())
+        self._taken.clear()
+
+    def _why_it_ends(self, idle_since: float) -> str:
+        """Return why no more is done; nothing as long as something is."""
+        if self._notice.ends:
+            return "its Slurm job had to end"
+        if self._driver.has_said_stop:
+            return "the run is over"
+        if self._cannot_begin:
+            return "no worker could begin"
+        soon = self._notice.ends_soon
+        if soon is not None and time.monotonic() - soon > self._grace_s:
+            return "its Slurm job came to its time limit"
+        if self._taken:
+            return ""
+        if not self._takes_more:
+            return "its Slurm job takes no more"
+        if time.monotonic() - idle_since > self._pace.idle_s:
+            return "there was nothing to do"
+        return ""
+
+    def _see_whether_to_leave(self) -> None:
+        """Take no more jobs once it is known that there is no time for them."""
+        leaves = self._notice.ends_soon is not None or self._driver.is_dead
+        if leaves and self._takes_more:
+            self._takes_more = False
+            self._folder.note_host(self._name, HostState.LEAVING)
+
+    def _take(self) -> bool:
+        """Take jobs for workers that have none; return whether there were any."""
+        took = False
+        while len(self._taken) < self._workers:
+            job = self._folder.take(self._name)
+            if job is None:
+                break
+            took = True
+            self._begin(job)
+        return took
+
+    def _begin(self, job: TakenJob) -> None:
+        said = json.loads(job.line)
+        if said["key"] in self._begun:
+            # It was done here, and what came of it got lost on its way.
+            said["key"] += f", once more as {job.number}"
+        key = said["key"]
+        self._begun.add(key)
+        self._host.submit(json.dumps(said).encode())
+        self._taken[key] = job
+        if not self._any_is_done:
+            self._first.add(key)
+
+    def _hear(self, seconds: float) -> bool:
+        """Lay down what the workers have done, waiting so long for it at most."""
+        if not self._host.unfinished:
+            time.sleep(seconds)
+            return False
+        if len(self._taken) >= self._workers or not self._takes_more:
+            # Nothing else is to be looked for meanwhile.
+            seconds = self._pace.poll_s
+        line = next(self._host.lines(patience_s=seconds), None)
+        if line is None:
+            return False
+        said = json.loads(line)
+        if "error" in said:
+            self._cannot_begin = True
+            for job in self._taken.values():
+                self._folder.answer(job, line)
+            self._taken.clear()
+            return False
+        self._any_is_done = True
+        self._folder.answer(self._taken.pop(said["key"]), line)
+        return True
+
+
+class _Driver:
+    """The driver, as far as its folder shows it."""
+
+    def __init__(self, folder: JobFolder, *, silent_s: float) -> None:
+        self._folder = folder
+        self._silent_s = silent_s
+        self._sign = folder.sign()
+        # By the clock of this machine.
+        self._changed = time.monotonic()
+        self.has_said_stop = False
+
+    def look(self) -> None:
+        """See what is new."""
+        self.has_said_stop = self.has_said_stop or self._folder.is_stopped
+        sign = self._folder.sign()
+        if sign and sign != self._sign:
+            self._sign = sign
+            self._changed = time.monotonic()
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether it has given no sign of life for too long."""
+        return time.monotonic() - self._changed > self._silent_s
