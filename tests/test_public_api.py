@@ -50,9 +50,8 @@ CONFINED = {
     "scipy": {"evaluation"},
     "matplotlib": {"reporting"},
     "rich": {"commands", "monitors"},
-    "submitit": {"engines"},
     "ray": {"engines.ray"},
-    "submitit": {"engines.slurm"},
+    "submitit": {"engines.slurm_jobs"},
 }
 
 HEAVY = (
