@@ -382,6 +382,38 @@ def test_where_nothing_can_be_drawn_one_try_is_enough(
     assert len(tries) == 1
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--address", "auto"], "--engine ray"),
+        (["--engine-option", "partition=gpu"], "--engine slurm"),
+        (["--engine", "local", "--engine-option", "partition"], "KEY=VALUE"),
+        (["--engine", "local", "--workers", "0"], "workers"),
+    ],
+)
+def test_a_wrong_engine_is_one_clear_error(
+    arguments: list[str], message: str, tmp_path: Path, mjrec: Run
+) -> None:
+    """And nothing is rendered."""
+    write_finished(tmp_path)
+    status, out, err = mjrec(tmp_path, *arguments)
+    assert (status, out) == (1, "")
+    assert message in err
+    assert not list(tmp_path.glob("*.mp4"))
+
+
+def test_an_engine_says_what_this_process_would(tmp_path: Path, mjrec: Run) -> None:
+    """Of what cannot be rendered too; nothing of it stays in the directory."""
+    write_finished(tmp_path, 0, frames=False)
+    write_log(tmp_path, 1, video=None)
+    alone = mjrec(tmp_path, "--json")
+    (tmp_path / "openaigym.trajectory.0.7.episode000001.h5").unlink()
+    write_log(tmp_path, 1, video=None)
+    assert mjrec(tmp_path, "--engine", "local", "--workers", 1, "--json") == alone
+    assert list(json.loads(alone[1])["failures"]) == [f"{VIDEO}.mp4"]
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path: Path) -> None:
     """With workers and OpenGL; two commands at once share the work."""
     env = gymnasium.make(

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import json
 import os
 import random
 import signal
@@ -29,6 +30,7 @@ from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
 from mjrec.evaluation.results_files import read_results
 from mjrec.formats.locks import try_lock
+from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_metadata import metadata_path
 
 PENDULUM = "InvertedPendulum-v5"
@@ -147,14 +149,124 @@ def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
         assert columns.video_prefix(index) == path.stem
 
 
+@pytest.mark.parametrize("engine", ["local", mjrec.LocalEngine(2)])
+def test_an_engine_changes_nothing(tmp_path: Path, engine: Any) -> None:
+    """Results, trajectories and videos are those of a call without one."""
+    options: dict[str, Any] = {"tasks": [PENDULUM, DOUBLE], "keep": "best,worst"}
+    workers = 2 if engine == "local" else None
+    there = run(tmp_path / "there", **options, engine=engine, workers=workers)
+    here = run(tmp_path / "here", **options)
+    assert contents(there.directory) == contents(here.directory)
+    assert there.pending == here.pending == {}
+    assert recorded_in(there) == recorded_in(here)
+    assert len(recorded_in(there)) == 8 + 4
+    for folder in there.directory.glob("*-v5"):
+        assert {path.name for path in folder.glob("*.mp4")} == {
+            video for video, _ in manifest_videos(folder)
+        }
+
+
+def recorded_in(evaluation: Evaluation) -> dict[tuple[Any, ...], Any]:
+    """Return what was recorded of each episode, whatever its monitor was called."""
+    with (evaluation.directory / "timing.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found: dict[tuple[Any, ...], Any] = {}
+    for row in rows:
+        of = (row["task"], row["seed"], row["episode"])
+        (folder,) = evaluation.directory.glob(row["task"])
+        with open_trajectory(folder / row["trajectory"]) as reader:
+            states = reader.states(0, reader.row_count).tobytes()
+            promised = (reader.header.facts.get("video") or {}).get("selection")
+        found[*of, "trajectory"] = (states, promised)
+        if row["video"]:
+            video = folder / row["video"]
+            assert row["video_sha256"]
+            found[*of, "video"] = (video.read_bytes(), hashes_of(video))
+    return found
+
+
+def hashes_of(video: Path) -> str:
+    return video.with_suffix(".framehash").read_text()
+
+
+def manifest_videos(folder: Path) -> list[list[str]]:
+    manifests = map(json.loads, map(Path.read_text, folder.glob("*.manifest.json")))
+    return [pair for manifest in manifests for pair in manifest["videos"]]
+
+
+def test_an_engine_draws_while_other_tasks_run(tmp_path: Path) -> None:
+    """A task's videos come as soon as its episodes are over."""
+    told: list[EvaluationProgress] = []
+    # What takes long begins first, and one worker does one job after the other.
+    options: dict[str, Any] = {"tasks": [PENDULUM, DOUBLE], "workers": None}
+    evaluation = run(
+        tmp_path / "e",
+        **options,
+        keep="all",
+        num_seeds=3,
+        engine=mjrec.LocalEngine(1),
+        on_progress=told.append,
+    )
+    assert len(evaluation.videos) == 12
+    assert (told[-1].videos_done, told[-1].videos) == (12, 12)
+    assert [each.videos_done for each in told] == sorted(
+        each.videos_done for each in told
+    )
+    assert any(0 < each.videos < 12 for each in told)
+
+
+def test_results_are_there_before_an_engine_has_drawn(tmp_path: Path) -> None:
+    """What is killed or cancelled then has only videos left."""
+
+    def interrupt(progress: EvaluationProgress) -> None:
+        if progress.videos_done:
+            raise KeyboardInterrupt
+
+    options: dict[str, Any] = {"keep": "all", "workers": None}
+    options["engine"] = mjrec.LocalEngine(1)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "e", **options, on_progress=interrupt)
+    before = contents(tmp_path / "e")
+    drawn = list(tmp_path.glob("e/*/*.mp4"))
+    assert 1 <= len(drawn) < 4
+    stamps = [path.stat().st_mtime_ns for path in drawn]
+    evaluation = run(tmp_path / "e", **options, resume=True)
+    assert contents(tmp_path / "e") == before
+    assert len(evaluation.videos) == 4
+    assert [path.stat().st_mtime_ns for path in drawn] == stamps
+    assert begun(tmp_path / "e") == 4
+
+
+@pytest.mark.parametrize("name", [".mjrec.work", ".mjrec.evaluation.lock"])
+def test_what_an_engine_keeps_in_a_directory_is_nobodys(
+    tmp_path: Path, name: str
+) -> None:
+    """It may be there before the evaluation is, and disturbs no reader."""
+    place = tmp_path / "e" / name
+    if name.endswith("lock"):
+        place.parent.mkdir()
+        place.touch()
+    else:
+        place.mkdir(parents=True)
+        (place / "job.json").touch()
+    evaluation = run(tmp_path / "e", keep="best")
+    assert evaluation.pending == {}
+    assert len(list(read_results(tmp_path / "e"))) == 4
+    assert len(run(tmp_path / "e", keep="best", resume=True).results) == 4
+
+
+@pytest.mark.parametrize("engine", [None, "local"])
 def test_without_opengl_videos_stay_pending(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    engine: str | None,
 ) -> None:
     """The results are there, and how to draw the videos elsewhere is told."""
     # It needs a display, and there is none.
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)
-    evaluation = run(tmp_path / "e", keep="best")
+    evaluation = run(tmp_path / "e", keep="best", engine=engine)
     assert evaluation.videos == []
     (path,) = evaluation.pending
     assert f"mjrec render {path.parent}" in caplog.text
@@ -162,7 +274,8 @@ def test_without_opengl_videos_stay_pending(
     assert [(v.name, v.sha256) for v in columns.videos.values()] == [(path.name, None)]
     monkeypatch.undo()
     # Whoever goes on draws what is left.
-    assert run(tmp_path / "e", keep="best", resume=True).videos == [path]
+    again = run(tmp_path / "e", keep="best", resume=True, engine=engine)
+    assert again.videos == [path]
 
 
 def test_progress_is_told(tmp_path: Path) -> None:
@@ -289,7 +402,7 @@ import test_evaluating
 test_evaluating.run(
     Path(sys.argv[1]), tasks=[test_evaluating.PENDULUM, test_evaluating.DOUBLE],
     policy="slow_policy:Slow", episodes=6, keep="best", resume="resume" in sys.argv,
-    workers=int(sys.argv[2]),
+    workers=int(sys.argv[2]), engine="local" if "engine" in sys.argv else None,
 )
 """
 SLOW = """
@@ -344,20 +457,28 @@ def kill_with_workers(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-@pytest.mark.parametrize("moment", ["running", "drawing"])
+@pytest.mark.parametrize(
+    ("moment", "engine"),
+    [
+        ("running", ()),
+        ("drawing", ()),
+        ("running", ("engine",)),
+        ("drawing", ("engine",)),
+    ],
+)
 def test_a_killed_evaluation_goes_on_where_it_was(
-    whole: Path, tmp_path: Path, moment: str
+    whole: Path, tmp_path: Path, moment: str, engine: tuple[str, ...]
 ) -> None:
     """SIGKILL of all its processes: the same bytes, and nothing is repeated."""
     killed = tmp_path / "killed"
-    process = slow_run(tmp_path, "killed", "2")
+    process = slow_run(tmp_path, "killed", "2", *engine)
     if moment == "running":
         wait_until(lambda: ended(killed) >= 5)
     else:
         wait_until((killed / "results.json").exists)
     kill_with_workers(process)
     assert (killed / "results.json").exists() is (moment == "drawing")
-    assert slow_run(tmp_path, "killed", "2", "resume").wait() == 0
+    assert slow_run(tmp_path, "killed", "2", "resume", *engine).wait() == 0
     assert contents(killed) == contents(whole)
     # Each once; those that the two workers were at, once more.
     assert 24 <= begun(killed) <= 26
@@ -447,6 +568,9 @@ WRONG: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"seeds": [-1], "num_seeds": None}, InvalidArgument, "seed"),
     ({"seeds": [1], "num_seeds": 2}, InvalidArgument, "one of them"),
     ({"workers": 0}, InvalidArgument, "workers"),
+    ({"engine": "spark"}, UnknownName, "slurm"),
+    ({"engine": 3, "workers": None}, InvalidArgument, "LocalEngine"),
+    ({"engine": mjrec.LocalEngine(1)}, InvalidArgument, "of its own"),
     ({"keep": "bset"}, UnknownName, "best:N"),
     ({"protocol": "seed"}, UnknownName, "suite"),
     ({"quality": "low"}, UnknownName, "draft"),

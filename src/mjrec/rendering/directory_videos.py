@@ -81,10 +81,10 @@ class RenderedVideos:
         return cls(
             directory=directory,
             videos=videos,
-            trajectories=trajectories,
+            trajectories=tuple(trajectories),
             failures=failures,
             blank=blank,
-            elsewhere=elsewhere,
+            elsewhere=tuple(elsewhere),
         )
 
     @property

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the command line says of an engine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from mjrec import Error, LocalEngine
+from mjrec.commands.engine_options import NO_ENGINE, EngineOptions
+
+
+def test_without_an_option_there_is_no_engine() -> None:
+    """All is as it was before there were any."""
+    assert NO_ENGINE.chosen(None) is None
+    assert NO_ENGINE.chosen(3) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "gpus", "required"),
+    [
+        ({"engine": "local"}, 0.0, False),
+        ({"gpus": 0.25}, 0.25, False),
+        ({"engine": "local", "gpus": 2.0, "require_gpu": True}, 2.0, True),
+    ],
+)
+def test_the_local_engine_may_be_meant(
+    options: dict[str, Any], gpus: float, required: bool
+) -> None:
+    """By its name, or by what each worker is to have of a GPU."""
+    engine = EngineOptions(**options).chosen(3)
+    assert isinstance(engine, LocalEngine)
+    assert engine.workers == 3
+    assert (engine.share.each, engine.share.required) == (gpus, required)
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"address": "auto"}, "--engine ray"),
+    ({"address": "auto", "engine": "local"}, "Ray"),
+    ({"address": "auto", "gpus": 0.5}, "--engine ray"),
+    ({"engine_option": ("partition=gpu",)}, "--engine slurm"),
+    ({"engine_option": ("partition=gpu",), "engine": "local"}, "partition"),
+    ({"engine_option": ("partition",), "engine": "slurm"}, "KEY=VALUE"),
+    ({"engine_option": ("=gpu",), "engine": "slurm"}, "KEY=VALUE"),
+    ({"engine_option": ("a=1", "a=2"), "engine": "slurm"}, "given twice"),
+    ({"gpus": -1.0}, "gpus"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), WRONG)
+def test_what_contradicts_itself_is_one_clear_error(
+    options: dict[str, Any], words: str
+) -> None:
+    """It says what there is, or how it is meant."""
+    with pytest.raises(Error, match=words):
+        EngineOptions(**options).chosen(None)
