@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import functools
-import re
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from .children import call
+from .process_memory import peak_memory
 from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 from .setups import BARE, MONITOR, RECORD_VIDEO, Setup, has_moviepy, random_actions
@@ -20,8 +19,6 @@ __all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure", "record_episode"]
 
 TITLE = "Memory: peak of the simulation's process in one episode of HalfCheetah-v5"
 
-_MEGABYTE = 1e6
-_PEAK = re.compile(r"^VmHWM:\s+(\d+) kB$", re.MULTILINE)
 _BARE, _PENDING, _DRAWN = "bare", "workers=0", "workers=1"
 _LITTLE = at_most(64)
 # Pages come and go with what the allocator happens to do.
@@ -81,14 +78,7 @@ def record_episode(setup: dict[str, Any], steps: int) -> float:
         for action in actions:
             env.step(action)
         environment.close(env)
-    return _peak_memory()
-
-
-def _peak_memory() -> float:
-    # Not `ru_maxrss`: that of a new process begins with its parent's.
-    match = _PEAK.search(Path("/proc/self/status").read_text())
-    assert match is not None
-    return int(match[1]) * 1024 / _MEGABYTE
+    return peak_memory()
 
 
 _Peaks = dict[tuple[str, int], tuple[float, ...]]

@@ -6,7 +6,6 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.util
-import re
 import shutil
 import tempfile
 import time
@@ -24,6 +23,7 @@ from mjrec.reporting.gathering import gather
 from mjrec.reporting.media_files import ReportProgress
 
 from .children import call
+from .process_memory import peak_memory
 from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 
@@ -41,7 +41,6 @@ _MEMORY_PROMISE = at_most(500)
 _CHROMIUM = "/usr/bin/chromium"
 _STEPS = 2
 _SIZE = 64
-_PEAK = re.compile(r"^VmHWM:\s+(\d+) kB$", re.MULTILINE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,9 +204,7 @@ def memory_to_load(directory: str) -> float:
     contents = gather(directory)
     if not contents.tasks[0].episodes.length.size:
         raise RuntimeError("nothing was loaded")
-    match = _PEAK.search(Path("/proc/self/status").read_text())
-    assert match is not None
-    return int(match[1]) * 1024 / 1e6
+    return peak_memory()
 
 
 def _variants(

@@ -19,15 +19,21 @@ from benchmarks import (
     memory,
     rendering,
     reporting,
+    scaling,
     stepping,
     time_to_video,
     verifying,
 )
 from benchmarks.children import ChildFailed, call
+from benchmarks.many_monitors import TASK, write_evaluation, write_monitors
 from benchmarks.results import Reference, Result, at_least, at_most
 from benchmarks.rounds import take_turns
 from benchmarks.tables import table_of
 from rich.console import Console
+
+import mjrec
+from mjrec.evaluation.ledger import read_ledgers
+from mjrec.evaluation.results_files import read_results
 
 ROOT = Path(__file__).parents[1]
 TINY = (16, 16)
@@ -216,6 +222,22 @@ def test_reporting_is_compared_with_loading() -> None:
     assert all(r.median > 0 for r in results if r.samples)
 
 
+def test_scaling_compares_many_monitors_with_fewer() -> None:
+    """Reading is to grow as their number does, and its memory has a limit."""
+    settings = scaling.Settings(
+        rounds=1, monitors=(2, 4), episodes=2, tasks=2, results=(10, 20)
+    )
+    results = scaling.measure(settings, silently)
+    readers = [r for r in results if r.subject == "load_results"]
+    assert [r.variant for r in readers] == [
+        *("2 monitors", "4 monitors", "4 monitors, peak memory"),
+    ]
+    kept = promised(readers)
+    assert kept["4 monitors"] == "≤ 3"
+    assert kept["4 monitors, peak memory"] == "≤ 30.048"
+    assert all(r.median > 0 for r in results)
+
+
 def test_disk_gives_the_size_of_every_file() -> None:
     """Log, finished file, and both of the model."""
     settings = disk.Settings(environments=("HalfCheetah-v5",), rounds=1, steps=10)
@@ -233,6 +255,31 @@ def test_encoding_gives_the_rate_of_each_codec() -> None:
     results = encoding.measure(settings, silently)
     assert len(results) == 4
     assert all(r.unit == "frames/s" and r.median > 0 for r in results)
+
+
+# --- the files that are measured ------------------------------------------------------
+
+
+def test_written_monitors_are_as_recorded_ones(tmp_path: Path) -> None:
+    """All readers find the same episodes, and nothing is to be put in order."""
+    write_monitors(tmp_path / "task", monitors=3, episodes=2)
+    results = mjrec.load_results(tmp_path / "task")
+    assert results is not None
+    assert len(results["manifests"]) == 3
+    assert results["env_info"]["env_id"] == TASK
+    assert results["episode_lengths"] == [1000] * 6
+    listed = mjrec.iter_episodes(tmp_path / "task")
+    assert [episode.episode_id for episode in listed] == [*range(6)]
+    assert len(read_ledgers(tmp_path / "task")) == 6
+    assert not mjrec.recover(tmp_path / "task")
+
+
+def test_written_evaluation_can_be_read(tmp_path: Path) -> None:
+    """Its tables have the episodes of all monitors."""
+    write_evaluation(tmp_path / "e", tasks=2, monitors=3, episodes=2)
+    read = read_results(tmp_path / "e", needs_timing=True)
+    assert [len(columns) for columns in read.columns.values()] == [6, 6]
+    assert all(columns.has_trajectory.any() for columns in read.columns.values())
 
 
 # --- the command ---------------------------------------------------------------------

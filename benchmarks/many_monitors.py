@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Directories into which thousands of monitors have recorded, made without recording.
+
+One monitor records. Its manifest, with all that it says of the machine, is then written
+again under other infixes, by the writers that monitors use, as are statistics, journals
+and ledgers. Trajectories are there by their names only: who
+reads results opens none of them.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+import mjrec
+from mjrec.evaluation.episode_results import EpisodeResult
+from mjrec.evaluation.ledger import Ledger, ledger_name
+from mjrec.evaluation.plan import Batch, EvaluatedTask, EvaluationPlan
+from mjrec.evaluation.plan_file import write_plan
+from mjrec.evaluation.recorded_files import RecordedFiles
+from mjrec.evaluation.results_files import write_results
+from mjrec.evaluation.summaries import Bootstrap
+from mjrec.evaluation.summarizing import summarize_results
+from mjrec.formats.journal import JournalEntry, JournalWriter
+from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
+from mjrec.formats.monitor_directory import (
+    Infix,
+    journal_name,
+    manifest_name,
+    stats_prefix,
+    trajectory_prefix,
+)
+from mjrec.formats.stats_file import StatsFile, write_stats_file
+
+__all__ = ["TASK", "results_of", "write_evaluation", "write_monitors"]
+
+TASK = "InvertedPendulum-v5"
+
+_START = 1.79e9
+_SECONDS = 0.5
+_STEPS = 1000
+# As many monitors as one process makes before the next has another number.
+_OF_ONE_PROCESS = 100
+_FIRST_PROCESS = 4711
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Written:
+    """One monitor among those that are written.
+
+    Attributes:
+        infix: its own.
+        seed: of its batch.
+        first: number of its first episode, in the evaluation and in the directory.
+        episodes: how many it recorded.
+    """
+
+    infix: Infix
+    seed: int
+    first: int
+    episodes: int
+
+    @property
+    def numbers(self) -> range:
+        """The numbers of its episodes."""
+        return range(self.first, self.first + self.episodes)
+
+
+def write_monitors(folder: Path, *, monitors: int, episodes: int) -> None:
+    """Write what so many closed monitors of an evaluation leave in a task's folder.
+
+    Args:
+        folder: is made.
+        monitors: how many.
+        episodes: of each.
+    """
+    _write_monitors(folder, monitors, episodes, _recorded_manifest())
+
+
+def write_evaluation(
+    directory: Path, *, tasks: int, monitors: int, episodes: int
+) -> None:
+    """Write a finished evaluation, all of whose episodes have a trajectory.
+
+    Args:
+        directory: is made.
+        tasks: how many.
+        monitors: of each task.
+        episodes: of each monitor.
+    """
+    planned = [EvaluatedTask(f"{TASK}/{n}", f"task{n}") for n in range(tasks)]
+    plan = EvaluationPlan(
+        tasks=tuple(planned),
+        policy="random",
+        seeds=(0,),
+        episodes=monitors * episodes,
+        keep="none",
+    )
+    pattern = _recorded_manifest()
+    for task in planned:
+        _write_monitors(directory / task.folder, monitors, episodes, pattern)
+    results = {
+        task.name: list(results_of(task.name, monitors=monitors, episodes=episodes))
+        for task in planned
+    }
+    files = {task.name: RecordedFiles(directory / task.folder, ()) for task in planned}
+    few = Bootstrap(resamples=10)
+    write_plan(directory, plan)
+    write_results(
+        directory,
+        plan=plan,
+        results=[result for each in results.values() for result in each],
+        summaries=[
+            summarize_results(task, each, bootstrap=few)
+            for task, each in results.items()
+        ],
+        across=None,
+        bootstrap=few,
+        selection={},
+        versions={},
+        files=lambda result: files[result.task].of(result),
+    )
+
+
+def results_of(task: str, *, monitors: int, episodes: int) -> Iterator[EpisodeResult]:
+    """Yield the results of the episodes that `write_monitors` writes."""
+    for written in _monitors(monitors, episodes):
+        for number in written.numbers:
+            yield _result(task, written, number)
+
+
+def _recorded_manifest() -> Manifest:
+    """Return what a monitor of an evaluation writes about its machine."""
+    with tempfile.TemporaryDirectory() as place:
+        env = gymnasium.make(TASK)
+        monitor: Any = mjrec.Monitor(env, place, False, mode="evaluation", workers=0)
+        with monitor:
+            monitor.reset(seed=0)
+            monitor.step(env.action_space.sample())
+        [path] = Path(place).glob("*.manifest.json")
+        return read_manifest(path)
+
+
+def _write_monitors(
+    folder: Path, monitors: int, episodes: int, pattern: Manifest
+) -> None:
+    folder.mkdir(parents=True)
+    for written in _monitors(monitors, episodes):
+        _write_monitor(folder, written, pattern)
+
+
+def _monitors(count: int, episodes: int) -> Iterator[_Written]:
+    for number in range(count):
+        process, monitor_id = divmod(number, _OF_ONE_PROCESS)
+        yield _Written(
+            infix=Infix(monitor_id, str(_FIRST_PROCESS + process)),
+            seed=0,
+            first=number * episodes,
+            episodes=episodes,
+        )
+
+
+def _write_monitor(folder: Path, written: _Written, pattern: Manifest) -> None:
+    entries = [_entry(number) for number in written.numbers]
+    writer = JournalWriter(
+        folder / journal_name(written.infix), env_info=pattern.env_info
+    )
+    for entry in entries:
+        writer.append(entry)
+        trajectory = trajectory_prefix(written.infix, entry.episode_id)
+        (folder / f"{trajectory}.h5").touch()
+    writer.close()
+    _write_ledger(folder, written)
+    stats = f"{stats_prefix(written.infix)}.stats.json"
+    write_stats_file(folder / stats, _stats(entries))
+    details = {
+        **(pattern.mjrec or {}),
+        "first_episode_id": written.first,
+        "next_episode_id": written.first + written.episodes,
+    }
+    manifest = replace(pattern, stats=stats, videos=(), mjrec=details)
+    write_manifest(folder / manifest_name(written.infix), manifest)
+
+
+def _write_ledger(folder: Path, written: _Written) -> None:
+    batch = Batch(
+        task=TASK,
+        folder=folder.name,
+        seed=written.seed,
+        episodes=tuple(written.numbers),
+    )
+    path = folder / ledger_name(str(written.infix))
+    ledger = Ledger(path, batch, whole=False)
+    for number in written.numbers:
+        result = _result(TASK, written, number)
+        ledger.begin(result.unit, monitor=str(written.infix), episode_id=number)
+        ledger.end(result)
+    ledger.close()
+
+
+def _entry(number: int) -> JournalEntry:
+    start = _START + number
+    return JournalEntry(
+        episode_id=number,
+        length=_STEPS,
+        reward=_reward(number),
+        type="e",
+        start_time=start,
+        end_time=start + _SECONDS,
+        seed=number,
+        options=None,
+        terminated=False,
+        truncated=True,
+        success=None,
+    )
+
+
+def _stats(entries: Sequence[JournalEntry]) -> StatsFile:
+    return StatsFile(
+        initial_reset_timestamp=entries[0].start_time,
+        timestamps=tuple(entry.end_time for entry in entries),
+        episode_lengths=tuple(entry.length for entry in entries),
+        episode_rewards=tuple(entry.reward for entry in entries),
+        episode_types=tuple(entry.type for entry in entries),
+    )
+
+
+def _result(task: str, written: _Written, number: int) -> EpisodeResult:
+    return EpisodeResult(
+        task=task,
+        seed=written.seed,
+        episode=number,
+        total_reward=_reward(number),
+        length=_STEPS,
+        terminated=False,
+        truncated=True,
+        monitor=str(written.infix),
+        episode_id=number,
+        start_time=_START + number,
+        seconds=_SECONDS,
+    )
+
+
+def _reward(number: int) -> float:
+    # No two alike for long, and no more digits than returns have.
+    return number * 7919 % 10_007 / 13

@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How cost grows with the number of monitors that have recorded into a directory."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import itertools
+import math
+import shutil
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+import mjrec
+from mjrec.evaluation.ledger import read_ledgers
+from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
+from mjrec.evaluation.progress_counts import LedgerCounts
+from mjrec.evaluation.results_files import write_results
+from mjrec.evaluation.settling import settle_monitor
+from mjrec.evaluation.summaries import Bootstrap
+from mjrec.evaluation.summarizing import summarize_results
+from mjrec.recorder.selection import UNDECIDED
+from mjrec.rendering.pending import remove_unfinished
+
+from .children import call
+from .many_monitors import TASK, results_of, write_evaluation, write_monitors
+from .process_memory import peak_memory
+from .results import Promise, Reference, Result, at_most
+from .rounds import Say, take_turns
+
+__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure"]
+
+TITLE = "Scaling: a directory into which many monitors have recorded"
+
+# What a reader keeps of a monitor with ten episodes, and what any reader needs.
+_KEPT_MB, _NEEDED_MB = 0.012, 30.0
+_RESULT_MB = 0.001
+# Half as much again as the number of monitors grows, for what is not the reader's.
+_LINEAR = 1.5
+
+_Work = Callable[[], object]
+_Prepare = Callable[[Path], _Work]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How much is measured.
+
+    Attributes:
+        rounds: of all variants.
+        monitors: in a directory, each time more.
+        episodes: of each monitor.
+        tasks: among which the monitors of an evaluation are spread.
+        results: how many episodes a driver holds, each time more.
+    """
+
+    rounds: int = 3
+    monitors: tuple[int, ...] = (100, 1000, 10_000)
+    episodes: int = 10
+    tasks: int = 50
+    results: tuple[int, ...] = (100_000, 1_000_000)
+
+
+FULL = Settings()
+QUICK = Settings(monitors=(10, 100, 1000), tasks=5, results=(10_000, 100_000))
+
+
+@dataclass(frozen=True)
+class _Cost:
+    """Of an operation: the seconds, and the peaks before it and after it, in MB."""
+
+    seconds: float
+    before: float
+    after: float
+
+
+def measure(settings: Settings, say: Say) -> list[Result]:
+    """Return how long each operation takes, how that grows, and in what memory."""
+    with tempfile.TemporaryDirectory() as place:
+        directories = _directories(Path(place), settings, say)
+        variants: dict[tuple[str, int], Callable[[], _Cost]] = {
+            (name, count): functools.partial(
+                _cost, run, operation=name, directory=str(directory)
+            )
+            for count, (task, evaluation) in directories.items()
+            for name, directory in (
+                *((name, task) for name in _OF_MONITORS),
+                *((name, evaluation) for name in _OF_EVALUATIONS),
+            )
+        }
+        for count in settings.results:
+            variants[_HELD, count] = functools.partial(_cost, hold, results=count)
+        samples = take_turns(variants, rounds=settings.rounds, say=say)
+    return [*_results(samples, settings)]
+
+
+def run(operation: str, directory: str) -> list[float]:
+    """Do something once, and return its seconds, and the peaks before and after."""
+    prepare = {**_OF_MONITORS, **_OF_EVALUATIONS}[operation]
+    return _measured(prepare(Path(directory)))
+
+
+def hold(results: int) -> list[float]:
+    """Hold the results of so many episodes, as a driver does, and write them."""
+    plan = EvaluationPlan(
+        tasks=(EvaluatedTask(TASK, TASK),),
+        policy="random",
+        seeds=(0,),
+        episodes=results,
+        keep="none",
+    )
+
+    def work() -> None:
+        held = list(results_of(TASK, monitors=results, episodes=1))
+        with tempfile.TemporaryDirectory() as place:
+            write_results(
+                Path(place),
+                plan=plan,
+                results=held,
+                summaries=[summarize_results(TASK, held)],
+                across=None,
+                bootstrap=Bootstrap(),
+                selection={},
+                versions={},
+            )
+
+    return _measured(work)
+
+
+def _measured(work: _Work) -> list[float]:
+    before, start = peak_memory(), time.perf_counter()
+    work()
+    return [time.perf_counter() - start, before, peak_memory()]
+
+
+def _cost(function: Callable[..., list[float]], **arguments: Any) -> _Cost:
+    return _Cost(*call(function, **arguments))
+
+
+def _directories(
+    place: Path, settings: Settings, say: Say
+) -> dict[int, tuple[Path, Path]]:
+    """Return by number of monitors a task's folder, and an evaluation's directory."""
+    directories = {}
+    for count in settings.monitors:
+        say(f"writing the files of {count} monitors, twice")
+        task, evaluation = place / f"task{count}", place / f"evaluation{count}"
+        write_monitors(task, monitors=count, episodes=settings.episodes)
+        write_evaluation(
+            evaluation,
+            tasks=min(settings.tasks, count),
+            monitors=count // min(settings.tasks, count),
+            episodes=settings.episodes,
+        )
+        directories[count] = task, evaluation
+    return directories
+
+
+# What is done. Each gets ready first: what it imports is no part of the cost.
+
+
+def _load(directory: Path) -> _Work:
+    load_results = mjrec.load_results
+    return lambda: load_results(directory)
+
+
+def _list(directory: Path) -> _Work:
+    iter_episodes = mjrec.iter_episodes
+    return lambda: sum(1 for _ in iter_episodes(directory))
+
+
+def _report(directory: Path) -> _Work:
+    write_report = mjrec.write_report
+    for name in ("jinja2", "matplotlib.figure"):
+        importlib.import_module(name)
+    report = directory.with_name(f"{directory.name}-report")
+    shutil.rmtree(report, ignore_errors=True)
+    return lambda: write_report(directory, report)
+
+
+def _open(directory: Path) -> _Work:
+    env = gymnasium.make(TASK)
+    return lambda: _monitor(env, directory)
+
+
+def _settle(directory: Path) -> _Work:
+    with _monitor(gymnasium.make(TASK), directory) as monitor:
+        monitor.reset(seed=0)
+        monitor.step(monitor.action_space.sample())
+    return lambda: settle_monitor(directory, monitor.infix, {}, rule="best")
+
+
+def _monitor(env: Any, directory: Path) -> Any:
+    """Open a monitor as a worker of an evaluation does."""
+    return mjrec.Monitor(
+        env,
+        directory,
+        keep=UNDECIDED,
+        resume=True,
+        mode="evaluation",
+        render="deferred",
+        workers=0,
+        env_id=TASK,
+    )
+
+
+def _recover(directory: Path) -> _Work:
+    recover = mjrec.recover
+    return lambda: recover(directory)
+
+
+def _read_ledgers(directory: Path) -> _Work:
+    return lambda: read_ledgers(directory)
+
+
+def _look_again(directory: Path) -> _Work:
+    # Not resting: what is asked is how long a look takes.
+    counts = LedgerCounts([directory], clock=itertools.repeat(0.0).__next__)
+    counts.look()
+    return counts.look
+
+
+def _remove_unfinished(directory: Path) -> _Work:
+    return lambda: remove_unfinished(directory / "openaigym.video.0.1.video000000.mp4")
+
+
+_LOADED, _LISTED, _REPORTED = "load_results", "iter_episodes", "mjrec report"
+_OF_MONITORS: Mapping[str, _Prepare] = {
+    _LOADED: _load,
+    _LISTED: _list,
+    _REPORTED: _report,
+    "a monitor is opened": _open,
+    "a monitor is settled": _settle,
+    "mjrec recover": _recover,
+    "ledgers read": _read_ledgers,
+    "ledgers looked at again": _look_again,
+    "a video's leftovers removed": _remove_unfinished,
+}
+_REPORTED_EVALUATION = "mjrec report of an evaluation"
+_OF_EVALUATIONS: Mapping[str, _Prepare] = {_REPORTED_EVALUATION: _report}
+_HELD = "results held and written"
+_READERS = (_LOADED, _LISTED, _REPORTED, _REPORTED_EVALUATION)
+
+
+def _results(
+    samples: Mapping[tuple[str, int], Sequence[_Cost]], settings: Settings
+) -> Iterator[Result]:
+    for name in (*_OF_MONITORS, *_OF_EVALUATIONS, _HELD):
+        counts = settings.results if name == _HELD else settings.monitors
+        what = "results" if name == _HELD else "monitors"
+        for fewer, count in zip((None, *counts), counts, strict=False):
+            less = () if fewer is None else samples[name, fewer]
+            growth = count / (fewer or count)
+            yield _time(name, f"{count} {what}", samples[name, count], less, growth)
+        if name in (*_READERS, _HELD):
+            most = counts[-1]
+            bound = _bound(name, most)
+            yield _memory(name, f"{most} {what}", samples[name, most], bound)
+
+
+def _bound(name: str, count: int) -> Promise:
+    return at_most(_NEEDED_MB + count * (_RESULT_MB if name == _HELD else _KEPT_MB))
+
+
+def _time(
+    name: str,
+    variant: str,
+    costs: Sequence[_Cost],
+    less: Sequence[_Cost],
+    growth: float,
+) -> Result:
+    seconds = tuple(cost.seconds for cost in costs)
+    reference, promise, note = None, None, ""
+    if less:
+        before = tuple(cost.seconds for cost in less)
+        reference = Reference(f"{growth:g} times fewer", before)
+        exponent = math.log(statistics.median(seconds) / statistics.median(before))
+        note = f"grows with the power {exponent / math.log(growth):.2f}"
+        promise = at_most(growth * _LINEAR) if name in _READERS else None
+    return Result(
+        subject=name,
+        variant=variant,
+        unit="s",
+        samples=seconds,
+        reference=reference,
+        promise=promise,
+        note=note,
+    )
+
+
+def _memory(
+    name: str, variant: str, costs: Sequence[_Cost], promise: Promise
+) -> Result:
+    return Result(
+        subject=name,
+        variant=f"{variant}, peak memory",
+        unit="MB",
+        samples=tuple(cost.after for cost in costs),
+        reference=Reference(
+            "imports", tuple(cost.before for cost in costs), is_ratio=False
+        ),
+        promise=promise,
+    )
