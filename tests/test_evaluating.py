@@ -26,6 +26,7 @@ from mjrec import (
     PolicyError,
     UnknownName,
 )
+from mjrec.evaluation import evaluating
 from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
 from mjrec.evaluation.results_files import read_results
@@ -113,17 +114,30 @@ def test_what_takes_long_begins_first(reference: Path) -> None:
     assert begun_at[DOUBLE] < begun_at[PENDULUM]
 
 
+@pytest.mark.parametrize("engine", [None, "local"])
 def test_workers_are_given_an_opengl_backend_that_works(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str | None
 ) -> None:
-    """Where nobody has chosen one, for tasks that are drawn while they run."""
+    """Where nobody has chosen one, for tasks that are drawn while they run.
+
+    Those of an engine choose for themselves, because they may be on other machines.
+    """
     monkeypatch.delenv("MUJOCO_GL")
 
     def push(_: Any) -> Any:
         assert os.environ["MUJOCO_GL"] in ("egl", "osmesa")
         return np.zeros(1)
 
-    evaluation = run(tmp_path / "e", policy=push, keep="best", episodes=1, num_seeds=1)
+    if engine is not None:
+        monkeypatch.setattr(evaluating, "choose", lambda: 1 / 0)
+    evaluation = run(
+        tmp_path / "e",
+        policy=push,
+        keep="best",
+        episodes=1,
+        num_seeds=1,
+        engine=engine,
+    )
     assert [each.failure for each in evaluation.results] == [None]
 
 

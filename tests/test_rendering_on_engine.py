@@ -264,6 +264,19 @@ def test_what_is_done_is_no_job(tmp_path: Path, painter: Painter) -> None:
     assert engine.works == []
 
 
+def test_what_an_earlier_run_left_undone_is_done(
+    tmp_path: Path, painter: Painter
+) -> None:
+    """Manifests are true at the end, though there was nothing to render."""
+    write_finished(tmp_path)
+    finish(Here(), tmp_path)
+    manifest = write_pending_manifest(tmp_path, 0)
+    assert finish(Here(), tmp_path) == []
+    content = json.loads(manifest.read_text())
+    assert [video for video, _ in content["videos"]] == [f"{VIDEO}.mp4"]
+    assert content["mjrec"]["pending"] == []
+
+
 def test_a_job_done_twice_is_done_once(tmp_path: Path, painter: Painter) -> None:
     """The second time there is nothing to do, and no file is touched."""
     write_finished(tmp_path)
