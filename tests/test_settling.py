@@ -108,6 +108,18 @@ def test_before_it_all_are_candidates_that_recovery_leaves_alone(folder: Path) -
     assert content_of(folder) == before
 
 
+@pytest.mark.parametrize("said", [None, -1, 10**15])
+def test_monitor_whose_manifest_says_no_numbers_is_settled(
+    folder: Path, said: int | None
+) -> None:
+    """Its episodes are found by their names then."""
+    for path in folder.glob("*.manifest.json"):
+        manifest = json.loads(path.read_text())
+        manifest["mjrec"]["first_episode_id"] = said
+        path.write_text(json.dumps(manifest))
+    check_settled(folder, settle_best(folder))
+
+
 def test_what_is_chosen_is_pending_and_the_rest_is_not(folder: Path) -> None:
     """Trajectories get their final form, and manifests say what there will be."""
     best = settle_best(folder)
