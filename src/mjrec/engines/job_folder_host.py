@@ -9,7 +9,7 @@ import json
 import logging
 import signal
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from types import FrameType
 
 from ..gl.given_gpu import visible_gpus
@@ -17,16 +17,16 @@ from .hosting import Host
 from .job_folder import HostState, JobFolder, Pace, TakenJob
 from .local_worker import SECONDS_TO_CLOSE
 
-__all__ = ["GIVEN_BACK", "HAD_ALL_TIME", "Notice", "heard_signals", "serve"]
+__all__ = ["GIVEN_BACK", "HAD_MUCH_TIME", "Notice", "heard_signals", "serve"]
 
 logger = logging.getLogger(__name__)
 
 # In an answer, instead of an outcome: why the job is not done, through no fault of its
-# own; and whether it had all the time that this host had.
+# own; and whether it had at least half of the time that this host had.
 GIVEN_BACK = "given_back"
-HAD_ALL_TIME = "had_all_time"
+HAD_MUCH_TIME = "had_much_time"
 
-# What is left of the notice after the workers have closed their files.
+# What is left of the time after the workers have closed their files.
 _SECONDS_LEFT = 5.0
 _SHORTEST_POLL = 0.01
 _POLLS_GROW = 1.5
@@ -38,24 +38,25 @@ class Notice:
 
     Attributes:
         ends: it has to end at once.
-        ends_soon: when, by `time.monotonic`, it was told that its time will be over;
-            None if it was not.
+        ends_soon: its time will be over.
     """
 
     ends: bool = False
-    ends_soon: float | None = None
+    ends_soon: bool = False
 
 
 @contextlib.contextmanager
-def heard_signals(*, end: Iterable[int], end_soon: Iterable[int]) -> Iterator[Notice]:
-    """Yield what signals say from now on; they do nothing else.
+def heard_signals(
+    *, end: Collection[int], end_soon: int
+) -> Iterator[Callable[[], Notice]]:
+    """Yield a function that returns what signals have said; they do nothing else.
 
-    A flag and no exception: between any two instructions, of submitit's too, nothing
-    is torn apart.
+    Flags and no exceptions: between any two instructions, of submitit's too, nothing is
+    torn apart.
 
     Args:
         end: those that ask for an end.
-        end_soon: those that say that the time will be over.
+        end_soon: the one that says that the time will be over.
     """
     notice = Notice()
 
@@ -63,17 +64,24 @@ def heard_signals(*, end: Iterable[int], end_soon: Iterable[int]) -> Iterator[No
         notice.ends = True
 
     def take_end_soon(signum: int, frame: FrameType | None) -> None:
-        notice.ends_soon = time.monotonic()
+        notice.ends_soon = True
 
-    handlers = {
-        **dict.fromkeys(end, take_end),
-        **dict.fromkeys(end_soon, take_end_soon),
+    def look() -> Notice:
+        # Blocked, it waits here, unless a thread of some library's has taken it.
+        notice.ends_soon = notice.ends_soon or end_soon in signal.sigpending()
+        return notice
+
+    before = {
+        **{signum: signal.signal(signum, take_end) for signum in end},
+        end_soon: signal.signal(end_soon, take_end_soon),
     }
-    before = {signum: signal.signal(signum, take) for signum, take in handlers.items()}
+    # Slurm sends it to all processes of the job, whom it would end. Workers inherit
+    # that it is blocked.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [end_soon])
     # The driver may have blocked them while this process was started.
-    mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, handlers)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, end)
     try:
-        yield notice
+        yield look
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for signum, handler in before.items():
@@ -85,8 +93,8 @@ def serve(
     *,
     host: str,
     workers: int,
-    notice: Notice,
-    notice_s: float,
+    notice: Callable[[], Notice],
+    limit_s: float,
     pace: Pace,
 ) -> None:
     """Do jobs of a folder until the run is over, or this process has to end.
@@ -99,11 +107,11 @@ def serve(
         folder: of the run.
         host: a name of this host that no other has had.
         workers: how many jobs are done at once.
-        notice: what signals say.
-        notice_s: how long after being told that its time will be over this process
-            is ended.
+        notice: returns what signals have said.
+        limit_s: how long from now on this process is let live.
         pace: how often it looks.
     """
+    time_s = max(0.0, limit_s - SECONDS_TO_CLOSE - _SECONDS_LEFT)
     if folder.is_stopped:
         return
     folder.note_host(host, HostState.WORKING)
@@ -117,7 +125,7 @@ def serve(
             name=host,
             workers=workers,
             notice=notice,
-            grace_s=notice_s - SECONDS_TO_CLOSE - _SECONDS_LEFT,
+            time_s=time_s,
             pace=pace,
         )
         why = serving.until_the_end()
@@ -136,8 +144,8 @@ class _Serving:
         *,
         name: str,
         workers: int,
-        notice: Notice,
-        grace_s: float,
+        notice: Callable[[], Notice],
+        time_s: float,
         pace: Pace,
     ) -> None:
         self._folder = folder
@@ -145,16 +153,16 @@ class _Serving:
         self._name = name
         self._workers = workers
         self._notice = notice
-        self._grace_s = grace_s
+        self._began = time.monotonic()
+        self._time_s = time_s
         self._pace = pace
         self._driver = _Driver(folder, silent_s=pace.silent_s)
         self._taken: dict[str, TakenJob] = {}
-        self._begun: set[str] = set()
-        # Those that were begun with.
-        self._first: set[str] = set()
-        self._any_is_done = False
+        # When each job was begun, by its key.
+        self._begun: dict[str, float] = {}
         self._takes_more = True
         self._cannot_begin = False
+        self._is_at_limit = False
 
     def until_the_end(self) -> str:
         """Do jobs; return why no more are done."""
@@ -181,21 +189,21 @@ class _Serving:
         for key, job in self._taken.items():
             said = {
                 GIVEN_BACK: why,
-                HAD_ALL_TIME: key in self._first and self._notice.ends_soon is not None,
+                HAD_MUCH_TIME: self._is_at_limit and self._had_much_time(key),
             }
             self._folder.answer(job, json.dumps(said).encode())
         self._taken.clear()
 
     def _why_it_ends(self, idle_since: float) -> str:
         """Return why no more is done; nothing as long as something is."""
-        if self._notice.ends:
+        if self._notice().ends:
             return "its Slurm job had to end"
         if self._driver.has_said_stop:
             return "the run is over"
         if self._cannot_begin:
             return "no worker could begin"
-        soon = self._notice.ends_soon
-        if soon is not None and time.monotonic() - soon > self._grace_s:
+        if time.monotonic() - self._began > self._time_s:
+            self._is_at_limit = True
             return "its Slurm job came to its time limit"
         if self._taken:
             return ""
@@ -207,7 +215,7 @@ class _Serving:
 
     def _see_whether_to_leave(self) -> None:
         """Take no more jobs once it is known that there is no time for them."""
-        leaves = self._notice.ends_soon is not None or self._driver.is_dead
+        leaves = self._notice().ends_soon or self._driver.is_dead
         if leaves and self._takes_more:
             self._takes_more = False
             self._folder.note_host(self._name, HostState.LEAVING)
@@ -229,11 +237,12 @@ class _Serving:
             # It was done here, and what came of it got lost on its way.
             said["key"] += f", once more as {job.number}"
         key = said["key"]
-        self._begun.add(key)
+        self._begun[key] = time.monotonic()
         self._host.submit(json.dumps(said).encode())
         self._taken[key] = job
-        if not self._any_is_done:
-            self._first.add(key)
+
+    def _had_much_time(self, key: str) -> bool:
+        return self._begun[key] - self._began < self._time_s / 2
 
     def _hear(self, seconds: float) -> bool:
         """Lay down what the workers have done, waiting so long for it at most."""
@@ -253,7 +262,6 @@ class _Serving:
                 self._folder.answer(job, line)
             self._taken.clear()
             return False
-        self._any_is_done = True
         self._folder.answer(self._taken.pop(said["key"]), line)
         return True
 

@@ -8,47 +8,30 @@ once, then does one job of the run after the other. Jobs and outcomes travel as 
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import logging
 import math
 import os
-import secrets
-import shutil
 import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from ..child_python import said_in
-from ..errors import (
-    ClosedError,
-    DirectoryNotWritable,
-    Error,
-    InvalidArgument,
-    UnknownName,
-)
+from ..errors import ClosedError, InvalidArgument, UnknownName
 from ..machine import usable_cpus
-from .driver_sign import DriverSign, is_surely_dead
+from .driver_sign import DriverSign
 from .gpu_shares import GpuShare
 from .hosting import HomeLog, HostedWork, take_home
 from .job_book import JobBook, Task
-from .job_folder import HostState, JobFolder, Pace, TakenJob
-from .job_folder_host import GIVEN_BACK, HAD_ALL_TIME
+from .job_folder import JobFolder, Pace, TakenJob
+from .job_folder_host import GIVEN_BACK, HAD_MUCH_TIME
 from .local import check_worker_count
-from .local_worker import SECONDS_TO_CLOSE
-from .slurm_jobs import (
-    ClusterJobs,
-    JobRequest,
-    JobState,
-    NotSubmitted,
-    check_cluster,
-    cluster_jobs,
-)
-from .work import WORK_FOLDER, Job, JobOutcome, Run, Work
+from .run_place import EarlierRun, RunPlace
+from .slurm_hosts import HostEnd, SlurmHosts
+from .slurm_jobs import ClusterJobs, JobRequest, check_cluster, cluster_jobs
+from .work import Job, JobOutcome, Run, Work
 
 __all__ = ["DEFAULT_WORKERS", "SlurmEngine", "SlurmRun"]
 
@@ -57,17 +40,10 @@ logger = logging.getLogger(__name__)
 # What a cluster would grant is not known before; four are what nobody minds.
 DEFAULT_WORKERS = 4
 
-_FOLDER_PREFIX = "slurm."
 _SHORTEST_POLL = 0.005
 _POLLS_GROW = 1.5
 # Hosts find so many jobs each, so that none waits for the driver.
 _JOBS_AHEAD = 2
-_ENDS_AT_ONCE = 2
-_SECONDS_BETWEEN_TRIES = 30.0
-_TRIES_TO_SUBMIT = 10
-_SECONDS_BEFORE_SAYING_WHY = 60.0
-_SECONDS_TO_LEAVE = 15.0
-_END_OF_LOG = 2000
 
 
 class SlurmEngine:
@@ -92,7 +68,8 @@ class SlurmEngine:
         time_min: their time limit in minutes. It ends no work: another takes the
             place of one whose time is over. The longest job has to fit.
         notice_s: so many seconds before its time limit a Slurm job takes no more
-            jobs; what it is at then can still be done.
+            jobs; what it is at then can still be done. None is 120, or a quarter of
+            a short limit.
         mem_gb: memory of each worker, in gigabytes.
         setup: lines of shell that run in a Slurm job before anything else.
         sbatch: any other options of `sbatch`, by name, without their dashes.
@@ -117,7 +94,7 @@ class SlurmEngine:
         qos: str | None = None,
         constraint: str | None = None,
         time_min: int = 60,
-        notice_s: float = 120.0,
+        notice_s: float | None = None,
         mem_gb: float | None = None,
         setup: Sequence[str] = (),
         sbatch: Mapping[str, str | int | bool] | None = None,
@@ -130,6 +107,8 @@ class SlurmEngine:
             _check_whole("workers_per_job", workers_per_job)
         if mem_gb is not None and not mem_gb > 0:
             raise InvalidArgument(f"mem_gb is more than 0, got {mem_gb!r}.")
+        if notice_s is None:
+            notice_s = min(120.0, 60 * time_min / 4)
         if not 0 <= notice_s < 60 * time_min:
             raise InvalidArgument(
                 f"notice_s is less than the time limit of {time_min} minutes (time_min)"
@@ -263,14 +242,14 @@ class SlurmRun:
         self._most = workers
         self._request = request
         self._pace = pace
-        self._place = _Place(work.shared_directory)
+        self._place = RunPlace(work.shared_directory)
         self._folder = self._place.make(HostedWork.of(work, share), work.payload)
         self._jobs = cluster_jobs(cluster, self._folder, request, pace)
         self._sign = DriverSign(self._folder, cluster, every_s=pace.beat_s)
         self._earlier = [
-            _EarlierRun(folder, request, pace) for folder in self._place.others()
+            EarlierRun(folder, request, pace) for folder in self._place.others()
         ]
-        self._hosts = _Hosts(self._folder, self._jobs, pace)
+        self._hosts = SlurmHosts(self._folder, self._jobs, pace)
         self._book = JobBook()
         self._log = HomeLog()
         self._out: dict[int, Task] = {}
@@ -407,16 +386,17 @@ class SlurmRun:
             self._book.put_back(task)
         elif GIVEN_BACK in said:
             self._log.tell(said)
-            self._take_back(task, said[GIVEN_BACK], is_try=said[HAD_ALL_TIME])
+            self._take_back(task, said[GIVEN_BACK], is_try=said[HAD_MUCH_TIME])
         else:
             take_home(line, task, self._book, self._log)
             self._hosts.has_done_something(host)
 
     def _take_back(self, task: Task, why: str, *, is_try: bool) -> None:
         if is_try:
-            limit = f"{self._request.time_min} minutes (time_min)"
             self._book.begin_again(
-                task, f"was at it for the whole time of a Slurm job, {limit}: {why}"
+                task,
+                "was at it for more than half of the time that a Slurm job has, which "
+                f"is {self._request.time_min} minutes (time_min): {why}",
             )
         else:
             logger.info("The job %s is done elsewhere: %s.", task.key, why)
@@ -460,296 +440,6 @@ class SlurmRun:
             run.look()
 
 
-@dataclass(frozen=True, kw_only=True)
-class HostEnd:
-    """How a host has ended that has not said so itself.
-
-    Attributes:
-        how: as a part of a sentence.
-        is_to_blame: whether what it did may be the cause.
-    """
-
-    how: str
-    is_to_blame: bool
-
-
-@dataclass(eq=False)
-class _SlurmJob:
-    """One that was submitted, and is not over."""
-
-    number: str
-    submitted: float
-    has_begun: bool = False
-    takes_more: bool = True
-    has_done_something: bool = False
-
-
-class _Hosts:
-    """The Slurm jobs of a run, and the hosts in them.
-
-    Args:
-        folder: of the run.
-        jobs: on the cluster.
-        pace: how often they are looked at.
-    """
-
-    def __init__(self, folder: JobFolder, jobs: ClusterJobs, pace: Pace) -> None:
-        self._folder = folder
-        self._jobs = jobs
-        self._pace = pace
-        self._all: dict[str, _SlurmJob] = {}
-        self._ends_at_once = 0
-        self._last_end = ""
-        self._refused = 0
-        self._not_before = -math.inf
-        self._why_said = -math.inf
-        self.logs_to_keep = False
-
-    def want(self, count: int) -> None:
-        """Have so many hosts that take jobs, once the cluster grants them.
-
-        Raises:
-            NotSubmitted: the cluster takes no jobs.
-        """
-        missing = count - sum(job.takes_more for job in self._all.values())
-        now = time.monotonic()
-        if missing <= 0 or now < self._not_before or self._ends_too_often:
-            return
-        try:
-            numbers = self._jobs.submit(missing)
-        except NotSubmitted as error:
-            self._refused += 1
-            if not self._all or self._refused >= _TRIES_TO_SUBMIT:
-                raise
-            logger.warning("%s. It is tried again.", error)
-            self._not_before = now + _SECONDS_BETWEEN_TRIES
-            return
-        self._refused = 0
-        logger.info("Submitted: %s.", ", ".join(numbers))
-        self._all.update((n, _SlurmJob(number=n, submitted=now)) for n in numbers)
-
-    def has_done_something(self, host: str) -> None:
-        """Note that a host has done a job."""
-        job = self._all.get(_job_of(host))
-        if job is not None and not job.has_done_something:
-            job.has_done_something = True
-            self._ends_at_once = 0
-
-    def look(self) -> dict[str, HostEnd]:
-        """See what became of all; return hosts that have died, and how."""
-        states = self._jobs.states(self._all)
-        hosts = self._folder.hosts()
-        dead: dict[str, HostEnd] = {}
-        for number, state in states.items():
-            ours = sorted((h for h in hosts if _job_of(h) == number), key=_begun)
-            self._note(self._all[number], state, [hosts[host] for host in ours])
-            last = ours if state.is_over or state.is_waiting else ours[:-1]
-            end = self._end_of(number, state)
-            dead |= {host: end for host in last if hosts[host] is not HostState.ENDED}
-            if state.is_over:
-                self._see_off(number, end, said=[hosts[host] for host in ours])
-        self._say_why_none_begins(states)
-        return dead
-
-    def check(self) -> None:
-        """Raise where hosts end again and again without having done anything.
-
-        Raises:
-            Error: they do, and there are no others.
-        """
-        if self._ends_too_often and not any(
-            job.has_done_something for job in self._all.values()
-        ):
-            raise Error(
-                f"No Slurm job can do anything. The last one {self._last_end} Their "
-                f"logs are in {self._folder.logs}."
-            )
-
-    def end_all(self) -> None:
-        """Let all hosts end by themselves, and see to it that they have."""
-        self._folder.stop()
-        waiting = [n for n, s in self._jobs.states(self._all).items() if s.is_waiting]
-        self._jobs.end(waiting)
-        deadline = time.monotonic() + SECONDS_TO_CLOSE + _SECONDS_TO_LEAVE
-        self._wait_until(deadline, self._have_said_so)
-        self._wait_until(deadline, self._are_over)
-        if self._all:
-            logger.warning(
-                "%d Slurm jobs have not ended by themselves, and are cancelled.",
-                len(self._all),
-            )
-            self._jobs.end(self._all)
-
-    @property
-    def _ends_too_often(self) -> bool:
-        return self._ends_at_once >= _ENDS_AT_ONCE
-
-    def _note(
-        self, job: _SlurmJob, state: JobState, hosts: Sequence[HostState]
-    ) -> None:
-        job.has_begun = job.has_begun or bool(hosts)
-        # One that begins again, begins to take jobs again.
-        job.takes_more = state.is_waiting or not (
-            state.is_over or (hosts and hosts[-1] is not HostState.WORKING)
-        )
-
-    def _end_of(self, number: str, state: JobState) -> HostEnd:
-        how = f"was in the Slurm job {number}, which is {state.name}."
-        if state.is_to_blame:
-            how = f"{how} The end of its log: {self._end_of_log(number)}"
-        return HostEnd(how=how, is_to_blame=state.is_to_blame)
-
-    def _see_off(self, number: str, end: HostEnd, *, said: list[HostState]) -> None:
-        """Note that a Slurm job is over."""
-        job = self._all.pop(number)
-        if (said and said[-1] is HostState.ENDED) or not end.is_to_blame:
-            return
-        self.logs_to_keep = True
-        self._last_end = end.how
-        if not job.has_done_something:
-            self._ends_at_once += 1
-        logger.warning("A Slurm job has died: it %s", end.how)
-
-    def _end_of_log(self, number: str) -> str:
-        with contextlib.suppress(OSError):
-            said = self._jobs.log_of(number).read_bytes()
-            return said[-_END_OF_LOG:].decode(errors="replace").strip() or "(nothing)"
-        return f"(there is none, {self._jobs.log_of(number)})"
-
-    def _say_why_none_begins(self, states: Mapping[str, JobState]) -> None:
-        now = time.monotonic()
-        waiting = [job for job in self._all.values() if not job.has_begun]
-        if (
-            len(waiting) < len(self._all)
-            or not waiting
-            or now - waiting[0].submitted < _SECONDS_BEFORE_SAYING_WHY
-            or now - self._why_said < 10 * _SECONDS_BEFORE_SAYING_WHY
-        ):
-            return
-        self._why_said = now
-        first = waiting[0].number
-        state = states.get(first, JobState(name="UNKNOWN"))
-        logger.warning(
-            "%d Slurm jobs wait for their turn. What Slurm says of %s: %s (%s).",
-            len(waiting),
-            first,
-            state.name,
-            state.reason or "no reason",
-        )
-
-    def _wait_until(self, deadline: float, is_so: Callable[[], bool]) -> None:
-        pause = _SHORTEST_POLL
-        while not is_so() and time.monotonic() < deadline:
-            time.sleep(pause)
-            pause = min(pause * _POLLS_GROW, self._pace.poll_s)
-
-    def _have_said_so(self) -> bool:
-        """Whether all hosts that have begun say that they have ended."""
-        states = self._folder.hosts().values()
-        return all(state is HostState.ENDED for state in states)
-
-    def _are_over(self) -> bool:
-        """Forget those that are over; return whether all are."""
-        for number, state in self._jobs.states(self._all).items():
-            if state.is_over:
-                del self._all[number]
-        return not self._all
-
-
-class _EarlierRun:
-    """What a driver that was killed has left in the same shared directory.
-
-    Args:
-        folder: of that run.
-        request: of this one, which is not used up.
-        pace: of this one.
-    """
-
-    def __init__(self, folder: JobFolder, request: JobRequest, pace: Pace) -> None:
-        self._folder = folder
-        self._sign = folder.sign()
-        self._seen = time.monotonic()
-        self._patience = 3 * pace.beat_s
-        facts = said_in(self._sign) if self._sign else {}
-        self._jobs = cluster_jobs(facts.get("cluster", ""), folder, request, pace)
-        self._is_stopped = False
-        self._is_alive = False
-
-    def look(self) -> None:
-        """End its Slurm jobs, once it is clear that its driver is dead."""
-        if self._is_stopped or self._is_alive:
-            return
-        sign = self._folder.sign()
-        if sign != self._sign:
-            # Somebody else's, who works in the same directory.
-            self._is_alive = True
-        elif is_surely_dead(sign) or time.monotonic() - self._seen > self._patience:
-            self._is_stopped = True
-            logger.info("The run in %s has no driver, and is ended.", self._folder.path)
-            self._folder.stop()
-            waiting = self._jobs.states(self._folder.submitted())
-            self._jobs.end([n for n, state in waiting.items() if state.is_waiting])
-
-    def tidy_up(self) -> None:
-        """Remove its folder, if nothing of it runs any more."""
-        if self._is_stopped:
-            submitted = self._folder.submitted()
-            states = self._jobs.states(submitted)
-            if all(n in states and states[n].is_over for n in submitted):
-                shutil.rmtree(self._folder.path, ignore_errors=True)
-
-
-class _Place:
-    """Where runs keep their folders, in a shared directory."""
-
-    def __init__(self, shared: Path) -> None:
-        self._shared = shared.absolute()
-        self._runs = self._shared / WORK_FOLDER
-        self._made = not self._shared.exists()
-        self._name = f"{_FOLDER_PREFIX}{secrets.token_hex(4)}"
-
-    def make(self, hosted: HostedWork, payload: bytes | None) -> JobFolder:
-        """Return the folder of a new run.
-
-        Raises:
-            DirectoryNotWritable: it cannot be made.
-        """
-        try:
-            return JobFolder.make(self._runs / self._name, hosted, payload)
-        except OSError as error:
-            raise DirectoryNotWritable(self._shared, error.strerror) from error
-
-    def others(self) -> list[JobFolder]:
-        """Return the folders of other runs."""
-        return [
-            JobFolder(path)
-            for path in sorted(self._runs.glob(f"{_FOLDER_PREFIX}*"))
-            if path.name != self._name and (path / "driver.json").exists()
-        ]
-
-    def tidy_up(self, *, keep: bool) -> None:
-        """Remove the run's folder, but for its logs where they are kept.
-
-        What this run has made above it goes with it, where nothing else is there.
-        """
-        folder = JobFolder(self._runs / self._name)
-        if keep:
-            for path in folder.path.iterdir():
-                if path == folder.logs:
-                    continue
-                if path.is_dir():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    path.unlink(missing_ok=True)
-            logger.warning("What Slurm jobs have said is in %s.", folder.logs)
-        else:
-            shutil.rmtree(folder.path, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            self._runs.rmdir()
-            if self._made:
-                self._shared.rmdir()
-
-
 def _abandon(
     folder: JobFolder, jobs: ClusterJobs, sign: DriverSign, owner: int
 ) -> None:
@@ -762,14 +452,6 @@ def _abandon(
     submitted = folder.submitted()
     states = jobs.states(submitted)
     jobs.end([n for n in submitted if n not in states or not states[n].is_over])
-
-
-def _job_of(host: str) -> str:
-    return host.rpartition("-")[0]
-
-
-def _begun(host: str) -> int:
-    return int(host.rpartition("-")[2])
 
 
 def _sharing(share: GpuShare) -> int:

@@ -46,6 +46,8 @@ _MOST_OF_ARRAY = 10_000
 _LOG_LEVEL = "SUBMITIT_LOG_LEVEL"
 _SECONDS_FOR_COMMAND = 60.0
 _SECONDS_TO_DIE = 5.0
+# What Python and its libraries take until the host begins, from a slow disk.
+_SECONDS_TO_START = 5.0
 _FINEST_LOOK = 0.05
 
 _WAITING = frozenset(
@@ -323,7 +325,7 @@ class _Submission:
         self._arguments = (
             str(folder.path),
             request.workers,
-            request.notice_s,
+            60.0 * request.time_min,
             pace,
         )
         self.jobs: dict[str, Any] = {}
@@ -351,7 +353,7 @@ class _Submission:
         return path
 
 
-def _serve_in_job(folder: str, workers: int, notice_s: float, pace: Pace) -> None:
+def _serve_in_job(folder: str, workers: int, limit_s: float, pace: Pace) -> None:
     """Be a host; this is what submitit runs in a Slurm job."""
     environment = _submitit().JobEnvironment()
     # A job that Slurm begins again has the number that it had.
@@ -360,14 +362,14 @@ def _serve_in_job(folder: str, workers: int, notice_s: float, pace: Pace) -> Non
     # at its own signal.
     with heard_signals(
         end=[signal.SIGTERM, signal.SIGINT, signal.SIGHUP],
-        end_soon=[signal.Signals[f"SIG{environment.USR_SIG}"]],
+        end_soon=signal.Signals[f"SIG{environment.USR_SIG}"],
     ) as notice:
         serve(
             JobFolder(Path(folder)),
             host=f"{environment.job_id}-{begun}",
             workers=workers,
             notice=notice,
-            notice_s=notice_s,
+            limit_s=limit_s - _SECONDS_TO_START,
             pace=pace,
         )
 
