@@ -50,7 +50,7 @@ CONFINED = {
     "scipy": {"evaluation"},
     "matplotlib": {"reporting"},
     "rich": {"commands", "monitors"},
-    "ray": {"engines.ray"},
+    "ray": {"engines.ray_connection", "engines.ray_worker"},
     "submitit": {"engines.slurm_jobs"},
 }
 

@@ -31,6 +31,7 @@ __all__ = ["RayEngine", "RayRun"]
 logger = logging.getLogger(__name__)
 
 _ENDS_AT_ONCE = 2
+_NO_MJREC = "No module named 'mjrec"
 _LONGEST_WAIT_S = 1.0
 # Ray ends this process after 60 seconds without its cluster, and says nothing of ours.
 _SECONDS_OF_SILENCE = 30.0
@@ -312,7 +313,8 @@ class RayRun:
 
     def _replace(self, seat: _Seat, error: Exception) -> None:
         """See what is to be done about a worker that is gone."""
-        if getattr(error, "actor_init_failed", False):
+        # Where its class cannot be imported, Ray does not say so otherwise.
+        if getattr(error, "actor_init_failed", False) or _NO_MJREC in str(error):
             self._dismiss(seat)
             raise Error(_why_none_can_begin(error)) from error
         if self._is_nobodys_fault(seat, error):
@@ -461,7 +463,7 @@ def _how_it_ended(error: Exception) -> str:
 
 def _why_none_can_begin(error: Exception) -> str:
     told = str(error).strip()
-    if "No module named 'mjrec" in told:
+    if _NO_MJREC in told:
         return (
             "Ray's workers have no mjrec: install it on all machines of the cluster, "
             "for the Python that runs Ray there, in the version that is here "

@@ -14,6 +14,7 @@ import logging
 import os
 import secrets
 import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -33,6 +34,7 @@ _TOKEN_PATH = "RAY_AUTH_TOKEN_PATH"
 _SMALLEST_STORE = 80 << 20
 _SECONDS_BETWEEN_LOOKS = 2.0
 _SECONDS_TO_STOP = 1.0
+_SECONDS_TO_REACH = 10.0
 
 
 def import_ray() -> Any:
@@ -173,12 +175,25 @@ def _connect(ray: Any, address: str | None, cpus: int | None, payload: int) -> N
             if address is None or address == "local":
                 _start(ray, cpus or usable_cpus(), payload)
             else:
+                _check_reachable(address)
                 ray.init(address=address, logging_level=logging.WARNING)
     # Ray has no class of its own for what goes wrong here.
     except Exception as error:
         with contextlib.suppress(Exception):
             ray.shutdown()
         raise Error(_why_not(address, error)) from error
+
+
+def _check_reachable(address: str) -> None:
+    """Raise OSError where nobody listens; Ray would try it for minutes."""
+    if address == "auto":
+        # What Ray has noted of a cluster that need not run any more; a private name.
+        with contextlib.suppress(ImportError, AttributeError):
+            services = importlib.import_module("ray._private.services")
+            address = services.canonicalize_bootstrap_address(address) or ""
+    host, colon, port = address.rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host, int(port)), _SECONDS_TO_REACH).close()
 
 
 def _why_not(address: str | None, error: Exception) -> str:
@@ -209,10 +224,12 @@ def _private_environment() -> dict[str, str]:
         "RAY_USAGE_STATS_ENABLED": "0",
         # Workers that were given no GPU see what they would without Ray.
         "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+        # Processes of jobs end by themselves, when they have closed their files.
+        "RAY_kill_child_processes_on_worker_exit": "0",
     }
     known = (
-        _TOKEN in os.environ
-        or _TOKEN_PATH in os.environ
+        os.environ.get(_TOKEN)
+        or os.environ.get(_TOKEN_PATH)
         or (Path.home() / ".ray" / "auth_token").exists()
     )
     if not known:

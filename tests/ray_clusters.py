@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ray clusters of several nodes on this machine, for tests."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ray
+from ray.cluster_utils import Cluster
+
+__all__ = [
+    "MARK",
+    "SMALL_STORE",
+    "cluster_of",
+    "home_for_ray",
+    "is_gone",
+    "ray_processes",
+    "wait_until",
+]
+
+MARK = "MJREC_TEST_OF_RAY"
+SMALL_STORE = 80 << 20
+
+
+@contextlib.contextmanager
+def home_for_ray(home: Path) -> Iterator[None]:
+    """Let Ray start from an empty home, and see that nothing of it is left."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOME", str(home))
+        patch.setenv(MARK, str(os.getpid()))
+        patch.setenv("RAY_AUTH_TOKEN", "0" * 64)
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        patch.delenv("RAY_ADDRESS", raising=False)
+        yield
+    assert not ray.is_initialized()
+    assert not list(home.iterdir())
+    mark = f"{MARK}={os.getpid()}"
+    wait_until(lambda: not ray_processes(mark), told=lambda: ray_processes(mark))
+
+
+@contextlib.contextmanager
+def cluster_of(*nodes: dict[str, Any]) -> Iterator[Cluster]:
+    """Have a cluster with a head on which nothing runs, and such nodes."""
+    head = {
+        "num_cpus": 0,
+        "include_dashboard": False,
+        "object_store_memory": SMALL_STORE,
+    }
+    cluster = Cluster(initialize_head=True, head_node_args=head)
+    try:
+        for node in nodes:
+            cluster.add_node(object_store_memory=SMALL_STORE, **node)
+        yield cluster
+    finally:
+        cluster.shutdown()
+
+
+def wait_until(
+    holds: Callable[[], Any],
+    *,
+    seconds: float = 30,
+    told: Callable[[], Any] = lambda: "it has not come to hold",
+) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline, told()
+        time.sleep(0.05)
+
+
+def is_gone(pid: int) -> bool:
+    return not Path(f"/proc/{pid}").exists()
+
+
+def ray_processes(mark: str) -> list[str]:
+    """Return the commands of processes in whose environment something stands."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name == str(os.getpid()):
+            continue
+        with contextlib.suppress(OSError):
+            if mark.encode() in (process / "environ").read_bytes():
+                command = (process / "cmdline").read_bytes().replace(b"\0", b" ")
+                found.append(command.decode(errors="replace"))
+    return found
