@@ -30,7 +30,7 @@ from .tables import table_of
 # Modules of this package, imported after the choice of OpenGL: some import mujoco.
 MEASUREMENTS = (
     *("stepping", "time_to_video", "memory", "rendering", "disk", "encoding"),
-    *("verifying", "evaluating", "reporting", "scaling"),
+    *("verifying", "evaluating", "reporting", "scaling", "engines"),
 )
 
 

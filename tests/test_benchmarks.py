@@ -15,6 +15,7 @@ import pytest
 from benchmarks import (
     disk,
     encoding,
+    engines,
     evaluating,
     memory,
     rendering,
@@ -235,6 +236,14 @@ def test_scaling_compares_many_monitors_with_fewer() -> None:
     kept = promised(readers)
     assert kept["4 monitors"] == "≤ 3"
     assert kept["4 monitors, peak memory"] == "≤ 30.048"
+    assert all(r.median > 0 for r in results)
+
+
+def test_engines_gives_what_an_engine_adds() -> None:
+    """How soon there is a worker, how fast jobs go, and how large a worker is."""
+    settings = engines.Settings(rounds=1, workers=(2,), jobs=20)
+    results = engines.measure(settings, silently)
+    assert [r.unit for r in results] == ["s", "jobs/s", "MB"]
     assert all(r.median > 0 for r in results)
 
 

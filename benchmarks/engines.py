@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an engine adds to the work that it hands out."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mjrec.engines.local import LocalEngine
+from mjrec.engines.work import Job, Work
+
+from .children import call
+from .process_memory import peak_memory
+from .results import Result
+from .rounds import Say, take_turns
+
+__all__ = ["FULL", "QUICK", "TITLE", "Idle", "Settings", "measure"]
+
+TITLE = "Engines: jobs in which nothing is done, in processes of this machine"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How much is measured.
+
+    Attributes:
+        rounds: of all variants.
+        workers: how many there are, each time more.
+        jobs: that are handed out.
+    """
+
+    rounds: int = 5
+    workers: tuple[int, ...] = (1, 2, 8)
+    jobs: int = 10_000
+
+
+FULL = Settings()
+QUICK = Settings(rounds=3, jobs=1000)
+
+
+def measure(settings: Settings, say: Say) -> list[Result]:
+    """Return how soon workers are there, how fast jobs go, and what workers take."""
+    samples = take_turns(
+        {
+            count: functools.partial(call, hand_out, workers=count, jobs=settings.jobs)
+            for count in settings.workers
+        },
+        rounds=settings.rounds,
+        say=say,
+    )
+    return [
+        Result(
+            subject=f"{count} worker" + "s" * (count > 1),
+            variant=variant,
+            unit=unit,
+            samples=tuple(sample[index] for sample in samples[count]),
+        )
+        for count in settings.workers
+        for index, (variant, unit) in enumerate(
+            (
+                ("first outcome", "s"),
+                ("outcomes", "jobs/s"),
+                ("memory of a worker", "MB"),
+            )
+        )
+    ]
+
+
+class Idle:
+    """Does nothing, with all loaded that an evaluation's worker loads.
+
+    Args:
+        settings: none.
+        payload: none.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], payload: bytes | None) -> None:
+        # Here, because whoever hands out the work loads none of it.
+        import gymnasium
+
+        import mjrec.evaluation.worker
+
+        del settings, payload, mjrec
+        gymnasium.make("InvertedPendulum-v5").reset()
+
+    def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return how much memory the worker has had."""
+        del arguments
+        return {"peak": peak_memory()}
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def hand_out(workers: int, jobs: int) -> list[float]:
+    """Return seconds to the first outcome, outcomes per second, and MB of a worker."""
+    start = time.perf_counter()
+    work = Work(entry=f"{__name__}:{Idle.__name__}")
+    with LocalEngine(workers).begin(work) as run:
+        run.submit(Job(key="first", arguments={}))
+        outcome = next(iter(run.results()))
+        assert outcome is not None
+        first = time.perf_counter() - start
+        for number in range(jobs):
+            run.submit(Job(key=str(number), arguments={}))
+        # Until all workers are there.
+        results = run.results()
+        for _ in range(jobs // 2):
+            next(results)
+        begin = time.perf_counter()
+        rest = sum(1 for _ in results)
+        seconds = time.perf_counter() - begin
+    peak: float = (outcome.value or {})["peak"]
+    return [first, rest / seconds, peak]
