@@ -21,6 +21,9 @@ from mjrec.engines.slurm import DEFAULT_WORKERS, SlurmEngine
 from mjrec.engines.work import WORK_FOLDER, Engine, Job, JobOutcome, Run, Work
 from mjrec.errors import ClosedError, Error, InvalidArgument, MissingDependency
 from mjrec.machine import usable_cpus
+from test_evaluating import SLOW, contents, ended, recorded_in
+from test_evaluating import begun as begun_in
+from test_evaluating import run as run_small
 
 pytest.importorskip("submitit")
 
@@ -619,18 +622,50 @@ assert "SUBMITIT_LOG_LEVEL" not in os.environ
 
 
 def test_an_evaluation_in_slurm_jobs_is_that_of_this_machine(tmp_path: Path) -> None:
-    """Byte for byte, however its jobs were handed out."""
-    options: dict[str, Any] = {
-        "tasks": ["InvertedPendulum-v5"],
-        "policy": "random",
-        "episodes": 2,
-        "num_seeds": 2,
-        "keep": "none",
-        "max_steps": 5,
-    }
-    mjrec.evaluate(**options, directory=tmp_path / "here", workers=1)
-    mjrec.evaluate(**options, directory=tmp_path / "there", engine=engine(2))
-    for name in ("results.csv", "results.json"):
-        here, there = (tmp_path / place / name for place in ("here", "there"))
-        assert here.read_bytes() == there.read_bytes()
+    """Results, trajectories and videos, however their jobs were handed out."""
+    there = run_small(tmp_path / "there", keep="best", engine=engine(2), workers=None)
+    here = run_small(tmp_path / "here", keep="best")
+    assert contents(there.directory) == contents(here.directory)
+    assert recorded_in(there) == recorded_in(here)
+    assert len(recorded_in(there)) == 4 + 1
     assert not (tmp_path / "there" / WORK_FOLDER).exists()
+
+
+EVALUATION = """
+import sys
+from pathlib import Path
+import mjrec
+from mjrec.engines.job_folder import Pace
+from mjrec.engines.slurm import SlurmEngine
+
+engine = SlurmEngine(2, cluster="local")
+engine._pace = Pace(poll_s=0.05, look_s=0.1, beat_s=0.1)
+mjrec.evaluate(
+    ["InvertedPendulum-v5"], policy="slow_policy:Slow", directory=sys.argv[1],
+    episodes=6, num_seeds=4, max_steps=10, keep="none", resume=True, engine=engine,
+)
+"""
+
+
+def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path, mark: str) -> None:
+    """Of its driver; what is finished, by hosts that live on too, is not repeated."""
+
+    def evaluating(name: str) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            [sys.executable, "-c", EVALUATION, str(tmp_path / name)],
+            cwd=tmp_path,
+            env={**os.environ, **DRIVER_PATH},
+        )
+
+    (tmp_path / "slow_policy.py").write_text(SLOW)
+    killed = tmp_path / "killed"
+    with evaluating("killed") as driver:
+        until(lambda: ended(killed) >= 5)
+        driver.kill()
+    for name in ("killed", "whole"):
+        with evaluating(name) as driver:
+            assert driver.wait() == 0
+    assert contents(killed) == contents(tmp_path / "whole")
+    assert 24 <= begun_in(killed) <= 26
+    until(lambda: not marked(mark))
+    assert not (killed / WORK_FOLDER).exists()

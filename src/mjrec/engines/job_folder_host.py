@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from types import FrameType
 
+from ..errors import Error
 from ..gl.given_gpu import visible_gpus
 from .hosting import Host
 from .job_folder import HostState, JobFolder, Pace, TakenJob
@@ -110,6 +111,9 @@ def serve(
         notice: returns what signals have said.
         limit_s: how long from now on this process is let live.
         pace: how often it looks.
+
+    Raises:
+        Error: no worker can begin on this machine.
     """
     time_s = max(0.0, limit_s - SECONDS_TO_CLOSE - _SECONDS_LEFT)
     if folder.is_stopped:
@@ -131,6 +135,9 @@ def serve(
         why = serving.until_the_end()
     # Closed by now: whoever does these jobs next finds no file open.
     serving.give_back(why)
+    if serving.cannot_begin:
+        # Another host on this machine would fare no better: this end is a bad one.
+        raise Error("No worker can begin on this machine.")
     folder.note_host(host, HostState.ENDED)
 
 
@@ -161,7 +168,7 @@ class _Serving:
         # When each job was begun, by its key.
         self._begun: dict[str, float] = {}
         self._takes_more = True
-        self._cannot_begin = False
+        self.cannot_begin = False
         self._is_at_limit = False
 
     def until_the_end(self) -> str:
@@ -200,7 +207,7 @@ class _Serving:
             return "its Slurm job had to end"
         if self._driver.has_said_stop:
             return "the run is over"
-        if self._cannot_begin:
+        if self.cannot_begin:
             return "no worker could begin"
         if time.monotonic() - self._began > self._time_s:
             self._is_at_limit = True
@@ -257,7 +264,7 @@ class _Serving:
             return False
         said = json.loads(line)
         if "error" in said:
-            self._cannot_begin = True
+            self.cannot_begin = True
             for job in self._taken.values():
                 self._folder.answer(job, line)
             self._taken.clear()

@@ -51,6 +51,8 @@ class _SlurmJob:
     has_begun: bool = False
     takes_more: bool = True
     has_done_something: bool = False
+    # Of a job that Slurm begins again: the hosts that were in it before.
+    earlier_hosts: int = 0
 
 
 class SlurmHosts:
@@ -67,8 +69,10 @@ class SlurmHosts:
         self._jobs = jobs
         self._pace = pace
         self._all: dict[str, _SlurmJob] = {}
+        self._dead: dict[str, HostEnd] = {}
         self._ends_at_once = 0
         self._last_end = ""
+        self._any_was_taken = False
         self._refused = 0
         self._not_before = -math.inf
         self._why_said = -math.inf
@@ -88,11 +92,12 @@ class SlurmHosts:
             numbers = self._jobs.submit(missing)
         except NotSubmitted as error:
             self._refused += 1
-            if not self._all or self._refused >= _TRIES_TO_SUBMIT:
+            if not self._any_was_taken or self._refused >= _TRIES_TO_SUBMIT:
                 raise
             logger.warning("%s. It is tried again.", error)
             self._not_before = now + _SECONDS_BETWEEN_TRIES
             return
+        self._any_was_taken = True
         self._refused = 0
         logger.info("Submitted: %s.", ", ".join(numbers))
         self._all.update((n, _SlurmJob(number=n, submitted=now)) for n in numbers)
@@ -105,30 +110,33 @@ class SlurmHosts:
             self._ends_at_once = 0
 
     def look(self) -> dict[str, HostEnd]:
-        """See what became of all; return hosts that have died, and how."""
+        """See what became of all; return hosts that have died so far, and how.
+
+        Again and again, because what they had taken may not be seen at once.
+        """
         states = self._jobs.states(self._all)
         hosts = self._folder.hosts()
-        dead: dict[str, HostEnd] = {}
         for number, state in states.items():
             ours = sorted((h for h in hosts if _job_of(h) == number), key=_begun)
             self._note(self._all[number], state, [hosts[host] for host in ours])
             last = ours if state.is_over or state.is_waiting else ours[:-1]
             end = self._end_of(number, state)
-            dead |= {host: end for host in last if hosts[host] is not HostState.ENDED}
+            for host in last:
+                if hosts[host] is not HostState.ENDED:
+                    self._dead.setdefault(host, end)
             if state.is_over:
                 self._see_off(number, end, said=[hosts[host] for host in ours])
         self._say_why_none_begins(states)
-        return dead
+        return self._dead
 
     def check(self) -> None:
         """Raise where hosts end again and again without having done anything.
 
         Raises:
-            Error: they do, and there are no others.
+            Error: they do, and there are no others at work.
         """
-        if self._ends_too_often and not any(
-            job.has_done_something for job in self._all.values()
-        ):
+        others = any(job.has_begun and job.takes_more for job in self._all.values())
+        if self._ends_too_often and not others:
             raise Error(
                 f"No Slurm job can do anything. The last one {self._last_end} Their "
                 f"logs are in {self._folder.logs}."
@@ -154,11 +162,11 @@ class SlurmHosts:
     def _note(
         self, job: _SlurmJob, state: JobState, hosts: Sequence[HostState]
     ) -> None:
-        job.has_begun = job.has_begun or bool(hosts)
-        # One that begins again, begins to take jobs again.
-        job.takes_more = state.is_waiting or not (
-            state.is_over or (hosts and hosts[-1] is not HostState.WORKING)
-        )
+        if state.is_waiting:
+            job.earlier_hosts = len(hosts)
+        now = hosts[job.earlier_hosts :]
+        job.has_begun = bool(now)
+        job.takes_more = not now or now[-1] is HostState.WORKING
 
     def _end_of(self, number: str, state: JobState) -> HostEnd:
         how = f"was in the Slurm job {number}, which is {state.name}."

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Of the Slurm engine, what only Slurm can show."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mjrec.engines.job_folder import Pace
+from mjrec.engines.slurm import SlurmEngine
+from mjrec.engines.work import WORK_FOLDER, Job, Run, Work
+from mjrec.errors import Error
+from slurm_cluster import lack_of_slurm, slurm_cluster
+
+pytest.importorskip("submitit")
+
+lack = lack_of_slurm()
+if lack and os.environ.get("MJREC_TEST_SLURM") != "1":
+    pytest.skip(lack, allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def configuration(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with slurm_cluster(tmp_path_factory.mktemp("slurm")) as path:
+        yield path
+
+
+@pytest.fixture(autouse=True)
+def cluster(configuration: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Nothing is left in its queue by any test."""
+    monkeypatch.setenv("SLURM_CONF", str(configuration))
+    yield
+    until(lambda: not asked("squeue", "--noheader"))
+
+
+def until(is_so: Callable[[], object], *, seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < deadline, "it has not come about"
+        time.sleep(0.02)
+
+
+def asked(*command: str) -> str:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert not done.returncode, (command, done.stderr)
+    return done.stdout.strip()
+
+
+def engine(workers: int = 1, **options: Any) -> SlurmEngine:
+    made = SlurmEngine(workers, **options)
+    made._pace = Pace(poll_s=0.05, look_s=0.5, beat_s=0.5)
+    return made
+
+
+def work(place: Path) -> Work:
+    return Work(
+        entry="odd_jobs:make",
+        settings={"closed": str(place / "closed")},
+        shared_directory=place / "shared",
+    )
+
+
+def hold(place: Path) -> Job:
+    arguments = {"do": "hold", "begun": str(place / "begun")}
+    return Job(key="held", arguments=arguments)
+
+
+def wait_for(path: Path, run: Run) -> str:
+    """Return the number of the process that has begun a job, which notes it there."""
+    for _ in run.results(patience_s=0.02):
+        if path.exists() and path.read_text():
+            break
+    return path.read_text()
+
+
+def lines(path: Path) -> list[str]:
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def slurm_job() -> str:
+    """Return the only one that runs."""
+    return asked("squeue", "--noheader", "--array", "--states=running", "--format=%i")
+
+
+def test_jobs_are_done_in_slurm_jobs(tmp_path: Path) -> None:
+    """Which are submitted as one array, and have completed at the end."""
+    with engine(3).begin(work(tmp_path)) as run:
+        for number in range(50):
+            run.submit(Job(key=str(number), arguments={"do": "where"}))
+        found = [outcome for outcome in run.results() if outcome is not None]
+        submitted = {path.name for path in (tmp_path / "shared").rglob("submitted/*")}
+    assert len(found) == 50
+    assert not [outcome.failure for outcome in found if outcome.failure]
+    [array] = {number.partition("_")[0] for number in submitted}
+    assert submitted == {f"{array}_{n}" for n in range(3)}
+    states = asked("squeue", "--noheader", "--states=all", "-j", array, "--format=%T")
+    assert set(states.split()) == {"COMPLETED"}
+    assert not (tmp_path / "shared").exists()
+
+
+@pytest.mark.parametrize("how", ["preempted", "cancelled", "killed"])
+def test_a_slurm_job_that_is_ended(
+    tmp_path: Path, how: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Files are closed where there is time; what it was at is done in another."""
+    with engine(partition="low").begin(work(tmp_path)) as run:
+        run.submit(hold(tmp_path))
+        wait_for(tmp_path / "begun", run)
+        first = slurm_job()
+        (tmp_path / "begun").unlink()
+        if how == "preempted":
+            # Needs the whole machine for a moment.
+            asked("srun", "--partition=high", "--cpus-per-task=4", "true")
+        else:
+            options = ["--signal=KILL", "--full"] if how == "killed" else []
+            asked("scancel", *options, first)
+        until(
+            lambda: wait_for(tmp_path / "begun", run) and slurm_job() not in (first, "")
+        )
+    assert "No Slurm job" not in caplog.text
+    assert lines(tmp_path / "closed")
+
+
+def test_what_slurm_refuses(tmp_path: Path) -> None:
+    """The error has its words."""
+    with engine(partition="none").begin(work(tmp_path)) as run:
+        run.submit(hold(tmp_path))
+        with pytest.raises(Error, match=r"No job could be submitted: .*partition"):
+            next(run.results())
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+import test_slurm_cluster
+place = Path(sys.argv[1])
+run = test_slurm_cluster.engine(2).begin(test_slurm_cluster.work(place))
+run.submit(test_slurm_cluster.hold(place))
+next(run.results())
+"""
+
+
+def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None:
+    """Those that wait in the queue too."""
+    driver = subprocess.Popen(
+        [sys.executable, "-c", DRIVER, str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+    )
+    with driver:
+        until(lambda: lines(tmp_path / "begun"))
+        driver.kill()
+    [pid] = lines(tmp_path / "begun")
+    with engine().begin(work(tmp_path)) as run:
+        until(lambda: pid in lines(tmp_path / "closed"))
+        run.submit(Job(key="a", arguments={"do": "echo"}))
+        assert next(run.results()) is not None
+        until(lambda: len(asked("squeue", "--noheader").splitlines()) == 1)
+    assert not (tmp_path / "shared" / WORK_FOLDER).exists()
+
+
+def test_an_evaluation_whose_driver_is_in_a_slurm_job(tmp_path: Path) -> None:
+    """What that was given is not what its Slurm jobs ask for; the bytes are equal."""
+    command = [
+        *(sys.executable, "-m", "mjrec", "evaluate", "InvertedPendulum-v5"),
+        *("--policy", "random", "--keep", "none"),
+        *("--episodes", "2", "--num-seeds", "2", "--max-steps", "5"),
+    ]
+    asked(*command, "--out", str(tmp_path / "here"))
+    small_job = ("srun", "--cpus-per-task=1", "--mem-per-cpu=10")
+    there = str(tmp_path / "there")
+    asked(*small_job, *command, "--out", there, "--engine", "slurm", "--workers", "2")
+    for name in ("results.csv", "results.json"):
+        one, other = (tmp_path / place / name for place in ("here", "there"))
+        assert one.read_bytes() == other.read_bytes()
