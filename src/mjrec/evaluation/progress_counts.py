@@ -9,10 +9,8 @@ where looking takes long it is done less often.
 from __future__ import annotations
 
 import contextlib
-import fnmatch
 import json
 import math
-import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -29,7 +27,7 @@ _ENDED = b'{"ended"'
 _NO_FAILURE = b'"failure": null'
 _BATCH = b'{"batch"'
 
-_LEDGER = re.compile(fnmatch.translate(LEDGER_PATTERN))
+_BEGIN, _, _END = LEDGER_PATTERN.partition("*")
 
 # What takes less may be done at any time; what takes more has a twentieth of the time.
 _SHORT_S = 0.02
@@ -62,8 +60,8 @@ class LedgerCounts:
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._folders = list(folders)
-        self._read: dict[Path, _Read] = {}
+        # By the names of ledgers, of which a path is made only to read one.
+        self._read: dict[Path, dict[str, _Read]] = {path: {} for path in folders}
         self._done = 0
         self._failed = 0
         self._clock = clock
@@ -77,18 +75,17 @@ class LedgerCounts:
         """
         begin = self._clock()
         if begin >= self._rests_until:
-            for folder in self._folders:
-                for path in _ledgers(folder):
-                    self._look_at(path)
+            for folder, known in self._read.items():
+                for name in _ledgers(folder):
+                    read = known.setdefault(name, _Read())
+                    if not read.is_over:
+                        self._look_at(folder / name, read)
             end = self._clock()
             if end - begin > _SHORT_S:
                 self._rests_until = end + _REST * (end - begin)
         return self._done, self._failed
 
-    def _look_at(self, path: Path) -> None:
-        read = self._read.setdefault(path, _Read())
-        if read.is_over:
-            return
+    def _look_at(self, path: Path, read: _Read) -> None:
         done, failed = read.done, read.failed
         with contextlib.suppress(OSError):
             _read_on(path, read)
@@ -96,12 +93,13 @@ class LedgerCounts:
         self._failed += read.failed - failed
 
 
-def _ledgers(folder: Path) -> Iterator[Path]:
-    # Not `glob`, which makes a path of each of the other files, too.
-    with contextlib.suppress(FileNotFoundError):
+def _ledgers(folder: Path) -> Iterator[str]:
+    # Not `glob`, which makes a path of each of the other files, too. It is only for a
+    # bar: a folder may not be there yet.
+    with contextlib.suppress(OSError):
         for name in names_in(folder):
-            if _LEDGER.match(name):
-                yield folder / name
+            if name.startswith(_BEGIN) and name.endswith(_END):
+                yield name
 
 
 def _read_on(path: Path, read: _Read) -> None:
