@@ -1,0 +1,34 @@
+"""Evaluate in the jobs of a Slurm cluster; without one, in processes in their place."""
+
+import shutil
+from pathlib import Path
+
+import mjrec
+
+PLACE = Path("recordings/slurm_cluster")
+
+
+def main() -> None:
+    shutil.rmtree(PLACE, ignore_errors=True)
+    # On a cluster: cluster=None, partition="gpu", gpus=0.25, workers=64 ...
+    engine = mjrec.SlurmEngine(workers=2, cluster="local")
+    evaluation = mjrec.evaluate(
+        ["InvertedPendulum-v5", "Hopper-v5"],
+        policy="random",
+        # A directory that all machines of the cluster see.
+        directory=PLACE,
+        engine=engine,
+        episodes=2,
+        num_seeds=2,
+        max_steps=50,
+        height=120,
+        width=160,
+    )
+    for summary in evaluation.summaries:
+        print(f"{summary.task}: mean return {summary.mean:.3g}")
+    for video in evaluation.videos:
+        print(video)
+
+
+if __name__ == "__main__":
+    main()
