@@ -42,7 +42,10 @@ def home_for_ray(home: Path) -> Iterator[None]:
     assert not ray.is_initialized()
     assert not list(home.iterdir())
     mark = f"{MARK}={os.getpid()}"
-    wait_until(lambda: not ray_processes(mark), told=lambda: ray_processes(mark))
+    # Where its driver was killed, an agent of Ray's looks for it for most of a minute.
+    wait_until(
+        lambda: not ray_processes(mark), seconds=90, told=lambda: ray_processes(mark)
+    )
 
 
 @contextlib.contextmanager
