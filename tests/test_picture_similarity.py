@@ -15,6 +15,7 @@ from mjrec.evidence.verifying.decoded_video import DecodedVideo
 from mjrec.evidence.verifying.difference_picture import difference_picture, png
 from mjrec.evidence.verifying.likeness import OTHER_ENCODER, OTHER_RENDERER, Likeness
 from mjrec.evidence.verifying.picture_similarity import (
+    but_for_shadows,
     frame_of,
     planes_of,
     similarity,
@@ -135,3 +136,27 @@ def test_a_png_is_read_by_others() -> None:
     """Pillow reads what was written, pixel by pixel."""
     frame = noise(33, 47)
     assert np.array_equal(np.array(Image.open(io.BytesIO(png(frame)))), frame)
+
+
+def test_a_shadow_is_taken_away_whichever_picture_it_is_in() -> None:
+    """A patch of any colours that is darker in one picture counts as equal."""
+    lit = noise()
+    shaded = lit.copy()
+    shaded[8:16, 8:24] = shaded[8:16, 8:24] // 4
+    for one, other in ((lit, shaded), (shaded, lit)):
+        unshadowed, share = but_for_shadows(planes_of(one), planes_of(other))
+        assert similarity(planes_of(one), planes_of(other)).block > 50
+        assert similarity(planes_of(one), unshadowed).block < 20
+        # A part of it is too dark already to get much darker.
+        assert 0.02 < share <= 8 * 16 / (48 * 64)
+
+
+def test_another_colour_is_no_shadow() -> None:
+    """Red instead of green stays, however dark."""
+    green = np.zeros((48, 64, 3), np.uint8)
+    green[...] = (20, 200, 20)
+    red = green.copy()
+    red[8:16, 8:24] = (90, 10, 10)
+    unshadowed, share = but_for_shadows(planes_of(green), planes_of(red))
+    assert share == 0
+    assert similarity(planes_of(red), unshadowed).block == 0

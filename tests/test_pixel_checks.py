@@ -24,6 +24,7 @@ from conftest import Corridor, run_episodes
 from mjrec.evidence.verification import Check, Verdict
 from mjrec.evidence.verifying.pixel_checks import check_pixels
 from mjrec.evidence.verifying.task import Task
+from mjrec.gl import probe
 
 STEPS = 6
 DECODES, PACED, DRAWN, ENCODED, ALIKE = range(5)
@@ -35,6 +36,15 @@ CLAIMS = (
     "the shipped frames show the pictures drawn",
 )
 PASS, FAIL, OPEN = Verdict.PASS, Verdict.FAIL, Verdict.NOT_CHECKABLE
+
+
+def is_gpu() -> bool:
+    return not probe("egl").software
+
+
+needs_mesa = pytest.mark.skipif(
+    "is_gpu()", reason="only Mesa has another rasteriser to choose"
+)
 
 
 def record(directory: Path, *, episodes: int = 1, **options: Any) -> Path:
@@ -207,6 +217,7 @@ def test_who_names_another_driver_is_left_with_little_room(alone: Path) -> None:
     assert checks[0, ALIKE].figures["worst_frame"] == 4
 
 
+@needs_mesa
 def test_the_same_software_on_another_cpu_may_differ_by_roundings(alone: Path) -> None:
     """What a CPU of another maker draws has other bits, and is no forgery."""
     changed = [frame ^ np.uint8(1) for frame in drawn(alone)]
@@ -220,6 +231,7 @@ def test_the_same_software_on_another_cpu_may_differ_by_roundings(alone: Path) -
     assert verdicts(alone) == [PASS, PASS, OPEN, OPEN, FAIL]
 
 
+@needs_mesa
 def test_an_honest_video_that_another_driver_drew(
     alone: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -236,6 +248,28 @@ def test_an_honest_video_that_another_driver_drew(
     assert checks[0, ALIKE].figures["unnoticed_square"] < 4
 
 
+def test_a_shadow_of_another_driver_is_no_forgery(alone: Path) -> None:
+    """Where only the light differs nobody can tell, in a small part of a picture."""
+    for side, verdict in ((10, OPEN), (16, FAIL)):
+        # As another driver draws: no picture is the same to the last bit.
+        frames = [frame ^ np.uint8(1) for frame in drawn(alone)]
+        frames[4][4 : 4 + side, 8 : 8 + side] //= 8
+        forge(video(alone), frames)
+        say(video(alone), gl_renderer="a card that is not here")
+        checks = found(alone)
+        assert checks[0, ALIKE].verdict is verdict
+        assert ("in shadow" in checks[0, ALIKE].reason) is (verdict is OPEN)
+
+
+def test_a_shadow_of_the_same_driver_is_a_forgery(alone: Path) -> None:
+    """What drew the pictures draws the same shadows again."""
+    frames = [frame.copy() for frame in drawn(alone)]
+    frames[4][4:14, 8:18] //= 8
+    forge(video(alone), frames)
+    assert verdicts(alone)[ALIKE] is FAIL
+
+
+@needs_mesa
 def test_another_pose_is_noticed_with_another_driver(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

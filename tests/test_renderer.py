@@ -25,12 +25,22 @@ from mjrec.errors import (
     InvalidFrame,
     UnknownName,
 )
+from mjrec.gl import probe
 from mjrec.simulation import gl_thread
 from mjrec.simulation.gl_strings import current_gl_strings
 from mjrec.simulation.gl_thread import GLThread
 from mjrec.simulation.renderer import SceneRenderer
 
 ASSETS = Path(__file__).parents[1] / "assets"
+
+
+def is_gpu() -> bool:
+    return not probe("egl").software
+
+
+needs_time = pytest.mark.skipif(
+    "is_gpu()", reason="a GPU is done before the signal comes"
+)
 SIZE: dict[str, Any] = {"height": 50, "width": 70}
 
 # Small shadow map: most of the time of a small picture goes there.
@@ -737,6 +747,7 @@ def test_leaving_without_closing_is_silent(order: str) -> None:
     assert "mjrec" not in done.stderr
 
 
+@needs_time
 def test_leaving_in_the_midst_of_a_picture_is_silent() -> None:
     """Ctrl-C while the driver draws: it is waited for before EGL is shut down."""
     script = f"""
@@ -908,6 +919,7 @@ def test_what_ctrl_c_interrupted_is_waited_for(thread: GLThread) -> None:
     assert thread.call(lambda: 3) == 3
 
 
+@needs_time
 def test_a_picture_after_ctrl_c_is_right() -> None:
     """It is not the one that was given up."""
     model, data = load("showcase")

@@ -41,7 +41,7 @@ class Painter:
         plain: whether to leave the white pixel out.
     """
 
-    gl_strings = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
+    gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
 
     def __init__(
         self, size: tuple[int, int] = (16, 24), *, plain: bool = False

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..frames import check_size
 from ..simulation.cameras import raw_model, resolve_camera
-from ..simulation.gl_strings import current_gl_strings
+from ..simulation.gl_strings import current_gl_facts
 from ..simulation.scene_pictures import (
     Look,
     ScenePictures,
@@ -99,7 +99,7 @@ class PhysicsPictures:
             "camera": camera_label(raw_model(physics.model), self._camera),
         }
         with physics.contexts.gl.make_current() as context:
-            facts.update(context.call(current_gl_strings))
+            facts.update(context.call(current_gl_facts))
         return facts
 
     def close(self) -> None:

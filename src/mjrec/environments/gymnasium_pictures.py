@@ -108,12 +108,12 @@ class EnvironmentPictures:
         simulated = simulation_in(self._env)
         viewer = getattr(_renderer(self._env), "viewer", None)
         if simulated is not None and viewer is not None:
-            from ..simulation.gl_strings import current_gl_strings
+            from ..simulation.gl_strings import current_gl_facts
             from ..simulation.scene_pictures import camera_label
 
             facts["camera"] = camera_label(simulated.model, viewer.cam)
             with _own_context(self._env):
-                facts.update(current_gl_strings())
+                facts.update(current_gl_facts())
         return facts
 
     def close(self) -> None:

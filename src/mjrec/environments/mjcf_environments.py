@@ -172,8 +172,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         facts = {"camera": camera_label(self.simulation.model, self.camera)}
         if self._renderer is None:
             return facts
-        names = ("gl_vendor", "gl_renderer", "gl_version")
-        return {**facts, **dict(zip(names, self._renderer.gl_strings, strict=True))}
+        return {**facts, **self._renderer.gl_facts}
 
     def close(self) -> None:
         """Close the renderer; idempotent."""

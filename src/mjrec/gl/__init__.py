@@ -9,16 +9,21 @@ from __future__ import annotations
 from .backends import BACKENDS
 from .choice import Choice, choose, use_gl
 from .diagnosis import Diagnosis, diagnose
-from .probing import EglDevice, Probe, probe
+from .egl_device import EglDevice
+from .given_gpu import GivenGpu, render_on_given_gpu, visible_gpus
+from .probing import Probe, probe
 
 __all__ = [
     "BACKENDS",
     "Choice",
     "Diagnosis",
     "EglDevice",
+    "GivenGpu",
     "Probe",
     "choose",
     "diagnose",
     "probe",
+    "render_on_given_gpu",
     "use_gl",
+    "visible_gpus",
 ]

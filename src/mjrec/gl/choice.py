@@ -18,7 +18,7 @@ from .backends import (
 from .diagnosis import Diagnosis
 from .probing import Probe, probe
 
-__all__ = ["Choice", "choose", "use_gl"]
+__all__ = ["Choice", "choose", "conflict_with", "set_backend", "use_gl"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ def use_gl(backend: str | None = None) -> str:
     if choice.probe.warning():
         _LOG.warning("%s", choice.probe.warning())
     _LOG.info("Using %s (%s).", choice.backend, choice.probe.gl_renderer)
-    _set_environment(choice.backend)
+    set_backend(choice.backend)
     return choice.backend
 
 
@@ -88,7 +88,7 @@ def choose(backend: str | None = None) -> Choice:
     asked, reason = _asked_for(backend)
     rejected: list[tuple[str, Diagnosis]] = []
     for candidate in [asked] if asked else BACKENDS:
-        conflict = _conflict(candidate)
+        conflict = conflict_with(candidate)
         if conflict:
             rejected.append((candidate, conflict))
             continue
@@ -108,7 +108,7 @@ def _asked_for(backend: str | None) -> tuple[str | None, str]:
     return None, "the first that renders"
 
 
-def _conflict(backend: str) -> Diagnosis | None:
+def conflict_with(backend: str) -> Diagnosis | None:
     """Return why this process cannot use `backend` any more, if so."""
     for package, taken in _taken().items():
         if taken == backend or (package == "PyOpenGL" and backend == "glfw"):
@@ -164,7 +164,8 @@ def _nothing_renders(
     return "\n".join([*lines, last])
 
 
-def _set_environment(backend: str) -> None:
+def set_backend(backend: str) -> None:
+    """Let `MUJOCO_GL` and `PYOPENGL_PLATFORM` say `backend`."""
     wanted = environment_for(backend, os.environ)
     for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM"):
         if name in wanted:

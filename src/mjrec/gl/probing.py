@@ -17,8 +17,9 @@ from typing import Any
 from ..machine import gpu_device_files
 from .backends import backend_name, environment_for
 from .diagnosis import Diagnosis, diagnose
+from .egl_device import EglDevice
 
-__all__ = ["EglDevice", "Probe", "probe", "probe_environment"]
+__all__ = ["Probe", "probe", "probe_environment"]
 
 # Drivers of machines with many GPUs take ten seconds and more to wake up.
 TIMEOUT = 60.0
@@ -27,26 +28,6 @@ TIMEOUT = 60.0
 _GRACE = 5.0
 _END_OF_OUTPUT = 4000
 _SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|SwiftShader|software", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class EglDevice:
-    """One of EGL's devices.
-
-    Attributes:
-        index: its place in EGL's list, which is what `MUJOCO_EGL_DEVICE_ID` means to
-            mujoco 3 (and to mujoco 4 where no device has a CUDA number).
-        device_file: for example `/dev/dri/renderD128`; empty where EGL does not tell.
-        cuda_id: CUDA's number of the same device; None where it has none.
-        software: whether it is the CPU.
-        in_use: whether the probe drew on it.
-    """
-
-    index: int
-    device_file: str
-    cuda_id: int | None
-    software: bool
-    in_use: bool
 
 
 @dataclass(frozen=True)
@@ -61,7 +42,7 @@ class Probe:
         gl_version: OpenGL's version, with the driver's.
         frames_per_second: 480x480 pictures of a small scene with MuJoCo's default
             quality, read back; None where it was not measured.
-        devices: EGL's devices, where it tells.
+        devices: EGL's devices, where it tells; also if none of them renders.
         cause: why it does not render.
         fix: what to do about it; empty where that is not known.
         output: the end of what the child process said, if it does not render.
@@ -108,7 +89,13 @@ class Probe:
         )
 
 
-def probe(backend: str, *, measure: bool = False, timeout: float = TIMEOUT) -> Probe:
+def probe(
+    backend: str,
+    *,
+    environ: Mapping[str, str] | None = None,
+    measure: bool = False,
+    timeout: float = TIMEOUT,
+) -> Probe:
     """Try `backend` as `use_gl` would set it; the answer is kept for this process.
 
     Another environment is another question: the answer is not used again after an
@@ -116,13 +103,16 @@ def probe(backend: str, *, measure: bool = False, timeout: float = TIMEOUT) -> P
 
     Args:
         backend: its name.
+        environ: the environment variables; this process's, if None.
         measure: measure its speed too.
         timeout: how many seconds to wait for the picture.
 
     Raises:
         UnknownName: there is no such backend.
     """
-    environ = environment_for(backend_name(backend), os.environ)
+    environ = environment_for(
+        backend_name(backend), os.environ if environ is None else environ
+    )
     key = (environ["MUJOCO_GL"], frozenset(environ.items()))
     known = _answers.get(key)
     if known and not (measure and known.renders and known.frames_per_second is None):
@@ -146,6 +136,7 @@ def probe_environment(
     """
     backend = environ["MUJOCO_GL"]
     facts, output = _ask_child(environ, measure=measure, timeout=timeout)
+    devices = tuple(EglDevice(**device) for device in facts.get("devices", ()))
     if facts.get("renders"):
         return Probe(
             backend=backend,
@@ -154,12 +145,13 @@ def probe_environment(
             gl_vendor=facts.get("gl_vendor", ""),
             gl_version=facts.get("gl_version", ""),
             frames_per_second=facts.get("frames_per_second"),
-            devices=tuple(EglDevice(**device) for device in facts.get("devices", ())),
+            devices=devices,
         )
     found = diagnose(output, backend=backend, environ=environ) or _unknown(output)
     return Probe(
         backend,
         False,
+        devices=devices,
         cause=found.cause,
         fix=found.fix,
         output=output[-_END_OF_OUTPUT:],

@@ -36,8 +36,8 @@ class Drawing(Protocol):
         """`(height, width)` of the pictures."""
 
     @property
-    def gl_strings(self) -> dict[str, str]:
-        """Who draws: `gl_vendor`, `gl_renderer`, `gl_version`."""
+    def gl_facts(self) -> dict[str, Any]:
+        """Who draws, and on which device: `gl_strings.current_gl_facts`."""
 
     def draw(self, index: int, *, out: Frame | None = None) -> Frame:
         """Return a picture, in `out` if that is given.
@@ -113,9 +113,9 @@ class TrajectoryDrawing:
         return self._pictures.size
 
     @property
-    def gl_strings(self) -> dict[str, str]:
-        """Who draws: `gl_vendor`, `gl_renderer`, `gl_version`."""
-        return self._pictures.gl_strings()
+    def gl_facts(self) -> dict[str, Any]:
+        """Who draws, and on which device: `gl_strings.current_gl_facts`."""
+        return self._pictures.gl_facts()
 
     def draw(self, index: int, *, out: Frame | None = None) -> Frame:
         """Return picture `index` of the trajectory, in `out` if that is given.
@@ -168,9 +168,9 @@ class StatesDrawing:
         return self._pictures.size
 
     @property
-    def gl_strings(self) -> dict[str, str]:
-        """Who draws: `gl_vendor`, `gl_renderer`, `gl_version`."""
-        return self._pictures.gl_strings()
+    def gl_facts(self) -> dict[str, Any]:
+        """Who draws, and on which device: `gl_strings.current_gl_facts`."""
+        return self._pictures.gl_facts()
 
     def draw(self, index: int, *, out: Frame | None = None) -> Frame:
         """Return the picture of row `index`, in `out` if that is given."""
@@ -251,9 +251,8 @@ class _Pictures:
         self._last = index
         return frame
 
-    def gl_strings(self) -> dict[str, str]:
-        vendor, renderer, version = self.eyes[0].renderer.gl_strings
-        return {"gl_vendor": vendor, "gl_renderer": renderer, "gl_version": version}
+    def gl_facts(self) -> dict[str, Any]:
+        return self.eyes[0].renderer.gl_facts
 
     def close(self) -> None:
         for eye in self.eyes:

@@ -249,7 +249,7 @@ def render_footage(
             **file_facts(file),
             **blank.facts(),
             **shot.facts,
-            **workers.gl_strings,
+            **workers.gl_facts,
         }
         _complete(file, metadata)
         return _Written(file=file, blank=blank)

@@ -148,7 +148,7 @@ class _Desk:
         self._ring.shape(*self._drawing.size)
         self._job = order["job"]
         self._answers.say(
-            job=self._job, size=self._drawing.size, gl=self._drawing.gl_strings
+            job=self._job, size=self._drawing.size, gl=self._drawing.gl_facts
         )
 
     def _close(self) -> None:

@@ -78,7 +78,7 @@ class DrawingWorkers:
             self._environ = with_all_models_trusted(self._environ)
         self._seats = [_Seat() for _ in range(count)]
         self._selector = selectors.DefaultSelector()
-        self._gl_strings: dict[str, str] = {}
+        self._gl_facts: dict[str, Any] = {}
         self._has_drawn = False
         self._job: _Job | None = None
         self._jobs = 0
@@ -86,9 +86,9 @@ class DrawingWorkers:
         self._process_id = os.getpid()
 
     @property
-    def gl_strings(self) -> dict[str, str]:
-        """Who draws: `gl_vendor`, `gl_renderer`, `gl_version`; empty before it did."""
-        return dict(self._gl_strings)
+    def gl_facts(self) -> dict[str, Any]:
+        """Who draws, as `gl_strings.current_gl_facts`; empty before anybody did."""
+        return dict(self._gl_facts)
 
     def frames(
         self,
@@ -284,7 +284,7 @@ class DrawingWorkers:
     ) -> None:
         if "size" in answer:
             seat.ring.shape(*answer["size"])
-            self._gl_strings = answer["gl"]
+            self._gl_facts = answer["gl"]
             return
         position = answer["position"]
         slot = seat.owes.pop(position)

@@ -12,13 +12,14 @@ goes to standard error.
     {"error": "ImportError: ..."}                 it does not render, or
     {"renders": true, "gl_renderer": ..., ...}    it does
     {"frames_per_second": 16.2}                   with --measure
-    {"devices": [...]}                            EGL's, where it tells
+    {"devices": [...]}                            EGL's, where it tells; in any case
 """
 
 from __future__ import annotations
 
 import argparse
 import ctypes
+import dataclasses
 import faulthandler
 import importlib
 import json
@@ -31,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from ..machine import gpu_device_files
+from .egl_devices import egl_devices
 from .gl_strings import current_gl_strings
 
 __all__ = ["check_picture", "main"]
@@ -114,6 +116,7 @@ def main() -> int:
         _draw_and_report(say, backend, measure=arguments.measure)
     except Exception as error:  # Whatever it is, it is the answer.
         say(notes=list(_notes(backend)), error=_text_of(error))
+        _report_devices(say, backend)
         return 1
     return 0
 
@@ -136,8 +139,13 @@ def _draw_and_report(say: Callable[..., None], backend: str, *, measure: bool) -
     say(renders=True, **_gl_strings())
     if measure:
         say(frames_per_second=_frames_per_second(draw))
+    _report_devices(say, backend)
+
+
+def _report_devices(say: Callable[..., None], backend: str) -> None:
+    # Last, because asking for CUDA's numbers begins CUDA, which may fail or hang.
     if backend == "egl":
-        say(devices=list(_egl_devices()))
+        say(devices=[*map(dataclasses.asdict, egl_devices())])
 
 
 def _drawing_function(backend: str) -> Callable[[], np.ndarray]:
@@ -276,108 +284,6 @@ def _text_of(error: BaseException) -> str:
         lines.append(f"{type(link).__name__}: {link}")
         link = link.__cause__ or link.__context__
     return "\n".join(lines)
-
-
-# --- EGL's devices -----------------------------------------------------------------
-
-_EGL_EXTENSIONS = 0x3055
-_EGL_DEVICE = 0x322C
-_EGL_CUDA_DEVICE = 0x323A
-_EGL_DRM_DEVICE_FILE = 0x3233
-_EGL_DRM_RENDER_NODE_FILE = 0x3377
-# mujoco itself asks for ten.
-_MOST_DEVICES = 256
-
-
-def _egl_devices() -> Iterator[dict[str, Any]]:
-    """Yield what EGL tells about its devices, in the order of MUJOCO_EGL_DEVICE_ID."""
-    try:
-        egl = ctypes.CDLL("libEGL.so.1")
-        query = _egl_function(
-            egl,
-            "eglQueryDevicesEXT",
-            ctypes.c_uint,
-            ctypes.c_int,
-            ctypes.POINTER(ctypes.c_void_p),
-            ctypes.POINTER(ctypes.c_int),
-        )
-    except (OSError, AttributeError):
-        return
-    devices = (ctypes.c_void_p * _MOST_DEVICES)()
-    count = ctypes.c_int()
-    if query is None or not query(_MOST_DEVICES, devices, ctypes.byref(count)):
-        return
-    used = _device_in_use(egl)
-    for index in range(count.value):
-        yield {
-            "index": index,
-            **_egl_device(egl, devices[index]),
-            "in_use": devices[index] == used,
-        }
-
-
-def _egl_device(egl: Any, device: Any) -> dict[str, Any]:
-    text = _egl_function(
-        egl, "eglQueryDeviceStringEXT", ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int
-    )
-
-    def string(name: int) -> str:
-        return (text(device, name) or b"").decode(errors="replace") if text else ""
-
-    extensions = string(_EGL_EXTENSIONS).split()
-    file = ""
-    if "EGL_EXT_device_drm_render_node" in extensions:
-        file = string(_EGL_DRM_RENDER_NODE_FILE)
-    if not file and "EGL_EXT_device_drm" in extensions:
-        file = string(_EGL_DRM_DEVICE_FILE)
-    return {
-        "device_file": file,
-        "cuda_id": _cuda_id(egl, device, extensions),
-        "software": "EGL_MESA_device_software" in extensions,
-    }
-
-
-def _cuda_id(egl: Any, device: Any, extensions: list[str]) -> int | None:
-    query = _egl_function(
-        egl,
-        "eglQueryDeviceAttribEXT",
-        ctypes.c_uint,
-        ctypes.c_void_p,
-        ctypes.c_int,
-        ctypes.POINTER(ctypes.c_ssize_t),
-    )
-    value = ctypes.c_ssize_t()
-    if query is None or "EGL_NV_device_cuda" not in extensions:
-        return None
-    found = query(device, _EGL_CUDA_DEVICE, ctypes.byref(value))
-    return value.value if found else None
-
-
-def _device_in_use(egl: Any) -> int | None:
-    """Return the device behind the current display, or None where EGL cannot tell."""
-    current = _egl_function(egl, "eglGetCurrentDisplay", ctypes.c_void_p)
-    query = _egl_function(
-        egl,
-        "eglQueryDisplayAttribEXT",
-        ctypes.c_uint,
-        ctypes.c_void_p,
-        ctypes.c_int,
-        ctypes.POINTER(ctypes.c_ssize_t),
-    )
-    value = ctypes.c_ssize_t()
-    if current is None or query is None:
-        return None
-    found = query(current(), _EGL_DEVICE, ctypes.byref(value))
-    return value.value if found else None
-
-
-def _egl_function(egl: Any, name: str, result: Any, *arguments: Any) -> Any:
-    """Return one of EGL's functions; None where this EGL has none of that name."""
-    get = egl.eglGetProcAddress
-    get.restype = ctypes.c_void_p
-    get.argtypes = [ctypes.c_char_p]
-    address = get(name.encode())
-    return ctypes.CFUNCTYPE(result, *arguments)(address) if address else None
 
 
 if __name__ == "__main__":

@@ -5,8 +5,11 @@ from __future__ import annotations
 
 import importlib
 import sys
+from typing import Any
 
-__all__ = ["current_gl_strings"]
+from .egl_devices import egl_devices
+
+__all__ = ["current_gl_facts", "current_gl_strings"]
 
 _NAMES = ("GL_VENDOR", "GL_RENDERER", "GL_VERSION")
 
@@ -32,3 +35,26 @@ def current_gl_strings() -> dict[str, str]:
             return {}
         strings[name.lower()] = value.decode(errors="replace")
     return strings
+
+
+def current_gl_facts() -> dict[str, Any]:
+    """Return what metadata says of who draws on this thread.
+
+    These are the strings and, where EGL tells on which of its devices it draws,
+    `gl_device`: its `index` in EGL's list and, of a GPU whose driver says them, its
+    `file` and its `uuid`. CUDA's number is not asked for, because that would begin
+    CUDA in a process that may be somebody else's and forked later.
+    """
+    facts: dict[str, Any] = current_gl_strings()
+    if facts and _is_egl():
+        for device in egl_devices(with_cuda=False):
+            if device.in_use:
+                known = {"file": device.device_file, "uuid": device.uuid}
+                said = {name: value for name, value in known.items() if value}
+                facts["gl_device"] = {"index": device.index, **said}
+    return facts
+
+
+def _is_egl() -> bool:
+    platform = getattr(sys.modules["OpenGL.platform"], "PLATFORM", None)
+    return type(platform).__name__ == "EGLPlatform"

@@ -21,13 +21,13 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import mujoco
 
 from ..errors import ClosedError, Error, GLError
-from .gl_strings import current_gl_strings
+from .gl_strings import current_gl_facts, current_gl_strings
 
 __all__ = ["GLStrings", "GLThread", "gl_error", "opengl"]
 
@@ -105,7 +105,7 @@ class GLThread:
         )
         # Its own atexit hook may run after EGL was shut down, ours may not.
         self._release.atexit = False
-        self._strings: GLStrings = self._answer(made)
+        self._facts: dict[str, Any] = self._answer(made)
         # Hooks run in reverse order, and mujoco's, which shuts EGL down, was registered
         # when the first context was made.
         self._exit_hook = functools.partial(_close_at_exit, weakref.ref(self))
@@ -115,7 +115,12 @@ class GLThread:
     @property
     def strings(self) -> GLStrings:
         """Who draws: OpenGL's vendor, renderer and version."""
-        return self._strings
+        return _strings_in(self._facts)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What metadata says of who draws, as `current_gl_facts`."""
+        return dict(self._facts)
 
     def call(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Return `function(*args, **kwargs)`, called on the thread.
@@ -239,7 +244,7 @@ def _serve(
 ) -> None:
     try:
         context = _make_context()
-        made.put(_Outcome(_read_strings()))
+        made.put(_Outcome(current_gl_facts()))
     except BaseException as error:
         made.put(_Outcome(error=error))
         return
@@ -304,9 +309,12 @@ def _make_context() -> Any:
 def _read_strings() -> GLStrings:
     # Not every context of mujoco's imports it, and nothing is read through it before.
     opengl()
-    found = current_gl_strings()
+    return _strings_in(current_gl_strings())
+
+
+def _strings_in(facts: Mapping[str, Any]) -> GLStrings:
     names = ("gl_vendor", "gl_renderer", "gl_version")
-    return GLStrings(*(found.get(name, "") for name in names))
+    return GLStrings(*(facts.get(name, "") for name in names))
 
 
 def opengl() -> Any:

@@ -112,6 +112,11 @@ class SceneRenderer:
         return self._thread.strings
 
     @property
+    def gl_facts(self) -> dict[str, Any]:
+        """What metadata says of who draws, as `gl_strings.current_gl_facts`."""
+        return self._thread.facts
+
+    @property
     def camera_positions(self) -> NDArray[np.float32]:
         """Where the two cameras stood in the last picture, `(2, 3)`, in metres.
 

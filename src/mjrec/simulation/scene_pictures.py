@@ -93,8 +93,7 @@ class ScenePictures:
         if self._model is not None:
             facts["camera"] = camera_label(self._model, self._camera)
         if self._renderer is not None:
-            vendor, renderer, version = self._renderer.gl_strings
-            facts.update(gl_vendor=vendor, gl_renderer=renderer, gl_version=version)
+            facts.update(self._renderer.gl_facts)
         return facts
 
     def close(self) -> None:

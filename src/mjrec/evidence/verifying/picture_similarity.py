@@ -21,6 +21,7 @@ __all__ = [
     "SAMPLES_OF_BLOCK",
     "Planes",
     "Similarity",
+    "but_for_shadows",
     "frame_of",
     "planes_of",
     "similarity",
@@ -31,6 +32,10 @@ _BEST_PSNR: Final = 100.0
 # In pixels, and the samples of all planes in it.
 BLOCK: Final = 8
 SAMPLES_OF_BLOCK: Final = BLOCK**2 * 3 // 2
+# Of a cell of two by two pixels that is in shadow in one picture only: by how many
+# levels its lumas differ at least, and its colours at most from those in shadow.
+_LEAST_SHADOW: Final = 12
+_SHADOW_COLOUR: Final = 10
 # Of the definition of SSIM, for samples of eight bits.
 _C1: Final = (0.01 * 255) ** 2
 _C2: Final = (0.03 * 255) ** 2
@@ -115,6 +120,40 @@ def similarity(one: Planes, other: Planes) -> Similarity:
     samples = sum(plane.size for plane in squares)
     error = float(sum(plane.sum(dtype=np.float64) for plane in squares)) / samples
     return Similarity(_psnr(error), _ssim(one.luma, other.luma), _block(squares))
+
+
+def but_for_shadows(one: Planes, other: Planes) -> tuple[Planes, float]:
+    """Return `other` with the samples of `one` where only their light differs.
+
+    There either is the other one made darker: the same colour, times a number from
+    0 to 1. So a shadow changes it; and so does whoever paints it black.
+
+    Returns:
+        The picture, and how much of it is from `one`, from 0 to 1.
+    """
+    lumas = [_halved(planes.luma) - 16 for planes in (one, other)]
+    is_one_lighter = lumas[0] >= lumas[1]
+    light, dark = np.maximum(*lumas), np.maximum(np.minimum(*lumas), 0)
+    is_shadow = light - dark >= _LEAST_SHADOW
+    shade = dark / np.maximum(light, 1)
+    for planes in ((one.blue, other.blue), (one.red, other.red)):
+        a, b = (plane.astype(np.float32) - 128 for plane in planes)
+        lit, shaded = np.where(is_one_lighter, (a, b), (b, a))
+        is_shadow &= np.abs(shaded - shade * lit) <= _SHADOW_COLOUR
+    of_luma = np.repeat(np.repeat(is_shadow, 2, 0), 2, 1)
+    changed = Planes(
+        np.where(of_luma, one.luma, other.luma),
+        np.where(is_shadow, one.blue, other.blue),
+        np.where(is_shadow, one.red, other.red),
+    )
+    return changed, float(is_shadow.mean())
+
+
+def _halved(luma: NDArray[np.uint8]) -> NDArray[np.float32]:
+    height, width = luma.shape
+    cells = luma.reshape(height // 2, 2, width // 2, 2)
+    means: NDArray[np.float32] = cells.mean(axis=(1, 3), dtype=np.float32)
+    return means
 
 
 def _psnr(error: float) -> float:

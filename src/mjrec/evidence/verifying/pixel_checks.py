@@ -46,8 +46,8 @@ from .difference_picture import difference_picture, png
 from .drawing_plan import DoesNotFit, DrawingPlan, NotDrawable, plan_drawing
 from .encoded_again import OLD_RATE, EncodedAgain
 from .frame_times import UnevenTimes, rate_of_frames
-from .likeness import OTHER_ENCODER, OTHER_RENDERER, Likeness
-from .picture_similarity import Planes, planes_of, similarity
+from .likeness import MOST_SHADOW, OTHER_ENCODER, OTHER_RENDERER, Likeness
+from .picture_similarity import Planes, but_for_shadows, planes_of, similarity
 from .shipped_video import (
     GL_STRINGS,
     ShippedVideo,
@@ -238,7 +238,9 @@ class _Found:
     Attributes:
         positions: the numbers of the frames that were drawn.
         wrong: those among them whose hash is another.
-        likeness: of what was shipped.
+        likenesses: of what was shipped, within what another encoder may differ, and
+            another renderer.
+        unshadowed: the latter, without what is in shadow in one picture only.
         pictures: the drawn and the shipped picture that are most unlike.
         gl: who drew.
         bytes_equal: whether the file encoded again is the shipped one; None where none
@@ -250,6 +252,7 @@ class _Found:
     positions: Sequence[int]
     wrong: list[int] = field(default_factory=list)
     likenesses: tuple[Likeness, ...] = ()
+    unshadowed: Likeness = field(default_factory=lambda: Likeness(OTHER_RENDERER))
     pictures: tuple[Planes, Planes] | None = None
     gl: tuple[str | None, ...] = ()
     bytes_equal: bool | None = None
@@ -367,7 +370,7 @@ class _Studio:
                 tell()
             if found.refusal is None:
                 found.bytes_equal = again.is_equal()
-        strings = self._workers.gl_strings
+        strings = self._workers.gl_facts
         found.gl = tuple(strings.get(key) for key in GL_STRINGS)
         return found
 
@@ -421,16 +424,24 @@ class _Studio:
         likeness = strict if is_near else loose
         is_proved = bool(found.bytes_equal)
         passes = likeness.passes or is_proved
+        is_shadow = likeness is loose and not passes and found.unshadowed.passes
         reason = likeness.told()
         if is_proved:
             reason = f"they are the same file; {reason}"
+        elif is_shadow:
+            reason = (
+                f"{reason}; but what differs more is in shadow in one of the two, and "
+                "renderers differ in where a large floor casts shadows on itself: "
+                "nobody can tell"
+            )
         else:
             reason = f"{reason}; {likeness.told_unnoticed()}"
         figures = {**likeness.figures(), **self._keep_picture(found)}
         if is_proved:
             # What was encoded again, byte for byte, leaves room for nothing.
             figures = {k: v for k, v in figures.items() if "unnoticed" not in k}
-        verdict = Verdict.PASS if passes else Verdict.FAIL
+        otherwise = Verdict.NOT_CHECKABLE if is_shadow else Verdict.FAIL
+        verdict = Verdict.PASS if passes else otherwise
         return _check(_ALIKE, video.name, verdict, reason, **figures)
 
     def _keep_picture(self, found: _Found) -> dict[str, str]:
@@ -468,6 +479,11 @@ def _compare(found: _Found, position: int, drawn: Frame, shipped: Planes) -> Non
     is_worst = [likeness.add(position, alike) for likeness in found.likenesses]
     if is_worst[0]:
         found.pictures = planes, shipped
+    if OTHER_RENDERER.strain(alike) > 1:
+        unshadowed, share = but_for_shadows(planes, shipped)
+        if share <= MOST_SHADOW:
+            alike = similarity(planes, unshadowed)
+    found.unshadowed.add(position, alike)
 
 
 def _other_renderer(
