@@ -333,33 +333,22 @@ def test_a_host_that_is_told_to_end(
 
 def test_a_host_whose_time_will_be_over(tmp_path: Path) -> None:
     """It is at its job to the end, and another Slurm job does the next."""
-    os.mkfifo(tmp_path / "pipe")
     with begun(tmp_path) as run:
-        submit(run, "a", do="meet", pipe=str(tmp_path / "pipe"), mode="rb")
-        until(lambda: next(run.results(patience_s=0.02)) is None and taken(tmp_path))
+        submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
+        pid = wait_for(tmp_path / "begun", run)
         # As Slurm does: to all processes of the job.
         host = host_process(tmp_path)
-        for pid in [host, *children_of(host)]:
-            os.kill(pid, signal.SIGUSR2)
-        until(
-            lambda: (
-                next(run.results(patience_s=0.02)) is None
-                and HostState.LEAVING in folder_in(tmp_path).hosts().values()
-            )
-        )
+        for process in [host, *children_of(host)]:
+            os.kill(process, signal.SIGUSR2)
+        until(lambda: HostState.LEAVING in folder_in(tmp_path).hosts().values())
         submit(run, "b", do="where")
         for outcome in run.results(patience_s=0.02):
             if outcome is not None:
                 break
         assert outcome is not None
         assert outcome.key == "b"
-        with (tmp_path / "pipe").open("wb"):
-            [first] = values(run)
-        assert first["pid"] != (outcome.value or {})["pid"]
-
-
-def taken(place: Path) -> list[Any]:
-    return folder_in(place).taken()
+        assert [pid] == children_of(host)
+        assert (outcome.value or {})["pid"] != pid
 
 
 def children_of(pid: int) -> list[int]:
@@ -427,6 +416,26 @@ def test_ctrl_c_while_results_come(tmp_path: Path) -> None:
     assert lines(tmp_path / "closed") == [str(pid)]
 
 
+def test_ctrl_c_in_a_terminal(tmp_path: Path) -> None:
+    """It reaches all processes there, of which only the driver takes it to heart."""
+    script = DRIVER.replace("run = engine.begin(work)", "run = start(engine, work)")
+    driver = subprocess.Popen(
+        [sys.executable, "-c", CANCELLING + script, str(tmp_path), "60"],
+        env={**os.environ, **DRIVER_PATH},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    until(lambda: lines(tmp_path / "begun"))
+    os.killpg(driver.pid, signal.SIGINT)
+    _, said = driver.communicate(timeout=60)
+    assert said.count("KeyboardInterrupt") == 1
+    [pid] = lines(tmp_path / "begun")
+    assert pid in lines(tmp_path / "closed")
+    assert not (tmp_path / "shared").exists()
+
+
 def test_forgotten_runs_end(tmp_path: Path, mark: str) -> None:
     """In mid-job too."""
     run = begun(tmp_path)
@@ -438,6 +447,13 @@ def test_forgotten_runs_end(tmp_path: Path, mark: str) -> None:
 
 # A driver that is killed
 
+CANCELLING = """
+import atexit
+def start(engine, work):
+    run = engine.begin(work)
+    atexit.register(run.cancel)
+    return run
+"""
 DRIVER = """
 import sys
 from pathlib import Path
