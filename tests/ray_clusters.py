@@ -42,9 +42,8 @@ def home_for_ray(home: Path) -> Iterator[None]:
     assert not ray.is_initialized()
     assert not list(home.iterdir())
     mark = f"{MARK}={os.getpid()}"
-    # Where its driver was killed, an agent of Ray's looks for it for most of a minute.
     wait_until(
-        lambda: not ray_processes(mark), seconds=90, told=lambda: ray_processes(mark)
+        lambda: not ray_processes(mark), seconds=30, told=lambda: ray_processes(mark)
     )
 
 
@@ -83,7 +82,10 @@ def is_gone(pid: int) -> bool:
 
 
 def ray_processes(mark: str) -> list[str]:
-    """Return the commands of processes in whose environment something stands."""
+    """Return the commands of processes in whose environment something stands.
+
+    Without an agent of Ray's that tells a cluster for a minute that it is gone.
+    """
     found = []
     for process in Path("/proc").iterdir():
         if process.name == str(os.getpid()):
@@ -92,4 +94,4 @@ def ray_processes(mark: str) -> list[str]:
             if mark.encode() in (process / "environ").read_bytes():
                 command = (process / "cmdline").read_bytes().replace(b"\0", b" ")
                 found.append(command.decode(errors="replace"))
-    return found
+    return [command for command in found if "DashboardAgent" not in command]

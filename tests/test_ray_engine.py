@@ -360,7 +360,7 @@ for _ in run.results(patience_s=0.05):
 """
     with pytest.raises(AssertionError):
         run_python(script, str(tmp_path), **{MARK: str(tmp_path)})
-    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=90)
+    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=30)
     assert lines(tmp_path / "closed") == [(tmp_path / "begun").read_text()]
 
 

@@ -338,7 +338,8 @@ class RayRun:
             return True
         if getattr(error, "preempted", False):
             return True
-        dead = {node["NodeID"] for node in self._ray.nodes() if not node["Alive"]}
+        self._watch.look()
+        dead = self._watch.dead_nodes
         return seat.node in dead if seat.node else bool(dead - seat.gone_before)
 
     def _begin_elsewhere(self, seat: _Seat, what: str) -> None:

@@ -110,7 +110,9 @@ class ClusterWatch:
         self._ray = import_ray()
         self._nodes: list[Mapping[str, Any]] = self._ray.nodes()
         self._heard = time.monotonic()
-        self._stopped = threading.Event()
+        self._asked = threading.Event()
+        self._answered = threading.Event()
+        self._is_stopped = False
         self._thread = threading.Thread(
             target=self._look, name="mjrec-ray-nodes", daemon=True
         )
@@ -121,9 +123,15 @@ class ClusterWatch:
         """For how many seconds the cluster has not answered."""
         return max(0.0, time.monotonic() - self._heard - _SECONDS_BETWEEN_LOOKS)
 
+    def look(self) -> None:
+        """Ask now, and wait for the answer, but not for ever."""
+        self._answered.clear()
+        self._asked.set()
+        self._answered.wait(_SECONDS_TO_REACH)
+
     @property
     def dead_nodes(self) -> frozenset[str]:
-        """Those that have gone."""
+        """Those that have gone, by the last answer."""
         return frozenset(n["NodeID"] for n in self._nodes if not n["Alive"])
 
     def room_for(self, share: GpuShare) -> int:
@@ -141,16 +149,22 @@ class ClusterWatch:
 
     def stop(self) -> None:
         """Look no more. Idempotent."""
-        self._stopped.set()
+        self._is_stopped = True
+        self._asked.set()
         # It may be asking what does not answer.
         self._thread.join(_SECONDS_TO_STOP)
 
     def _look(self) -> None:
-        while not self._stopped.wait(_SECONDS_BETWEEN_LOOKS):
+        while True:
+            self._asked.wait(_SECONDS_BETWEEN_LOOKS)
+            self._asked.clear()
+            if self._is_stopped:
+                return
             # What goes wrong is told by the silence.
             with contextlib.suppress(Exception):
                 self._nodes = self._ray.nodes()
                 self._heard = time.monotonic()
+                self._answered.set()
 
 
 def _room_of(resources: Mapping[str, float], share: GpuShare) -> int:
