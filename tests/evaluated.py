@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mjrec.engines.work import AGAIN
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.plan_json import plan_to_json
 from mjrec.evaluation.worker import EvaluationWorker
@@ -39,9 +40,12 @@ def worker_of(
     return EvaluationWorker({"directory": str(directory), "plan": values}, payload)
 
 
-def run_job(plan: EvaluationPlan, seed: int, *episodes: int) -> dict[str, Any]:
+def run_job(
+    plan: EvaluationPlan, seed: int, *episodes: int, again: bool = False
+) -> dict[str, Any]:
     """Return the job of a batch; of all episodes of the plan, if none is named."""
     return {
+        AGAIN: again,
         "kind": "run",
         "task": plan.tasks[0].name,
         "folder": FOLDER,

@@ -67,7 +67,10 @@ def test_a_job_that_kills_goes_to_the_end_of_the_queue(
     book = book_of("a", "b")
     with caplog.at_level(logging.WARNING):
         book.begin_again(book.take(), "was killed by SIGKILL")
-    assert taken(book) == ["b", "a"]
+    first, second = book.take(), book.take()
+    assert json.loads(first.line) == {"key": "b", "arguments": {"number": 1}}
+    assert json.loads(second.line)["arguments"] == {"number": 1, "again": True}
+    assert second.key == "a"
     assert caplog.messages == [
         "A worker died at the job a, which is begun again. It was killed by SIGKILL"
     ]
@@ -107,4 +110,5 @@ def test_what_is_put_back_is_first_and_not_to_blame() -> None:
         assert task.key == "a"
         book.put_back(task)
     assert task.deaths == 0
+    assert json.loads(task.line)["arguments"] == {"number": 1, "again": True}
     assert taken(book) == ["a", "b"]

@@ -21,6 +21,12 @@ from mjrec import (
 )
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.manifest import Manifest, write_manifest
+from mjrec.formats.monitor_directory import (
+    Infix,
+    journal_name,
+    lock_name,
+    manifest_name,
+)
 from mjrec.recorder.opening import OpenDirectory, open_directory
 
 ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
@@ -294,4 +300,49 @@ def test_failed_opening_removes_what_it_made(tmp_path: Path) -> None:
         open_directory(
             tmp_path / "a" / "b", force=False, resume=False, uid=None, env_info=None
         )  # type: ignore[arg-type]  # a failure on purpose
+    assert not (tmp_path / "a").exists()
+
+
+def test_joining_looks_at_nobody_elses_files(tmp_path: Path) -> None:
+    """Whatever is there, also what cannot be read, and numbers begin with 0."""
+    write_video(tmp_path, "0.elsewhere", 7)
+    (tmp_path / "openaigym.manifest.1.elsewhere.manifest.json").write_text("{")
+    other = ENV_INFO | {"env_id": "Ant-v5"}
+    place = open_(tmp_path, resume="join", env_info=other)
+    assert place.first_episode_id == 0
+    place.lock.release()
+
+
+def test_joining_takes_nobody_elses_name(tmp_path: Path) -> None:
+    """A manifest, a journal or a lock shows that a name was given before."""
+    first = open_(tmp_path, resume="join", uid="same")
+    after = [Infix(first.infix.monitor_id + n, "same") for n in (1, 2, 3)]
+    (tmp_path / manifest_name(after[0])).touch()
+    (tmp_path / journal_name(after[1])).touch()
+    (tmp_path / lock_name(after[2])).touch()
+    place = open_(tmp_path, resume="join", uid="same")
+    assert place.infix.monitor_id > after[2].monitor_id
+    for each in (first, place):
+        each.lock.release()
+
+
+def test_a_monitor_that_joins_leaves_dead_ones_as_they_are(
+    tmp_path: Path, make_corridor: Any, play: Callable[..., None]
+) -> None:
+    """Putting them in order is left to others."""
+    dead = tmp_path / "openaigym.trajectory.0.1.episode000000.log"
+    dead.write_bytes(b"x")
+    record(tmp_path, make_corridor, play, resume="join")
+    assert dead.read_bytes() == b"x"
+    record(tmp_path, make_corridor, play, resume=True)
+    assert not dead.exists()
+
+
+@pytest.mark.parametrize("resume", ["yes", 1, None])
+def test_resume_is_one_of_three(
+    resume: Any, tmp_path: Path, make_corridor: Any
+) -> None:
+    """A slip is not taken for yes."""
+    with pytest.raises(InvalidArgument, match='True, False, or "join"'):
+        mjrec.Monitor(make_corridor(), tmp_path / "a", False, resume=resume)
     assert not (tmp_path / "a").exists()

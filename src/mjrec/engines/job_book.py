@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import InvalidArgument
-from .work import Job, JobOutcome
+from .work import AGAIN, Job, JobOutcome
 
 __all__ = ["TRIES", "JobBook", "Task", "as_json"]
 
@@ -123,14 +123,14 @@ class JobBook:
                 task.key,
                 how,
             )
-            self._waiting.append(task)
+            self._waiting.append(_again(task))
             return
         failure = f"Its worker died, which was try {task.deaths} of {TRIES}: it {how}"
         self.finish(task, value=None, failure=failure, tries=0)
 
     def put_back(self, task: Task) -> None:
         """Let a job be done first of all: through no fault of its own it was not."""
-        self._waiting.appendleft(task)
+        self._waiting.appendleft(_again(task))
 
     def next_outcome(self) -> JobOutcome | None:
         """Return an outcome that is given out now; None where there is none."""
@@ -143,6 +143,13 @@ class JobBook:
     def has_outcome(self) -> bool:
         """Whether there is an outcome to give out."""
         return bool(self._outcomes)
+
+
+def _again(task: Task) -> Task:
+    """Let a job say that somebody has begun it before."""
+    arguments = {**task.job.arguments, AGAIN: True}
+    task.line = json.dumps({"key": task.key, "arguments": arguments}).encode()
+    return task
 
 
 def as_json(said: Mapping[str, Any], *, what: str) -> bytes:

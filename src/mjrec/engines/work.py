@@ -15,10 +15,22 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-__all__ = ["WORK_FOLDER", "Engine", "Handler", "Job", "JobOutcome", "Run", "Work"]
+__all__ = [
+    "AGAIN",
+    "WORK_FOLDER",
+    "Engine",
+    "Handler",
+    "Job",
+    "JobOutcome",
+    "Run",
+    "Work",
+]
 
 # In `Work.shared_directory`: where an engine keeps what it needs while work is done.
 WORK_FOLDER = ".mjrec.work"
+
+# What engines add to the arguments of a job that somebody has begun before.
+AGAIN = "again"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +61,8 @@ class Job:
 
     Attributes:
         key: tells it from all others of its run.
-        arguments: JSON.
+        arguments: JSON. Where a worker has begun the job before, the next one is given
+            `AGAIN` with true besides.
     """
 
     key: str

@@ -32,6 +32,7 @@ from ..environments.policies import (
 from ..errors import Error, InvalidArgument, PolicyError
 from ..monitors import Monitor
 from ..monitors.rendering_choice import rendering_choice
+from ..recorder.opening import JOIN
 from ..recorder.options import DEFERRED, RenderingChoice
 from ..recorder.selection import UNDECIDED
 from ..recorder.tracking import FinishedEpisode, Run, Tracker
@@ -120,14 +121,20 @@ def rendering_of(named: NamedEnvironment) -> RenderingChoice:
     return rendering_choice(None, named.scenes(), named.env_id)
 
 
-def run_batch(evaluation: Evaluation, batch: Batch) -> int:
-    """Run those episodes of a batch that no ledger has, and return how many they were.
+def run_batch(evaluation: Evaluation, batch: Batch, *, again: bool) -> int:
+    """Run the episodes of a batch, and return how many they were.
+
+    Args:
+        evaluation: what is evaluated.
+        batch: of which none is in any ledger, unless it is begun again.
+        again: whether somebody has begun it before: then those that are in a ledger
+            are left out. Looking for that takes the longer the more have recorded.
 
     Raises:
         Error: something could not be recorded; what was done is in the ledger.
     """
     whole = evaluation.plan.protocol == SUITE
-    done = read_ledgers(evaluation.directory / batch.folder)
+    done = read_ledgers(evaluation.directory / batch.folder) if again else {}
     left = [n for n in batch.episodes if (batch.seed, n) not in done]
     if left:
         left_of_it = dataclasses.replace(batch, episodes=tuple(left))
@@ -230,7 +237,7 @@ class _BatchRun:
         recorded = Monitor(
             named.environment,
             self._folder,
-            resume=True,
+            resume=JOIN,
             mode="evaluation",
             max_fps=plan.max_fps,
             quality=plan.quality,

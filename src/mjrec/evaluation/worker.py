@@ -11,8 +11,9 @@ each of which may be done again:
            one the number of degrees of freedom (0 without MuJoCo), or `{"error": ...}`
            where they cannot be: as `carried_errors` packs it, so that it comes home
            as what it is, and leaves no traceback in the log that nobody needs.
-`run`      `{"task", "folder", "seed", "episodes"}`: runs those episodes of a batch
-           that no ledger has. Returns `{"episodes": how many it ran}`.
+`run`      `{"task", "folder", "seed", "episodes"}`: runs the episodes of a batch; where
+           somebody has begun it before, those that no ledger has. Returns
+           `{"episodes": how many it ran}`.
 `recover`  `{"folder"}`: puts in order what killed workers left. Returns
            `{"monitors": infixes of those that are left to settle}`.
 `settle`   `{"folder", "monitor", "chosen": [[number, facts], ...]}`, see `settling`.
@@ -32,6 +33,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..carried_errors import carried
+from ..engines.work import AGAIN
 from ..errors import Error, GLError
 from ..gl import use_gl
 from ..recorder.options import DEFERRED
@@ -118,7 +120,8 @@ class EvaluationWorker:
             seed=arguments["seed"],
             episodes=tuple(arguments["episodes"]),
         )
-        return {"episodes": run_batch(self._evaluation, batch)}
+        again = bool(arguments.get(AGAIN, False))
+        return {"episodes": run_batch(self._evaluation, batch, again=again)}
 
     # What is imported below loads HDF5, which stepping has no use for.
 

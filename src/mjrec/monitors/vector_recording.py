@@ -110,7 +110,7 @@ def options_of(index: int, options: RecorderOptions) -> RecorderOptions:
     """
     changed: dict[str, Any] = {}
     if index > 0:
-        changed.update(force=False, resume=True)
+        changed.update(force=False, resume=options.resume or True)
     if options.name_prefix is not None:
         # One name for all would be one file for all.
         changed["name_prefix"] = f"{options.name_prefix}-env-{index}"

@@ -39,7 +39,10 @@ from ..results import clear_monitor_files
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.sources import MonitorResults
 
-__all__ = ["OpenDirectory", "open_directory"]
+__all__ = ["JOIN", "OpenDirectory", "open_directory"]
+
+# To record beside monitors that are of the same environment, without a look at them.
+JOIN = "join"
 
 
 class _MonitorIds:
@@ -78,7 +81,7 @@ def open_directory(
     directory: str | os.PathLike[str],
     *,
     force: bool,
-    resume: bool,
+    resume: bool | str,
     uid: str | None,
     env_info: Mapping[str, str],
 ) -> OpenDirectory:
@@ -90,6 +93,9 @@ def open_directory(
         resume: add to the recordings that are there. Episodes are numbered on from
             the highest number of the monitors with this `uid` that closed or died
             (without `uid`: of all of them); monitors that are still open do not count.
+            `JOIN` looks at nobody else's files, however many there are: the caller
+            knows that they are of the same environment, and episodes are numbered
+            from 0.
         uid: stands in the file names instead of the process id.
         env_info: `env_id` of the environment, among others.
 
@@ -105,8 +111,10 @@ def open_directory(
     path = Path(directory).absolute()
     with _made(path):
         _check_existing(path, force=force, resume=resume, env_id=env_info["env_id"])
-        first = 0 if force else _next_episode_id(path, uid=wanted_uid)
-        infix, lock = _claim(path, uid=wanted_uid, env_info=env_info)
+        joins = resume == JOIN and not force
+        numbers_on = not (force or joins)
+        first = _next_episode_id(path, uid=wanted_uid) if numbers_on else 0
+        infix, lock = _claim(path, uid=wanted_uid, env_info=env_info, looks=not joins)
     return OpenDirectory(path, infix, first, lock)
 
 
@@ -130,9 +138,13 @@ def _made(path: Path) -> Iterator[None]:
         raise
 
 
-def _check_existing(path: Path, *, force: bool, resume: bool, env_id: str) -> None:
+def _check_existing(
+    path: Path, *, force: bool, resume: bool | str, env_id: str
+) -> None:
     if force:
         clear_monitor_files(path)
+        return
+    if resume == JOIN:
         return
     existing = [file.name for file in iter_monitor_files(path, hidden=True)]
     if existing and not resume:
@@ -198,14 +210,23 @@ def _last_counted(files: MonitorFiles) -> int:
 
 
 def _claim(
-    path: Path, *, uid: str | None, env_info: Mapping[str, str]
+    path: Path, *, uid: str | None, env_info: Mapping[str, str], looks: bool
 ) -> tuple[Infix, Lock]:
+    """Return an infix that is this monitor's from now on, and its lock.
+
+    Args:
+        path: the directory.
+        uid: stands in it instead of the process id.
+        env_info: of the environment.
+        looks: also for stray files with it. Without that, a manifest, a journal or a
+            lock say that it was somebody's: each monitor leaves one of them.
+    """
     content = json_text.dumps(
         {"pid": os.getpid(), "since": time.time(), "env_info": dict(env_info)}
     )
     while True:
         infix = Infix(_monitor_ids.take(), uid or str(os.getpid()))
-        if _is_taken(path, infix):
+        if _is_taken(path, infix, looks=looks):
             continue
         try:
             lock = Lock(path / lock_name(infix), content)
@@ -215,17 +236,19 @@ def _claim(
             raise DirectoryNotWritable(path, error.strerror) from error
         # The monitor that had it may have closed, and so unlocked, between the look
         # at the files and the lock.
-        if not _is_taken(path, infix, besides=lock_name(infix)):
+        if not _is_taken(path, infix, besides=lock_name(infix), looks=looks):
             return infix, lock
         lock.release()
 
 
-def _is_taken(path: Path, infix: Infix, *, besides: str | None = None) -> bool:
+def _is_taken(
+    path: Path, infix: Infix, *, looks: bool, besides: str | None = None
+) -> bool:
     # The rare case is a pid or uid that was here before; the manifest, there after
     # every close, answers most of them without a look at the whole directory.
     if (path / manifest_name(infix)).exists() or (path / journal_name(infix)).exists():
         return True
-    return any(
+    return looks and any(
         file.name != besides and infix_of(file.name) == str(infix)
         for file in iter_monitor_files(path, hidden=True)
     )

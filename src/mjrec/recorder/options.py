@@ -18,6 +18,7 @@ from ..errors import InvalidArgument
 from ..frames import check_quality
 from ..rates import to_rate
 from ..schedules import check_takes_one
+from .opening import JOIN
 from .selection import selection_from
 from .tracking import FinishedEpisode, Tracker
 
@@ -49,7 +50,7 @@ class RecorderOptions:
 
     video_callable: Callable[[int], Any] | bool | None = None
     force: bool = False
-    resume: bool = False
+    resume: bool | str = False
     write_upon_reset: bool = False
     uid: str | None = None
     mode: str | None = None
@@ -83,6 +84,11 @@ class RecorderOptions:
                 raise InvalidArgument(
                     f"{name} must be True or False, got {getattr(self, name)!r}."
                 )
+        if not (isinstance(self.resume, bool) or self.resume == JOIN):
+            raise InvalidArgument(
+                'resume must be True, False, or "join" to record beside others without '
+                f"a look at them, got {self.resume!r}."
+            )
         check_quality(self.quality)
         if self.render not in (None, DEFERRED, LIVE, OFF):
             raise InvalidArgument(
