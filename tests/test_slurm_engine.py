@@ -357,7 +357,7 @@ def children_of(pid: int) -> list[int]:
 
 
 def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path: Path) -> None:
-    """Two are enough; the error has the end of the log and says where it is."""
+    """Three are enough; the error has the end of the log and says where it is."""
     made = engine(setup=["echo no such module >&2; exit 1"])
     with made.begin(work(tmp_path)) as run:
         submit(run, "a", do="echo")

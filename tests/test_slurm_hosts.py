@@ -159,17 +159,17 @@ def test_one_that_was_begun_again_unseen(
 def test_hosts_that_die_before_they_do_anything(
     hosts: SlurmHosts, folder: JobFolder, told: ToldStates
 ) -> None:
-    """Two of them end the run, unless another is at work: then there are no more."""
-    hosts.want(3)
-    begin(folder, told, "2-0")
-    told.told.update({"0": "FAILED", "1": "FAILED"})
+    """Three of them end the run, unless another is at work: then there are no more."""
+    hosts.want(4)
+    begin(folder, told, "3-0")
+    told.told.update(dict.fromkeys("012", "FAILED"))
     hosts.look()
     hosts.check()
-    hosts.want(3)
-    assert len(told.told) == 3
-    told.told["2"] = "PREEMPTED"
+    hosts.want(4)
+    assert len(told.told) == 4
+    told.told["3"] = "PREEMPTED"
     hosts.look()
-    with pytest.raises(Error, match="The last one was in the Slurm job 1, which is FA"):
+    with pytest.raises(Error, match="The last one was in the Slurm job 2, which is FA"):
         hosts.check()
 
 
@@ -177,13 +177,13 @@ def test_a_host_that_does_something_is_a_good_sign(
     hosts: SlurmHosts, folder: JobFolder, told: ToldStates
 ) -> None:
     """Those that died before may have had bad luck."""
-    hosts.want(3)
-    begin(folder, told, "2-0")
-    told.told.update({"0": "FAILED", "1": "FAILED"})
+    hosts.want(4)
+    begin(folder, told, "3-0")
+    told.told.update(dict.fromkeys("012", "FAILED"))
     hosts.look()
-    hosts.has_done_something("2-0")
-    hosts.want(3)
-    assert len(told.told) == 5
+    hosts.has_done_something("3-0")
+    hosts.want(4)
+    assert len(told.told) == 7
 
 
 def test_a_cluster_that_takes_no_jobs(

@@ -21,7 +21,8 @@ logger = logging.getLogger(__name__)
 
 _SHORTEST_POLL = 0.005
 _POLLS_GROW = 1.5
-_ENDS_AT_ONCE = 2
+# Twice may be chance: a bad node, which the next one is given too.
+_ENDS_AT_ONCE = 3
 _SECONDS_BETWEEN_TRIES = 30.0
 _TRIES_TO_SUBMIT = 10
 _SECONDS_BEFORE_SAYING_WHY = 60.0
@@ -138,8 +139,8 @@ class SlurmHosts:
         others = any(job.has_begun and job.takes_more for job in self._all.values())
         if self._ends_too_often and not others:
             raise Error(
-                f"No Slurm job can do anything. The last one {self._last_end} Their "
-                f"logs are in {self._folder.logs}."
+                f"No Slurm job can do anything. Their logs are in {self._folder.logs}. "
+                f"The last one {self._last_end}"
             )
 
     def end_all(self) -> None:
