@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -357,6 +358,22 @@ def test_texts_in_csv_and_in_torn_journals_are_nobodys(tmp_path: Path) -> None:
         '#{"t_start": 1.5, "env_id": "<home>/a.xml"}\nr,l,t\n1.0,2,0.5\n'
     )
     assert journal.read_text() == '{"reward": 1e999, "seed": null}\n'
+
+
+def test_single_cards_are_not_named(tmp_path: Path) -> None:
+    """Which of EGL's devices drew is left, and how many GPUs were given."""
+    card = "GPU-8f1c2b0e-5d6a-4e3b-9c7d-112233445566"
+    metadata = {
+        "gl_device": {"index": 1, "file": "/dev/dri/renderD129", "uuid": card},
+        "surroundings": {"variables": {"CUDA_VISIBLE_DEVICES": f"{card},GPU-8f,2"}},
+    }
+    path = tmp_path / "openaigym.video.0.1.video000000.meta.json"
+    path.write_text(json.dumps(metadata))
+    make_anonymous(tmp_path, identity=Identity())
+    assert _read(path) == {
+        "gl_device": {"index": 1},
+        "surroundings": {"variables": {"CUDA_VISIBLE_DEVICES": "<gpu>,<gpu>,2"}},
+    }
 
 
 def test_what_nobody_can_read_is_removed(tmp_path: Path) -> None:

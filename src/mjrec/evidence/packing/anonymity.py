@@ -7,6 +7,8 @@ Of a staged monitor directory, which is nobody's original:
   Stable-Baselines3's CSV have placeholders: `<home>`, `<path>`, `<user>`, `<host>`;
 - of the surroundings of a recording, the command line keeps only names of files, the
   code neither its commit nor where it is, and variables no directories;
+- of the device that drew a video its number is left, and where UUIDs of GPUs stood is
+  `<gpu>`: each names a single card;
 - names of files, where a uid, a camera or a prefix has the identity in it, have `user`
   or `host` instead, and whatever refers to them says the same;
 - trajectories have other facts, and the same arrays (`anonymous_trajectories`);
@@ -55,6 +57,8 @@ _PATH_OF_FILE = re.compile(
     r"(?:[/~]|\.\.?/)[^\s\"':,;<>=]*|[^\s\"':,;<>=]*/[^\s\"':,;<>=/]*\.\w+"
 )
 _COMMIT = "<commit>"
+# Of a card, or of a part of one; `CUDA_VISIBLE_DEVICES` takes a beginning too.
+_GPU = re.compile(r"(?<![\w-])(?:GPU|MIG)-[0-9a-fA-F][0-9a-fA-F/-]*")
 
 
 def make_anonymous(recordings: Path, *, identity: Identity) -> None:
@@ -129,6 +133,8 @@ class _Texts:
         if key == "model" and isinstance(value, dict):
             # All recordings of one user have the same key.
             value = {**value, "seal": None} if "seal" in value else value
+        if key == "gl_device" and isinstance(value, dict):
+            value = {k: v for k, v in value.items() if k not in ("uuid", "file")}
         return self.value(value)
 
     def _with_new_infixes(self, text: str) -> str:
@@ -205,7 +211,7 @@ def _general_surroundings(surroundings: Mapping[str, Any]) -> dict[str, Any]:
     variables = general.get("variables")
     if isinstance(variables, Mapping):
         general["variables"] = {
-            name: _DIRECTORY.sub("<path>", value) if isinstance(value, str) else value
+            name: _general_variable(value) if isinstance(value, str) else value
             for name, value in variables.items()
         }
     code = general.get("code")
@@ -219,6 +225,10 @@ def _general_surroundings(surroundings: Mapping[str, Any]) -> dict[str, Any]:
     if "working_directory" in general:
         general["working_directory"] = "<path>"
     return general
+
+
+def _general_variable(value: str) -> str:
+    return _GPU.sub("<gpu>", _DIRECTORY.sub("<path>", value))
 
 
 def _without_directories(argument: Any) -> Any:
