@@ -185,9 +185,14 @@ def _report(directory: Path) -> _Work:
     return lambda: write_report(directory, report)
 
 
-def _open(directory: Path) -> _Work:
+def _join(directory: Path) -> _Work:
     env = gymnasium.make(TASK)
     return lambda: _monitor(env, directory)
+
+
+def _resume(directory: Path) -> _Work:
+    env = gymnasium.make(TASK)
+    return lambda: _monitor(env, directory, resume=True)
 
 
 def _settle(directory: Path) -> _Work:
@@ -197,13 +202,13 @@ def _settle(directory: Path) -> _Work:
     return lambda: settle_monitor(directory, monitor.infix, {}, rule="best")
 
 
-def _monitor(env: Any, directory: Path) -> Any:
-    """Open a monitor as a worker of an evaluation does."""
+def _monitor(env: Any, directory: Path, *, resume: bool | str = "join") -> Any:
+    """Open a monitor, by itself as a worker of an evaluation does."""
     return mjrec.Monitor(
         env,
         directory,
         keep=UNDECIDED,
-        resume=True,
+        resume=resume,
         mode="evaluation",
         render="deferred",
         workers=0,
@@ -236,7 +241,8 @@ _OF_MONITORS: Mapping[str, _Prepare] = {
     _LOADED: _load,
     _LISTED: _list,
     _REPORTED: _report,
-    "a monitor is opened": _open,
+    "a monitor joins": _join,
+    "a monitor resumes": _resume,
     "a monitor is settled": _settle,
     "mjrec recover": _recover,
     "ledgers read": _read_ledgers,
