@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,6 +26,7 @@ __all__ = [
 ]
 
 MARK = "MJREC_TEST_OF_RAY"
+AGENT = re.compile(r"ray::\w+Agent")
 SMALL_STORE = 80 << 20
 
 
@@ -84,7 +86,7 @@ def is_gone(pid: int) -> bool:
 def ray_processes(mark: str) -> list[str]:
     """Return the commands of processes in whose environment something stands.
 
-    Without an agent of Ray's that tells a cluster for a minute that it is gone.
+    Without Ray's agents, which tell a cluster for a minute that it is gone.
     """
     found = []
     for process in Path("/proc").iterdir():
@@ -94,4 +96,4 @@ def ray_processes(mark: str) -> list[str]:
             if mark.encode() in (process / "environ").read_bytes():
                 command = (process / "cmdline").read_bytes().replace(b"\0", b" ")
                 found.append(command.decode(errors="replace"))
-    return [command for command in found if "DashboardAgent" not in command]
+    return [command for command in found if not AGENT.match(command)]
