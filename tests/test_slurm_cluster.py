@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from slurm_cluster import lack_of_slurm, slurm_cluster
 
 from mjrec.engines.job_folder import Pace
 from mjrec.engines.slurm import SlurmEngine
 from mjrec.engines.work import WORK_FOLDER, Job, Run, Work
 from mjrec.errors import Error
-from slurm_cluster import lack_of_slurm, slurm_cluster
 
 pytest.importorskip("submitit")
 
