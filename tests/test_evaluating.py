@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evaluated_files import recorded_in
 
 import mjrec
 from mjrec import (
@@ -31,7 +32,6 @@ from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
 from mjrec.evaluation.results_files import read_results
 from mjrec.formats.locks import try_lock
-from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_metadata import metadata_path
 
 PENDULUM = "InvertedPendulum-v5"
@@ -178,29 +178,6 @@ def test_an_engine_changes_nothing(tmp_path: Path, engine: Any) -> None:
         assert {path.name for path in folder.glob("*.mp4")} == {
             video for video, _ in manifest_videos(folder)
         }
-
-
-def recorded_in(evaluation: Evaluation) -> dict[tuple[Any, ...], Any]:
-    """Return what was recorded of each episode, whatever its monitor was called."""
-    with (evaluation.directory / "timing.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    found: dict[tuple[Any, ...], Any] = {}
-    for row in rows:
-        of = (row["task"], row["seed"], row["episode"])
-        (folder,) = evaluation.directory.glob(row["task"])
-        with open_trajectory(folder / row["trajectory"]) as reader:
-            states = reader.states(0, reader.row_count).tobytes()
-            promised = (reader.header.facts.get("video") or {}).get("selection")
-        found[*of, "trajectory"] = (states, promised)
-        if row["video"]:
-            video = folder / row["video"]
-            assert row["video_sha256"]
-            found[*of, "video"] = (video.read_bytes(), hashes_of(video))
-    return found
-
-
-def hashes_of(video: Path) -> str:
-    return video.with_suffix(".framehash").read_text()
 
 
 def manifest_videos(folder: Path) -> list[list[str]]:

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evaluated_files import recorded_in
 from ray_clusters import home_for_ray, wait_until
 
 from mjrec.engines.ray import RayEngine
 from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation
-from mjrec.formats.trajectory_file import open_trajectory
 
 # Ray's own connections and pipes, of which it says so when they are collected.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -51,20 +51,6 @@ def run(directory: Path, **options: Any) -> Evaluation:
 
 def results_in(directory: Path) -> list[bytes]:
     return [(directory / name).read_bytes() for name in ("results.csv", "results.json")]
-
-
-def recorded_in(evaluation: Evaluation) -> dict[tuple[Any, ...], Any]:
-    """Return all states of all episodes, and the bytes of the videos."""
-    found: dict[tuple[Any, ...], Any] = {}
-    for path in evaluation.directory.glob("*/*.h5"):
-        with open_trajectory(path) as reader:
-            seed = reader.header.facts.get("seed")
-            found[path.parent.name, str(seed)] = reader.states(
-                0, reader.row_count
-            ).tobytes()
-    for path in evaluation.directory.glob("*/*.mp4"):
-        found["video", path.parent.name] = path.read_bytes()
-    return found
 
 
 class Huge:

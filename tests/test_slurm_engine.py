@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from evaluated_files import recorded_in
 from interruption import ctrl_c_soon
 
 import mjrec
@@ -21,7 +22,7 @@ from mjrec.engines.slurm import DEFAULT_WORKERS, SlurmEngine
 from mjrec.engines.work import WORK_FOLDER, Engine, Job, JobOutcome, Run, Work
 from mjrec.errors import ClosedError, Error, InvalidArgument, MissingDependency
 from mjrec.machine import usable_cpus
-from test_evaluating import SLOW, contents, ended, recorded_in
+from test_evaluating import SLOW, contents, ended
 from test_evaluating import begun as begun_in
 from test_evaluating import run as run_small
 

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an evaluation has recorded, whoever ran it and under whatever names."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from mjrec.evaluation.evaluation import Evaluation
+from mjrec.formats.trajectory_file import open_trajectory
+
+__all__ = ["datasets_in", "hashes_of", "recorded_in"]
+
+
+def recorded_in(evaluation: Evaluation) -> dict[tuple[Any, ...], Any]:
+    """Return what was recorded of each episode: every dataset, and videos as bytes.
+
+    By task, seed and episode; what differs with each run (names, times, versions) is
+    left out.
+    """
+    with (evaluation.directory / "timing.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found: dict[tuple[Any, ...], Any] = {}
+    for row in rows:
+        of = (row["task"], row["seed"], row["episode"])
+        (folder,) = evaluation.directory.glob(row["task"])
+        with open_trajectory(folder / row["trajectory"]) as reader:
+            promised = (reader.header.facts.get("video") or {}).get("selection")
+        found[*of, "trajectory"] = (datasets_in(folder / row["trajectory"]), promised)
+        if row["video"]:
+            video = folder / row["video"]
+            assert row["video_sha256"]
+            found[*of, "video"] = (video.read_bytes(), hashes_of(video))
+    return found
+
+
+def datasets_in(path: Path) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
+    """Return the datasets of a finished trajectory by name: type, shape, content."""
+    found: dict[str, tuple[str, tuple[int, ...], bytes]] = {}
+
+    def note(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            found[name] = (str(item.dtype), item.shape, item[()].tobytes())
+
+    with h5py.File(path) as file:
+        file.visititems(note)
+    assert "states" in found
+    return found
+
+
+def hashes_of(video: Path) -> str:
+    """Return the hashes of a video's pictures, as its file has them."""
+    return video.with_suffix(".framehash").read_text()
