@@ -29,8 +29,9 @@ class EngineOptions:
             Slurm cluster. All machines see the directory under the same name.
         gpus: how much of a GPU each worker gets; with 0.25 four share one.
         require_gpu: fail where a worker would draw in software.
-        address: of the Ray cluster; the one that RAY_ADDRESS names or that runs here,
-            else one that is started for this command, if it is not given.
+        address: of the Ray cluster, HOST:PORT, or auto for the one that runs here; the
+            one that RAY_ADDRESS names, else one that is started for this command, if it
+            is not given.
         engine_option: KEY=VALUE, what only this engine has, such as
             partition=gpu of Slurm. May be given several times.
     """

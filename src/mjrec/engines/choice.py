@@ -30,8 +30,8 @@ def engine_from(
     Args:
         name: `"local"`, `"ray"` or `"slurm"`.
         workers: how many at most; None is what the engine takes by itself.
-        address: of a Ray cluster; None is the one that `RAY_ADDRESS` names or that runs
-            on this machine, else one that is started for the run.
+        address: of a Ray cluster, `"auto"` for the one that runs on this machine; None
+            is the one that `RAY_ADDRESS` names, else one that is started for the run.
         gpus: how much of a GPU each worker gets.
         require_gpu: a worker that renders in software is an error.
         options: what belongs to one engine only, as texts: parameters of `SlurmEngine`.
