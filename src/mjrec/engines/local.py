@@ -9,22 +9,22 @@ import os
 import selectors
 import time
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from ..carried_errors import unpacked
 from ..child_python import environment_of_child
-from ..errors import ClosedError, Error, InvalidArgument
+from ..errors import Error, InvalidArgument
 from ..gl.given_gpu import CUDA_VISIBLE_DEVICES, visible_gpus
 from ..machine import usable_cpus
+from .base_run import BaseRun
 from .gpu_shares import GpuShare
-from .job_book import JobBook, Task, as_json
+from .job_book import Task, as_json
 from .local_process import WorkerProcess
 from .local_worker import SECONDS_TO_CLOSE
-from .work import Job, JobOutcome, Work
+from .work import Work
 
 __all__ = ["LocalEngine", "LocalRun", "check_worker_count"]
 
@@ -73,7 +73,7 @@ class LocalEngine:
         return LocalRun(work, self.workers, share=self.share, gpus=gpus)
 
 
-class LocalRun:
+class LocalRun(BaseRun):
     """Work that has been begun.
 
     Workers start, take jobs and are heard while `results` is iterated over. Each is
@@ -82,8 +82,6 @@ class LocalRun:
 
     A job whose worker dies is put behind the others and begun again, three times in
     all; then its failure says what the last worker died of.
-
-    For one thread at a time, and for the process that began it.
 
     Args:
         work: what the workers do.
@@ -106,6 +104,7 @@ class LocalRun:
         gpus: Sequence[str] = (),
         directory: Path | None = None,
     ) -> None:
+        super().__init__()
         self._most = workers
         self._share = share or GpuShare()
         self._gpus = gpus
@@ -115,62 +114,14 @@ class LocalRun:
         self._forget_work = weakref.finalize(self, os.close, self._work)
         self._selector = selectors.DefaultSelector()
         self._workers: list[_Worker] = []
-        self._book = JobBook()
         self._ends_at_once = 0
-        self._cancelled = False
-        self._process_id = os.getpid()
 
     @property
     def workers(self) -> int:
         """How many there are at most."""
         return self._most
 
-    def submit(self, job: Job) -> None:
-        """Hand out a job; also while results come.
-
-        Raises:
-            InvalidArgument: there was one with that key, or its arguments are no JSON.
-            ClosedError: the run is cancelled, or another process's.
-        """
-        self._check_usable()
-        self._book.add(job)
-
-    @property
-    def unfinished(self) -> int:
-        """How many jobs have been submitted whose outcome has not been given out."""
-        return self._book.unfinished
-
-    def results(
-        self, *, patience_s: float | None = None
-    ) -> Iterator[JobOutcome | None]:
-        """Yield outcomes as they come, until none is outstanding or all is cancelled.
-
-        Args:
-            patience_s: None is yielded whenever no outcome has come for so long; never,
-                if it is None.
-
-        Raises:
-            InvalidArgument: `patience_s` is no positive number.
-            ClosedError: the run is cancelled, or another process's.
-            Error: no worker can be started, each ends as soon as it begins, or what
-                makes the handler raised. What it raised, if that is one of ours.
-        """
-        self._check_usable()
-        if patience_s is not None and not patience_s > 0:
-            raise InvalidArgument(
-                f"patience_s must be a positive number of seconds, got {patience_s!r}."
-            )
-        return self._results(patience_s)
-
-    def cancel(self) -> None:
-        """End all workers; jobs that are not done stay so. Idempotent.
-
-        Workers are told to end (SIGTERM), so that what they are at can close its
-        files, and are killed where they have not done so after ten seconds.
-        """
-        if self._cancelled or os.getpid() != self._process_id:
-            return
-        self._cancelled = True
+    def _end(self) -> None:
         try:
             self._let_workers_end()
         finally:
@@ -180,43 +131,10 @@ class LocalRun:
             self._selector.close()
             self._forget_work()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.cancel()
-
-    def _check_usable(self) -> None:
-        if os.getpid() != self._process_id:
-            raise ClosedError(
-                f"The run belongs to process {self._process_id}: begin one in the "
-                "process that uses it."
-            )
-        if self._cancelled:
-            raise ClosedError("The run is cancelled.")
-
-    def _results(self, patience_s: float | None) -> Iterator[JobOutcome | None]:
-        last = time.monotonic()
-        while self.unfinished and not self._cancelled:
-            self._hand_out()
-            rest = None if patience_s is None else last + patience_s - time.monotonic()
-            # Also where there are outcomes: the workers shall not wait for the caller.
-            is_over = rest is not None and rest <= 0
-            self._listen(0 if self._book.has_outcome or is_over else rest)
-            self._hand_out()
-            outcome = self._book.next_outcome()
-            if outcome is not None:
-                yield outcome
-            elif is_over:
-                yield None
-            else:
-                continue
-            last = time.monotonic()
+    def _turn(self, seconds: float | None) -> None:
+        self._hand_out()
+        self._listen(seconds)
+        self._hand_out()
 
     def _hand_out(self) -> None:
         """Give jobs to whoever is idle; start no more workers than there are jobs."""

@@ -10,21 +10,21 @@ import time
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import mjrec
 
 from ..child_python import said_in
-from ..errors import ClosedError, Error, InvalidArgument
+from ..errors import Error
+from .base_run import BaseRun
 from .gpu_shares import GpuShare
 from .hosting import HomeLog, HostedWork, take_home
-from .job_book import JobBook, Task
+from .job_book import Task
 from .local import check_worker_count
 from .local_worker import SECONDS_TO_CLOSE
 from .ray_connection import ClusterWatch, RayConnection, import_ray
 from .ray_worker import METHODS_AT_ONCE, RayWorker
-from .work import Job, JobOutcome, Work
+from .work import JobOutcome, Work
 
 __all__ = ["RayEngine", "RayRun"]
 
@@ -104,7 +104,7 @@ class RayEngine:
             raise
 
 
-class RayRun:
+class RayRun(BaseRun):
     """Work that has been begun on a Ray cluster.
 
     Workers start, take jobs and are heard while `results` is iterated over. Each is
@@ -113,8 +113,6 @@ class RayRun:
 
     A job whose worker dies is put behind the others and begun again, three times in
     all; one whose machine goes away is begun again as often as that happens.
-
-    For one thread at a time, and for the process that began it.
 
     Args:
         hosted: what the workers do, as JSON.
@@ -133,6 +131,7 @@ class RayRun:
         workers: int | None,
         share: GpuShare,
     ) -> None:
+        super().__init__()
         self._ray = import_ray()
         self._asked_for = workers
         self._share = share
@@ -149,36 +148,18 @@ class RayRun:
             max_task_retries=0,
         )(RayWorker)
         self._seats: list[_Seat] = []
-        self._book = JobBook()
         self._log = HomeLog()
         self._ends_at_once = 0
         self._last_had_workers = time.monotonic()
         self._has_told_of_waiting = False
-        self._cancelled = False
-        self._process_id = os.getpid()
-        self._end = weakref.finalize(
-            self, _end, self._seats, self._watch, connection, os.getpid()
+        self._leave = weakref.finalize(
+            self, _leave, self._seats, self._watch, connection, os.getpid()
         )
 
     @property
     def workers(self) -> int:
         """How many there are at most: as asked for, or as there is room for now."""
         return self._asked_for or max(1, self._watch.room_for(self._share))
-
-    def submit(self, job: Job) -> None:
-        """Hand out a job; also while results come.
-
-        Raises:
-            InvalidArgument: there was one with that key, or its arguments are no JSON.
-            ClosedError: the run is cancelled, or another process's.
-        """
-        self._check_usable()
-        self._book.add(job)
-
-    @property
-    def unfinished(self) -> int:
-        """How many jobs have been submitted whose outcome has not been given out."""
-        return self._book.unfinished
 
     def results(
         self, *, patience_s: float | None = None
@@ -198,65 +179,20 @@ class RayRun:
             Error: the cluster is gone, no worker can begin, or what makes the handler
                 raised. What it raised, if that is one of ours.
         """
-        self._check_usable()
-        if patience_s is not None and not patience_s > 0:
-            raise InvalidArgument(
-                f"patience_s must be a positive number of seconds, got {patience_s!r}."
-            )
-        return self._results(patience_s)
+        self._last_had_workers = time.monotonic()
+        return super().results(patience_s=patience_s)
 
-    def cancel(self) -> None:
-        """End all workers; jobs that are not done stay so. Idempotent.
-
-        They let what they are at close its files, and are killed where they have not
-        done so after some seconds.
-        """
-        if self._cancelled or os.getpid() != self._process_id:
-            return
-        self._cancelled = True
+    def _end(self) -> None:
         try:
             self._let_workers_end()
         finally:
             # Also where Ctrl-C has cut the waiting short.
-            self._end()
+            self._leave()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.cancel()
-
-    def _check_usable(self) -> None:
-        if os.getpid() != self._process_id:
-            raise ClosedError(
-                f"The run belongs to process {self._process_id}: begin one in the "
-                "process that uses it."
-            )
-        if self._cancelled:
-            raise ClosedError("The run is cancelled.")
-
-    def _results(self, patience_s: float | None) -> Iterator[JobOutcome | None]:
-        last = self._last_had_workers = time.monotonic()
-        while self.unfinished and not self._cancelled:
-            self._hand_out()
-            rest = None if patience_s is None else last + patience_s - time.monotonic()
-            # Also where there are outcomes: the workers shall not wait for the caller.
-            is_over = rest is not None and rest <= 0
-            self._listen(0 if self._book.has_outcome or is_over else rest)
-            self._hand_out()
-            outcome = self._book.next_outcome()
-            if outcome is not None:
-                yield outcome
-            elif is_over:
-                yield None
-            else:
-                continue
-            last = time.monotonic()
+    def _turn(self, seconds: float | None) -> None:
+        self._hand_out()
+        self._listen(seconds)
+        self._hand_out()
 
     def _hand_out(self) -> None:
         """Give jobs to whoever is idle; start no more workers than there are jobs."""
@@ -439,7 +375,7 @@ class _Seat:
             import_ray().kill(self.actor)
 
 
-def _end(
+def _leave(
     seats: list[_Seat], watch: ClusterWatch, connection: RayConnection, owner: int
 ) -> None:
     # A forked child has copies.

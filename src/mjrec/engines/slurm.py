@@ -14,24 +14,24 @@ import math
 import os
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from types import TracebackType
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 from ..child_python import said_in
-from ..errors import ClosedError, InvalidArgument, UnknownName
+from ..errors import InvalidArgument, UnknownName
 from ..machine import usable_cpus
+from .base_run import BaseRun
 from .driver_sign import DriverSign
 from .gpu_shares import GpuShare
 from .hosting import HomeLog, HostedWork, take_home
-from .job_book import JobBook, Task
+from .job_book import Task
 from .job_folder import JobFolder, Pace, TakenJob
 from .job_folder_host import GIVEN_BACK, HAD_MUCH_TIME
 from .local import check_worker_count
 from .run_place import EarlierRun, RunPlace
 from .slurm_hosts import HostEnd, SlurmHosts
 from .slurm_jobs import ClusterJobs, JobRequest, check_cluster, cluster_jobs
-from .work import Job, JobOutcome, Run, Work
+from .work import Run, Work
 
 __all__ = ["DEFAULT_WORKERS", "SlurmEngine", "SlurmRun"]
 
@@ -201,15 +201,13 @@ class SlurmEngine:
         )
 
 
-class SlurmRun:
+class SlurmRun(BaseRun):
     """Work that has been begun.
 
     Slurm jobs are submitted, and jobs handed out, while `results` is iterated over. One
     that ends is replaced as long as there is work for it. A job whose worker dies is
     begun again in the same Slurm job; one whose Slurm job ends in another, which counts
     as a try where the job itself may be to blame.
-
-    For one thread at a time, and for the process that began it.
 
     Args:
         work: what the workers do.
@@ -239,6 +237,7 @@ class SlurmRun:
                 "Workers in Slurm jobs need a directory that all machines see, and "
                 "this work names none (shared_directory)."
             )
+        super().__init__()
         self._most = workers
         self._request = request
         self._pace = pace
@@ -250,13 +249,11 @@ class SlurmRun:
             EarlierRun(folder, request, pace) for folder in self._place.others()
         ]
         self._hosts = SlurmHosts(self._folder, self._jobs, pace)
-        self._book = JobBook()
         self._log = HomeLog()
         self._out: dict[int, Task] = {}
         self._numbers = itertools.count(1)
         self._looked = -math.inf
-        self._cancelled = False
-        self._process_id = os.getpid()
+        self._pause = _SHORTEST_POLL
         self._leave = weakref.finalize(
             self, _abandon, self._folder, self._jobs, self._sign, os.getpid()
         )
@@ -267,53 +264,7 @@ class SlurmRun:
         """How many there are at most."""
         return self._most
 
-    def submit(self, job: Job) -> None:
-        """Hand out a job; also while results come.
-
-        Raises:
-            InvalidArgument: there was one with that key, or its arguments are no JSON.
-            ClosedError: the run is cancelled, or another process's.
-        """
-        self._check_usable()
-        self._book.add(job)
-
-    @property
-    def unfinished(self) -> int:
-        """How many jobs have been submitted whose outcome has not been given out."""
-        return self._book.unfinished
-
-    def results(
-        self, *, patience_s: float | None = None
-    ) -> Iterator[JobOutcome | None]:
-        """Yield outcomes as they come, until none is outstanding or all is cancelled.
-
-        Args:
-            patience_s: None is yielded whenever no outcome has come for so long; never,
-                if it is None.
-
-        Raises:
-            InvalidArgument: `patience_s` is no positive number.
-            ClosedError: the run is cancelled, or another process's.
-            Error: Slurm takes no jobs, they end again and again before they have done
-                anything, or what makes the handler raised. What it raised, if that is
-                one of ours.
-        """
-        self._check_usable()
-        if patience_s is not None and not patience_s > 0:
-            raise InvalidArgument(
-                f"patience_s must be a positive number of seconds, got {patience_s!r}."
-            )
-        return self._results(patience_s)
-
-    def cancel(self) -> None:
-        """End all Slurm jobs; jobs that are not done stay so. Idempotent.
-
-        Workers are told to end (SIGTERM), so that what they are at can close its
-        files, and are killed where they have not done so after some seconds.
-        """
-        if self._cancelled or os.getpid() != self._process_id:
-            return
-        self._cancelled = True
+    def _end(self) -> None:
         try:
             self._hosts.end_all()
         finally:
@@ -322,52 +273,18 @@ class SlurmRun:
                 run.tidy_up()
             self._place.tidy_up(keep=self._hosts.logs_to_keep)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.cancel()
-
-    def _check_usable(self) -> None:
-        if os.getpid() != self._process_id:
-            raise ClosedError(
-                f"The run belongs to process {self._process_id}: begin one in the "
-                "process that uses it."
-            )
-        if self._cancelled:
-            raise ClosedError("The run is cancelled.")
-
-    def _results(self, patience_s: float | None) -> Iterator[JobOutcome | None]:
-        last, pause = time.monotonic(), _SHORTEST_POLL
-        while self.unfinished and not self._cancelled:
-            if self._turn():
-                pause = _SHORTEST_POLL
-            outcome = self._book.next_outcome()
-            rest = None if patience_s is None else last + patience_s - time.monotonic()
-            if outcome is not None:
-                yield outcome
-            elif rest is not None and rest <= 0:
-                yield None
-            else:
-                time.sleep(pause if rest is None else min(pause, rest))
-                pause = min(pause * _POLLS_GROW, self._pace.poll_s)
-                continue
-            last = time.monotonic()
-
-    def _turn(self) -> bool:
-        """Do what there is to do now; return whether there were outcomes."""
+    def _turn(self, seconds: float | None) -> None:
         any_came = self._hear()
         now = time.monotonic()
         if now - self._looked >= self._pace.look_s:
             self._looked = now
             self._look()
         self._hand_out()
-        return any_came
+        if any_came or self._book.has_outcome:
+            self._pause = _SHORTEST_POLL
+        elif seconds != 0:
+            time.sleep(self._pause if seconds is None else min(self._pause, seconds))
+            self._pause = min(self._pause * _POLLS_GROW, self._pace.poll_s)
 
     def _hear(self) -> bool:
         came = False
