@@ -95,7 +95,8 @@ class OddJobs:
     def meet(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Wait until another job has opened the other end of a pipe."""
         with Path(arguments["pipe"]).open(arguments["mode"]):
-            return {"pid": os.getpid()}
+            gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
+            return {"pid": os.getpid(), "gpus": gpus}
 
     def hold(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Keep at it until a signal comes; a file says when it has begun."""

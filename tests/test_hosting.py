@@ -12,7 +12,8 @@ import pytest
 from processes import children
 
 from mjrec.engines.gpu_shares import GpuShare
-from mjrec.engines.hosting import HomeLog, Host, HostedWork, take_home
+from mjrec.engines.home_log import HomeLog
+from mjrec.engines.hosting import Host, HostedWork, take_home
 from mjrec.engines.job_book import JobBook, Task
 from mjrec.engines.work import Job, Work
 from mjrec.errors import InvalidArgument, UnknownName

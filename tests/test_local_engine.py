@@ -22,7 +22,7 @@ import mjrec
 from mjrec.engines import local
 from mjrec.engines.local import LocalEngine, LocalRun
 from mjrec.engines.work import Engine, Job, JobOutcome, Run, Work
-from mjrec.errors import ClosedError, Error, InvalidArgument
+from mjrec.errors import ClosedError, Error, GLError, InvalidArgument
 from mjrec.machine import usable_cpus
 
 
@@ -190,6 +190,52 @@ def test_workers_are_one_for_each_cpu() -> None:
     """Unless their number is given."""
     assert LocalEngine().workers == usable_cpus()
     assert repr(LocalEngine(3)) == "LocalEngine(workers=3)"
+
+
+# GPUs
+
+
+def test_workers_share_the_gpus_that_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each sees the one that it was given, and no other; two share the first."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    wait = {"do": "meet", "pipe": str(tmp_path / "pipe")}
+    os.mkfifo(tmp_path / "pipe")
+    engine = LocalEngine(2, gpus=0.5)
+    with engine.begin(Work(entry="odd_jobs:make")) as run:
+        # Both at once, so that each is done by a worker of its own.
+        run.submit(Job(key="a", arguments={**wait, "mode": "rb"}))
+        run.submit(Job(key="b", arguments={**wait, "mode": "wb"}))
+        met = {value["pid"]: value["gpus"] for value in values(run)}
+    assert [*met.values()] == ["3", "3"]
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "3,5"
+    assert repr(engine) == "LocalEngine(workers=2, gpus=0.5)"
+
+
+def test_rendering_in_software_on_a_given_gpu_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Once, however many workers: they do their jobs all the same."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    with LocalEngine(2, gpus=0.5).begin(Work(entry="odd_jobs:make")) as run:
+        os.mkfifo(tmp_path / "pipe")
+        submit(run, "a", do="meet", pipe=str(tmp_path / "pipe"), mode="rb")
+        submit(run, "b", do="meet", pipe=str(tmp_path / "pipe"), mode="wb")
+        assert len(values(run)) == 2
+    assert len([text for text in caplog.messages if "GPU 3" in text]) == 1
+
+
+def test_a_gpu_that_is_required_and_is_not_there_is_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Before any job is done."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    engine = LocalEngine(1, gpus=1, require_gpu=True)
+    with engine.begin(Work(entry="odd_jobs:make")) as run:
+        submit(run, "a", do="echo")
+        with pytest.raises(GLError, match="GPU 3"):
+            outcomes(run)
 
 
 @pytest.mark.parametrize("workers", [0, -1, 1.5, True, "2"])

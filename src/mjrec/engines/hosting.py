@@ -19,7 +19,7 @@ import dataclasses
 import json
 import logging
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -29,11 +29,12 @@ from ..carried_errors import carried, unpacked
 from ..child_python import said_in
 from ..errors import Error
 from .gpu_shares import GpuShare
+from .home_log import HomeLog
 from .job_book import JobBook, Task, as_json
 from .local import LocalRun
 from .work import Job, JobOutcome, Work
 
-__all__ = ["HomeLog", "Host", "HostedWork", "take_home"]
+__all__ = ["Host", "HostedWork", "take_home"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,23 +184,6 @@ class Host:
         return json.dumps({**facts, "log": self._log.take()}).encode()
 
 
-class HomeLog:
-    """Logs in the driver what was logged elsewhere, each text once.
-
-    A hundred workers have the same to complain of.
-    """
-
-    def __init__(self) -> None:
-        self._told: set[tuple[str, int, str]] = set()
-
-    def tell(self, said: Mapping[str, Any]) -> None:
-        """Log what came home in a line, besides the outcome."""
-        for name, level, text in said.get("log", ()):
-            if (name, level, text) not in self._told:
-                self._told.add((name, level, text))
-                logging.getLogger(name).log(level, "%s", text)
-
-
 def take_home(line: bytes, task: Task, book: JobBook, log: HomeLog) -> None:
     """Note in the driver what a host has sent home of a job.
 
@@ -216,7 +200,7 @@ def take_home(line: bytes, task: Task, book: JobBook, log: HomeLog) -> None:
         Error: what stands in the way of any worker, as it was raised there.
     """
     said = said_in(line)
-    log.tell(said)
+    log.tell(said.get("log", ()))
     if "error" not in said:
         book.finish(
             task,

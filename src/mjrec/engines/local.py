@@ -21,6 +21,7 @@ from ..gl.given_gpu import CUDA_VISIBLE_DEVICES, visible_gpus
 from ..machine import usable_cpus
 from .base_run import BaseRun
 from .gpu_shares import GpuShare
+from .home_log import HomeLog
 from .job_book import Task, as_json
 from .local_process import WorkerProcess
 from .local_worker import SECONDS_TO_CLOSE
@@ -114,6 +115,7 @@ class LocalRun(BaseRun):
         self._forget_work = weakref.finalize(self, os.close, self._work)
         self._selector = selectors.DefaultSelector()
         self._workers: list[_Worker] = []
+        self._log = HomeLog()
         self._ends_at_once = 0
 
     @property
@@ -176,8 +178,7 @@ class LocalRun(BaseRun):
             return
         for answer in answers:
             if "log" in answer:
-                name, level, text = answer["log"]
-                logging.getLogger(name).log(level, "%s", text)
+                self._log.tell([answer["log"]])
             elif "ready" in answer:
                 worker.is_ready = True
                 self._ends_at_once = 0

@@ -18,7 +18,8 @@ from ..child_python import said_in
 from ..errors import Error
 from .base_run import BaseRun
 from .gpu_shares import GpuShare
-from .hosting import HomeLog, HostedWork, take_home
+from .home_log import HomeLog
+from .hosting import HostedWork, take_home
 from .job_book import Task
 from .local import check_worker_count
 from .local_worker import SECONDS_TO_CLOSE

@@ -23,7 +23,8 @@ from ..machine import usable_cpus
 from .base_run import BaseRun
 from .driver_sign import DriverSign
 from .gpu_shares import GpuShare
-from .hosting import HomeLog, HostedWork, take_home
+from .home_log import HomeLog
+from .hosting import HostedWork, take_home
 from .job_book import Task
 from .job_folder import JobFolder, Pace, TakenJob
 from .job_folder_host import GIVEN_BACK, HAD_MUCH_TIME
@@ -302,7 +303,7 @@ class SlurmRun(BaseRun):
         if not said:
             self._book.put_back(task)
         elif GIVEN_BACK in said:
-            self._log.tell(said)
+            self._log.tell(said.get("log", ()))
             self._take_back(task, said[GIVEN_BACK], is_try=said[HAD_MUCH_TIME])
         else:
             take_home(line, task, self._book, self._log)
