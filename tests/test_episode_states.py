@@ -439,6 +439,20 @@ def test_an_infinite_plane_remembers_the_camera_before(simulation: Simulation) -
     _recorded_and_live(simulation, 3)
 
 
+def test_pictures_before_can_be_forgotten(simulation: Simulation) -> None:
+    """Then an episode begins in a scene that nothing has been drawn in."""
+    simulation.compile(BALL, plane="0 0 1")
+    simulation.begin()
+    simulation.capture()
+    after = simulation.begin().scene
+    assert after is not None
+    assert after["previous_cameras"] is not None
+    simulation.states.forget_pictures()
+    scene = simulation.begin().scene
+    assert scene is not None
+    assert scene["previous_cameras"] is None
+
+
 def test_only_infinite_planes_in_scenes_that_stay_remember(tmp_path: Path) -> None:
     """A plane with edges does not, nor does a scene that is made for each picture."""
     for plane, fresh in (("2 2 1", False), ("0 0 1", True)):

@@ -30,7 +30,9 @@ from mjrec import (
 from mjrec.evaluation import evaluating
 from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
+from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.results_files import read_results
+from mjrec.evaluation.splitting import batches_of
 from mjrec.formats.locks import try_lock
 from mjrec.formats.video_metadata import metadata_path
 
@@ -183,6 +185,42 @@ def test_an_engine_changes_nothing(tmp_path: Path, engine: Any) -> None:
 def manifest_videos(folder: Path) -> list[list[str]]:
     manifests = map(json.loads, map(Path.read_text, folder.glob("*.manifest.json")))
     return [pair for manifest in manifests for pair in manifest["videos"]]
+
+
+def test_videos_do_not_depend_on_what_was_run_before(tmp_path: Path) -> None:
+    """The camera is placed anew in each episode, not at an environment's first picture."""
+    options: dict[str, Any] = {
+        "tasks": ["Reacher-v5"],
+        # By one worker in batches of two, by three in batches of one.
+        "episodes": 8,
+        "num_seeds": 1,
+        "keep": "all",
+        "max_steps": 12,
+    }
+    one = run(tmp_path / "one", **options, workers=1)
+    three = run(tmp_path / "three", **options, workers=3)
+    run(tmp_path / "parts", **{**options, "episodes": 3}, workers=1)
+    parts = run(tmp_path / "parts", **options, workers=1, resume=True)
+    videos = [videos_in(each) for each in (one, three, parts)]
+    assert len(videos[0]) == 8
+    assert videos[0] == videos[1] == videos[2]
+
+
+def videos_in(evaluation: Evaluation) -> dict[str, bytes]:
+    """Return the videos by episode."""
+    with (evaluation.directory / "timing.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    (folder,) = (path for path in evaluation.directory.iterdir() if path.is_dir())
+    return {row["episode"]: (folder / row["video"]).read_bytes() for row in rows}
+
+
+def test_what_is_drawn_live_has_an_environment_for_each_episode() -> None:
+    """Its pictures may depend on those before, and nobody can make them forget."""
+    tasks = (EvaluatedTask("live", "a"), EvaluatedTask("later", "b"))
+    plan = EvaluationPlan(tasks=tasks, policy="zero", seeds=(0,), episodes=16)
+    batches = batches_of(plan, {}, workers=2, alone={"live"})
+    sizes = [(batch.task, len(batch.episodes)) for batch in batches]
+    assert sizes == [("live", 1)] * 16 + [("later", 4)] * 4
 
 
 def test_an_engine_draws_while_other_tasks_run(tmp_path: Path) -> None:

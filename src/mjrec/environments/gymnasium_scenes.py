@@ -158,6 +158,7 @@ def _states(simulated: Any, view: dict[str, Any]) -> EpisodeStates:
     return EpisodeStates(
         lambda: (simulated.model, simulated.data),
         view=scene,
+        forget=scene.forget,
         at_picture=_at_picture(simulated, scene),
         authored=lambda: _authored(simulated),
         obstacle=None if own_view else scene.obstacle,

@@ -44,6 +44,7 @@ def mjcf_scenes(
         states=EpisodeStates(
             lambda: (simulation.model, simulation.data),
             view=scene,
+            forget=scene.forget,
             at_picture=scene.at_picture,
             authored=lambda: authored_from_file(env.path),
         ),

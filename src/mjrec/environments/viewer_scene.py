@@ -91,6 +91,13 @@ class ViewerScene:
         self._is_settled = True
         capture()
 
+    def forget(self) -> None:
+        """Go by the next picture as if it were the first.
+
+        A viewer that the environment has already stays as it is.
+        """
+        self._start()
+
     def is_unmoved(self) -> bool:
         """Tell, in a moment, that nothing is other than at the picture before.
 

@@ -287,7 +287,7 @@ def _run(
     )
     with engine.begin(work) as run:
         left = [task for task in plan.tasks if _is_left(plan, done[task.name])]
-        amounts = check_tasks(run, plan, left)
+        checked = check_tasks(run, plan, left)
         if not is_begun:
             _make(directory)
             stack.enter_context(_held(directory))
@@ -297,7 +297,7 @@ def _run(
             plan,
             directory,
             done=done,
-            work=amounts,
+            checked=checked,
             draws=draws,
             on_results=on_results,
             tell=tell,

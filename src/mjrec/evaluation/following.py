@@ -32,7 +32,7 @@ from .plan import Batch, EvaluatedTask, EvaluationPlan
 from .progress_counts import LedgerCounts
 from .splitting import batches_of
 
-__all__ = ["TaskRun", "check_tasks", "run_tasks"]
+__all__ = ["CheckedTask", "TaskRun", "check_tasks", "run_tasks"]
 
 logger = logging.getLogger(__name__)
 
@@ -82,13 +82,26 @@ class TaskRun:
         return list(keys)
 
 
+@dataclass(frozen=True, kw_only=True)
+class CheckedTask:
+    """What workers say of a task before it is run.
+
+    Attributes:
+        velocities: of its simulation: how much work a step is, roughly.
+        is_drawn_live: pictures are wanted, and cannot be drawn later.
+    """
+
+    velocities: int
+    is_drawn_live: bool
+
+
 def check_tasks(
     run: Run, plan: EvaluationPlan, tasks: Iterable[EvaluatedTask]
-) -> dict[str, int]:
+) -> dict[str, CheckedTask]:
     """Let workers make the environment and the policy of each task, and no step.
 
     Returns:
-        How much work a step of each task is, roughly, by name.
+        What they say of each, by name.
 
     Raises:
         Error: the one that making them raised, such as an `UnknownName`.
@@ -99,13 +112,16 @@ def check_tasks(
     for key, name in names.items():
         run.submit(Job(key=key, arguments={"kind": "check", "task": name}))
     rule = keep_rule(plan.keep)
-    work: dict[str, int] = {}
+    checked: dict[str, CheckedTask] = {}
     for outcome in run.results():
         # Without patience there is always one.
         assert outcome is not None
         name = names[outcome.key]
-        work[name] = _checked(name, outcome, rule)["velocities"]
-    return work
+        said = _checked(name, outcome, rule)
+        checked[name] = CheckedTask(
+            velocities=said["velocities"], is_drawn_live=not said["deferrable"]
+        )
+    return checked
 
 
 def run_tasks(
@@ -114,7 +130,7 @@ def run_tasks(
     directory: Path,
     *,
     done: _Done,
-    work: Mapping[str, int],
+    checked: Mapping[str, CheckedTask],
     draws: bool,
     on_results: Callable[[Sequence[TaskRun]], object],
     tell: _Tell,
@@ -126,7 +142,7 @@ def run_tasks(
         plan: what is evaluated.
         directory: of the evaluation.
         done: the results of what was done before, by task.
-        work: how much a step of each task is that is not done, as `check_tasks` says.
+        checked: the tasks that are not done, as `check_tasks` says.
         draws: whether the workers draw the videos of the chosen episodes, too.
         on_results: called once, with the tasks, when all are settled: what is left
             then are videos.
@@ -138,7 +154,7 @@ def run_tasks(
     runner = _Runner(
         run, plan, directory, draws=draws, on_results=on_results, tell=tell
     )
-    return runner.run(done, work)
+    return runner.run(done, checked)
 
 
 def _checked(task: str, outcome: JobOutcome, rule: KeepRule) -> Mapping[str, Any]:
@@ -193,10 +209,15 @@ class _Runner:
         self._recordings: dict[str, EpisodeKey] = {}
         self._counts = LedgerCounts(directory / task.folder for task in plan.tasks)
 
-    def run(self, done: _Done, work: Mapping[str, int]) -> list[TaskRun]:
-        batches = batches_of(self._plan, done, workers=self._run.workers)
+    def run(self, done: _Done, checked: Mapping[str, CheckedTask]) -> list[TaskRun]:
+        batches = batches_of(
+            self._plan,
+            done,
+            workers=self._run.workers,
+            alone={name for name, of in checked.items() if of.is_drawn_live},
+        )
         # What takes long comes first, so that all workers end at about the same time.
-        for batch in sorted(batches, key=lambda batch: -work.get(batch.task, 0)):
+        for batch in sorted(batches, key=lambda each: -checked[each.task].velocities):
             self._submit_batch(batch)
         for of in self._tasks.values():
             if not of.unfinished:

@@ -313,6 +313,8 @@ class _BatchRun:
 
     def _run_episode(self, recorded: _Recorded, begin: _Begin) -> EpisodeResult:
         monitor = recorded.monitor
+        # Whatever came before it in this batch: other batches have other episodes.
+        monitor.forget_pictures()
         running = _Running(
             EpisodeResult(
                 task=self._batch.task,

@@ -17,7 +17,11 @@ _Unit = tuple[int, int]
 
 
 def batches_of(
-    plan: EvaluationPlan, done: Mapping[str, Container[_Unit]], *, workers: int
+    plan: EvaluationPlan,
+    done: Mapping[str, Container[_Unit]],
+    *,
+    workers: int,
+    alone: Container[str] = (),
 ) -> list[Batch]:
     """Return what is left to do, in the order of the plan.
 
@@ -25,9 +29,11 @@ def batches_of(
         plan: what is evaluated.
         done: seed and number of the episodes that are done, by task.
         workers: how many processes it is for.
+        alone: the names of tasks of which each episode is to have an environment of its
+            own: what is drawn live depends on what was drawn before.
     """
     left = {task.name: _left(plan, done.get(task.name, ())) for task in plan.tasks}
-    return list(_batches(plan, left, workers))
+    return list(_batches(plan, left, workers, alone))
 
 
 def _left(plan: EvaluationPlan, done: Container[_Unit]) -> Mapping[int, Sequence[int]]:
@@ -42,10 +48,12 @@ def _batches(
     plan: EvaluationPlan,
     left: Mapping[str, Mapping[int, Sequence[int]]],
     workers: int,
+    alone: Container[str],
 ) -> Iterator[Batch]:
     units = sum(len(numbers) for runs in left.values() for numbers in runs.values())
-    size = max(1, units // (_BATCHES_PER_WORKER * workers))
+    usual = max(1, units // (_BATCHES_PER_WORKER * workers))
     for task in plan.tasks:
+        size = 1 if task.name in alone else usual
         for seed, numbers in left[task.name].items():
             if plan.protocol == SUITE:
                 # All or nothing: an episode starts where the last one has ended.

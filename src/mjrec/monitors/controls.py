@@ -106,6 +106,17 @@ class MonitorControls(MonitorLifetime):
         """
         self._recorder.model_changed()
 
+    def forget_pictures(self) -> None:
+        """Let the next episode look as if it were the environment's first.
+
+        Gymnasium places its free camera at the first picture, and infinite planes and
+        tracking cameras go by the picture before: an episode looks other as the tenth
+        than as the first. After this call, between two episodes, the next is shown as
+        by an environment that has just been made. Where pictures are drawn live it
+        changes nothing.
+        """
+        self._recorder.forget_pictures()
+
     def close(self, *, wait: bool = True) -> None:
         """Finish the recordings, then close the environment. Idempotent.
 

@@ -234,6 +234,11 @@ class Recorder:
         for states in self._all_states():
             states.model_changed()
 
+    def forget_pictures(self) -> None:
+        """Let the next episode's pictures depend on none that was made before."""
+        for states in self._all_states():
+            states.forget_pictures()
+
     def resetting(self) -> AbstractContextManager[None]:
         """Return what to put around the reset of the environment."""
         if self._states is None or self._choice.mode == LIVE:

@@ -55,6 +55,7 @@ class EpisodeStates:
         is_unmoved: tells, faster than the others do, that simulation and view are as
             when `view` was asked, and nothing stands in the way: no other is then
             called.
+        forget: lets the view be again as if nothing had been shown.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class EpisodeStates:
         authored: Callable[[], AuthoredModel | None] | None = None,
         obstacle: Callable[[], str | None] | None = None,
         is_unmoved: Callable[[], bool] | None = None,
+        forget: Callable[[], None] = lambda: None,
     ) -> None:
         self._simulation = simulation
         self._view = view
@@ -75,6 +77,7 @@ class EpisodeStates:
         self._authored = authored
         self._obstacle = obstacle
         self._is_unmoved = is_unmoved
+        self._forget = forget
         self._store: ModelStore | None = None
         self._stored: _StoredModel | None = None
         self._pictures: PictureStates | None = None
@@ -180,6 +183,13 @@ class EpisodeStates:
         if self._quick is not None:
             self._quick.is_over = True
             self._quick = None
+
+    def forget_pictures(self) -> None:
+        """Let the next episode's first picture be the first of all."""
+        self._forget()
+        self._pictures = None
+        if self._stored is not None:
+            self._stored.forget_pictures()
 
     def finish(self) -> None:
         """Wait until every model is stored.
@@ -320,6 +330,10 @@ class _StoredModel:
             kept=self._kept_cameras(view),
             checked=self._checked,
         )
+
+    def forget_pictures(self) -> None:
+        """Forget what pictures have left in the scene; of `pictures` make others."""
+        self._kept = None
 
     def _kept_cameras(self, view: SceneView) -> KeptCameras | None:
         if self._kept is None and moves_cameras(self._model, view):

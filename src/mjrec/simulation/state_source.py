@@ -99,6 +99,13 @@ class StateSource(Protocol):
     def model_changed(self) -> None:
         """Note that anything in the model may be another; the next capture looks."""
 
+    def forget_pictures(self) -> None:
+        """Let the next episode's pictures depend on none that was made before.
+
+        To be called between episodes. Cameras that are placed at the first picture, or
+        that each picture moves, are as in a simulation that has just been made.
+        """
+
     def finish(self) -> None:
         """Wait until every model is stored.
 
