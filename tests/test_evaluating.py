@@ -188,7 +188,7 @@ def manifest_videos(folder: Path) -> list[list[str]]:
 
 
 def test_videos_do_not_depend_on_what_was_run_before(tmp_path: Path) -> None:
-    """The camera is placed anew in each episode, not at an environment's first picture."""
+    """The camera is placed anew in each episode, not once for an environment."""
     options: dict[str, Any] = {
         "tasks": ["Reacher-v5"],
         # By one worker in batches of two, by three in batches of one.

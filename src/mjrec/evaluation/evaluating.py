@@ -31,6 +31,7 @@ from ..recorder.versions import versions
 from ..rendering.on_engine import given_engine
 from ..rendering.video_jobs import environ_for_drawing
 from .chosen_videos import ChosenVideos, drawn_by_workers, render_chosen
+from .episode_results import EpisodeResult
 from .evaluation import Evaluation, EvaluationProgress
 from .following import TaskRun, check_tasks, run_tasks
 from .kept_episodes import keep_rule
@@ -269,10 +270,7 @@ def _run(
     """
     if is_begun:
         stack.enter_context(_held(directory))
-    done = {
-        task.name: read_ledgers(directory / task.folder) if is_begun else {}
-        for task in plan.tasks
-    }
+    done = _done(plan, directory, is_begun=is_begun)
     work = Work(
         entry=_WORKER,
         settings={
@@ -292,6 +290,8 @@ def _run(
             _make(directory)
             stack.enter_context(_held(directory))
         write_plan(directory, plan)
+        # Once more: workers of a driver that was killed have gone on until now.
+        done = _done(plan, directory, is_begun=is_begun)
         return run_tasks(
             run,
             plan,
@@ -302,6 +302,16 @@ def _run(
             on_results=on_results,
             tell=tell,
         )
+
+
+def _done(
+    plan: EvaluationPlan, directory: Path, *, is_begun: bool
+) -> dict[str, dict[tuple[int, int], EpisodeResult]]:
+    """Return the results of the episodes that are over, by task."""
+    return {
+        task.name: read_ledgers(directory / task.folder) if is_begun else {}
+        for task in plan.tasks
+    }
 
 
 def _environ_of_workers(plan: EvaluationPlan, *, draws: bool) -> dict[str, str]:
