@@ -28,11 +28,13 @@ from mjrec.commands import main
 from mjrec.simulation.model_store import load_model
 from mjrec.simulation.model_trust import (
     TRUST_VARIABLE,
+    environ_with_key,
     is_sealed,
     is_trusted,
     seal_of,
     trusting_models,
 )
+from mjrec.surroundings import Surroundings
 
 DIGEST = hashlib.sha256(b"a model").hexdigest()
 BY_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
@@ -139,6 +141,37 @@ def test_other_processes_of_the_user_have_the_same() -> None:
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(2)]
     said = {process.communicate()[0].decode() for process in processes}
     assert said == {seal_of(DIGEST)}
+
+
+def test_workers_elsewhere_seal_as_the_user_who_sent_them(
+    state_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their machine's home is another one; its own seals are good there, too."""
+    here = seal_of(DIGEST)
+    given = environ_with_key()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "node"))
+    own = seal_of(DIGEST)
+    assert own != here
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    assert seal_of(DIGEST) == here
+    assert is_sealed(here, DIGEST)
+    assert is_sealed(own, DIGEST)
+    assert environ_with_key() == given
+    # Which would be in every recording.
+    around = Surroundings(tmp_path).found(wait=True)
+    assert around is not None
+    assert "XDG_STATE_HOME" not in around["variables"]
+    assert not around["variables"].keys() & given.keys()
+
+
+@pytest.mark.parametrize("said", ["", "no hex", "00"])
+def test_what_is_no_key_is_not_used(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The user's own is."""
+    own = seal_of(DIGEST)
+    [name] = environ_with_key()
+    monkeypatch.setenv(name, said)
+    assert seal_of(DIGEST) == own
 
 
 def test_without_variables_the_home_is_that_of_the_password_file(

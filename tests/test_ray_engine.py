@@ -5,6 +5,8 @@ import hashlib
 import logging
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -340,6 +342,52 @@ print(sorted(os.listdir(os.environ["HOME"])))
     environ = {MARK: str(tmp_path), "HOME": str(tmp_path), "RAY_AUTH_TOKEN": ""}
     assert run_python(script, **environ) == "[]\n"
     wait_until(lambda: not ray_processes(mark), seconds=10)
+
+
+def test_a_ray_of_our_own_without_a_gpu(tmp_path: Path) -> None:
+    """One warning, and the jobs are done; nobody waits for what will never be there."""
+    script = """
+import logging, sys
+from mjrec.engines.ray import RayEngine
+from mjrec.errors import GLError
+from ray_runs import begun, submit, values
+logging.basicConfig(stream=sys.stdout, format="%(message)s")
+with begun(engine=RayEngine(1, gpus=0.5)) as run:
+    submit(run, "a", "b", do="echo")
+    assert len(values(run)) == 2
+try:
+    begun(engine=RayEngine(1, gpus=0.5, require_gpu=True))
+except GLError as error:
+    print("refused:", error)
+"""
+    said = run_python(script, **{MARK: str(tmp_path)})
+    assert said.count("Ray finds none on this machine. They draw in software.") == 1
+    assert "refused: Workers are to get GPUs" in said
+    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=10)
+
+
+def test_a_terminated_driver_says_so(tmp_path: Path) -> None:
+    """By the exit status of SIGTERM, whatever Ray makes of signals."""
+    script = """
+import os, signal, sys
+from pathlib import Path
+from mjrec.signals import exiting_on_signals
+from ray_runs import begun, submit
+place = Path(sys.argv[1]) / "begun"
+with exiting_on_signals(), begun() as run:
+    submit(run, "a", do="hold", begun=str(place))
+    for _ in run.results(patience_s=0.05):
+        if place.exists() and place.read_text():
+            break
+    signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    signal.setitimer(signal.ITIMER_REAL, 0.5)
+    list(run.results())
+"""
+    environ = {"PYTHONPATH": str(Path(__file__).parent), MARK: str(tmp_path)}
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    done = subprocess.run(command, env={**os.environ, **environ}, check=False)
+    assert done.returncode == 128 + signal.SIGTERM
+    wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=10)
 
 
 def test_a_killed_driver_leaves_no_process(tmp_path: Path) -> None:

@@ -38,6 +38,8 @@ from .hosting import HostedWork
 __all__ = ["Answer", "HostState", "JobFolder", "Pace", "TakenJob"]
 
 _SUFFIX = ".json"
+# Whoever writes here lets hosts run code, and the work may hold a key.
+_PRIVATE = 0o700
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,8 +130,9 @@ class JobFolder:
         """
         line = hosted.to_json()
         folder = cls(path)
+        path.mkdir(mode=_PRIVATE, parents=True)
         for part in ("jobs", "taken", "done", "hosts", "submitted"):
-            (path / part).mkdir(parents=True)
+            (path / part).mkdir()
         if payload is not None:
             _write(folder._payload, payload)
         _write(folder._work, line)

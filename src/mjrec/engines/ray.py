@@ -15,7 +15,8 @@ from typing import Any
 import mjrec
 
 from ..child_python import said_in
-from ..errors import Error
+from ..errors import Error, GLError
+from ..signals import received
 from .base_run import BaseRun
 from .gpu_shares import GpuShare
 from .home_log import HomeLog
@@ -86,23 +87,40 @@ class RayEngine:
 
         Raises:
             InvalidArgument: the settings are no JSON.
+            GLError: a GPU is required, and the Ray that is started has none.
             Error: there is no such cluster, or no Ray can be started.
         """
-        hosted = HostedWork.of(work, self.share).to_json()
+        # Before anything is started.
+        HostedWork.of(work, self.share).to_json()
         connection = RayConnection(
             self.address, cpus=self.workers, payload_size=len(work.payload or b"")
         )
         try:
+            share = self._to_be_had(connection)
             return RayRun(
-                hosted,
+                HostedWork.of(work, share).to_json(),
                 work.payload,
                 connection,
                 workers=self.workers,
-                share=self.share,
+                share=share,
             )
         except BaseException:
             connection.leave()
             raise
+
+    def _to_be_had(self, connection: RayConnection) -> GpuShare:
+        """Return what workers can be given; nothing where they would wait for ever.
+
+        Raises:
+            GLError: there is no GPU, and one is required.
+        """
+        if not (self.share.asked_for and connection.lacks_gpus()):
+            return self.share
+        lack = "Workers are to get GPUs, and Ray finds none on this machine."
+        if self.share.required:
+            raise GLError(f"{lack} `nvidia-smi -L` lists those that there are.")
+        logger.warning("%s They draw in software.", lack)
+        return GpuShare()
 
 
 class RayRun(BaseRun):
@@ -191,9 +209,13 @@ class RayRun(BaseRun):
             self._leave()
 
     def _turn(self, seconds: float | None) -> None:
-        self._hand_out()
-        self._listen(seconds)
-        self._hand_out()
+        try:
+            self._hand_out()
+            self._listen(seconds)
+            self._hand_out()
+        except SystemExit as error:
+            # Of what a signal's handler raises inside Ray, Ray makes one of its own.
+            raise received() or error from None
 
     def _hand_out(self) -> None:
         """Give jobs to whoever is idle; start no more workers than there are jobs."""

@@ -71,6 +71,7 @@ class RayConnection:
     """
 
     _made = 0
+    _is_started = False
     _lock = threading.Lock()
 
     def __init__(
@@ -81,9 +82,16 @@ class RayConnection:
         with self._lock:
             self._is_ours = not self._ray.is_initialized() or RayConnection._made > 0
             if not self._ray.is_initialized():
-                _connect(self._ray, address, cpus, payload_size)
+                RayConnection._is_started = _connect(
+                    self._ray, address, cpus, payload_size
+                )
             if self._is_ours:
                 RayConnection._made += 1
+
+    def lacks_gpus(self) -> bool:
+        """Tell whether Ray was started here and has no GPU, and so never will."""
+        is_ours = self._is_ours and RayConnection._is_started
+        return is_ours and not self._ray.cluster_resources().get("GPU")
 
     def leave(self) -> None:
         """Give the connection up, if nobody else needs it. Idempotent."""
@@ -177,7 +185,8 @@ def _room_of(resources: Mapping[str, float], share: GpuShare) -> int:
     return min(room, fits)
 
 
-def _connect(ray: Any, address: str | None, cpus: int | None, payload: int) -> None:
+def _connect(ray: Any, address: str | None, cpus: int | None, payload: int) -> bool:
+    """Connect to Ray, and return whether it had to be started."""
     address = address or os.environ.get(_ADDRESS) or None
     if address is not None and address.startswith("ray://"):
         raise InvalidArgument(
@@ -188,9 +197,10 @@ def _connect(ray: Any, address: str | None, cpus: int | None, payload: int) -> N
         with _signals_as_they_are():
             if address is None or address == "local":
                 _start(ray, cpus or usable_cpus(), payload)
-            else:
-                _check_reachable(address)
-                ray.init(address=address, logging_level=logging.WARNING)
+                return True
+            _check_reachable(address)
+            ray.init(address=address, logging_level=logging.WARNING)
+            return False
     # Ray has no class of its own for what goes wrong here.
     except Exception as error:
         with contextlib.suppress(Exception):

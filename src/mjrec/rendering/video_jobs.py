@@ -25,7 +25,7 @@ from typing import Any
 
 from ..engines.work import JobOutcome
 from ..errors import GLError
-from ..simulation.model_trust import TRUST_VARIABLE
+from ..simulation.model_trust import TRUST_VARIABLE, environ_with_key
 from .again import Variant, render_one_again
 from .finishing import EpisodeFinisher
 from .outcomes import Outcome
@@ -48,6 +48,8 @@ def environ_for_drawing() -> dict[str, str]:
     # There are several, and Mesa's rasteriser would start as many threads as there are
     # CPUs in each of them.
     environ = {_RASTERISER_THREADS: os.environ.get(_RASTERISER_THREADS, "1")}
+    # Models that one has stored are loaded by the others, whatever their homes.
+    environ.update(environ_with_key())
     if TRUST_VARIABLE in os.environ:
         # Those on other machines do not have it from this process.
         environ[TRUST_VARIABLE] = os.environ[TRUST_VARIABLE]

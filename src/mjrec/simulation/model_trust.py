@@ -13,6 +13,10 @@ key, is neither used nor replaced: only its owner knows who has read it, and a n
 would make all earlier recordings a stranger's. Until it is mended, the other place has
 a key.
 
+Workers on other machines, whose homes may be others, are given this user's key in an
+environment variable, and use it before their own: what one of them stores, the others
+load, and so does this machine.
+
 Needs no simulator.
 """
 
@@ -35,6 +39,7 @@ from ..atomic_files import temporary_path
 
 __all__ = [
     "TRUST_VARIABLE",
+    "environ_with_key",
     "is_sealed",
     "is_trusted",
     "seal_of",
@@ -47,6 +52,8 @@ logger = logging.getLogger(__name__)
 
 TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 
+# With the line before, because variables that begin with MJREC_ are recorded.
+_KEY_VARIABLE = "_MJREC_MODEL_KEY"
 _ONE_BY_ONE = "sha256:"
 _KEY_NAME = "model-key"
 _KEY_SIZE = 32
@@ -64,6 +71,9 @@ def seal_of(digest: str) -> str | None:
     Returns:
         None, with a warning, where no key can be kept.
     """
+    given = _given_key()
+    if given is not None:
+        return _seal(given, digest)
     reasons = []
     for directory in _directories():
         try:
@@ -80,6 +90,20 @@ def seal_of(digest: str) -> str | None:
         f"rendering will need {TRUST_VARIABLE}=1."
     )
     return None
+
+
+def environ_with_key() -> dict[str, str]:
+    """Return the variable that gives workers elsewhere this user's key.
+
+    It must come to nobody else. Where there is no key it is made; where none can be
+    kept, nothing is returned.
+    """
+    key = _given_key()
+    for directory in _directories() if key is None else ():
+        with contextlib.suppress(_NoKey, OSError):
+            key = _made_key(directory)
+            break
+    return {} if key is None else {_KEY_VARIABLE: key.hex()}
 
 
 def is_sealed(seal: object, digest: object) -> bool:
@@ -168,7 +192,17 @@ def _seal(key: bytes, digest: str) -> str:
     return hmac.new(key, content, hashlib.sha256).hexdigest()
 
 
+def _given_key() -> bytes | None:
+    with contextlib.suppress(ValueError):
+        key = bytes.fromhex(os.environ.get(_KEY_VARIABLE, ""))
+        return key if len(key) == _KEY_SIZE else None
+    return None
+
+
 def _keys() -> Iterator[bytes]:
+    given = _given_key()
+    if given is not None:
+        yield given
     for directory in _directories():
         with contextlib.suppress(_NoKey, OSError):
             yield _read_key(directory)
