@@ -12,6 +12,7 @@ from mjrec.formats.monitor_directory import (
     infix_of,
     iter_monitor_files,
     names_in,
+    where_recordings_are,
 )
 
 VISIBLE = {
@@ -83,3 +84,17 @@ def test_links_count_where_they_lead_to_a_file(tmp_path: Path) -> None:
 def test_directory_that_is_not_there_holds_nothing(tmp_path: Path) -> None:
     """Nobody has recorded into it."""
     assert list(iter_monitor_files(tmp_path / "none")) == []
+
+
+def test_who_looks_in_the_wrong_place_is_told_of_the_folders(tmp_path: Path) -> None:
+    """An evaluation has one for each task; some are named."""
+    assert "mjrec record ENV --out" in where_recordings_are(tmp_path)
+    for number in range(7):
+        folder = tmp_path / f"task{number}"
+        folder.mkdir()
+        (folder / "openaigym.episodes.0.1.jsonl").touch()
+    told = where_recordings_are(tmp_path)
+    assert told == (
+        "Its folders do (task0, task1, task2, task3, task4 and 2 more): name one of "
+        "them."
+    )

@@ -39,6 +39,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,10 +69,13 @@ __all__ = [
     "trajectory_prefix",
     "video_lock_name",
     "video_prefix",
+    "where_recordings_are",
 ]
 
 FILE_PREFIX = "openaigym"
 MANIFEST_PREFIX = f"{FILE_PREFIX}.manifest"
+
+_SHOWN = 5
 
 # Gym took any text for a uid.
 _INFIX = re.compile(r"(?P<number>[0-9]{1,18})\.(?P<uid>[^/\n\0]+)")
@@ -292,6 +296,23 @@ def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Pat
         return
     for name in sorted(_names(directory, hidden=hidden)):
         yield directory / name
+
+
+def where_recordings_are(directory: Path) -> str:
+    """Return what to tell whoever looks for recordings in a directory without any.
+
+    Its own folders are looked at, because an evaluation has one for each task.
+    """
+    folders = [
+        path.name
+        for path in sorted(directory.iterdir())
+        if path.is_dir() and any(iter_monitor_files(path))
+    ]
+    if not folders:
+        return f"`mjrec record ENV --out {shlex.quote(str(directory))}` makes some."
+    rest = len(folders) - _SHOWN
+    more = f" and {rest} more" if rest > 0 else ""
+    return f"Its folders do ({', '.join(folders[:_SHOWN])}{more}): name one of them."
 
 
 def names_in(directory: Path) -> Iterator[str]:

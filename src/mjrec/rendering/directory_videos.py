@@ -13,7 +13,7 @@ from typing import Any, Self
 from ..annotation import check_annotation
 from ..engines.work import Engine
 from ..errors import InvalidArgument
-from ..formats.monitor_directory import iter_monitor_files
+from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
 from ..formats.trajectory_file import find_trajectory
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_all_models
@@ -272,8 +272,7 @@ def _recordings_of(
         return target.parent, [] if key is None else [key]
     if not any(iter_monitor_files(target)):
         raise InvalidArgument(
-            f"{target} holds no recordings. `mjrec record ENV --out {target}` makes "
-            "some."
+            f"{target} holds no recordings. {where_recordings_are(target)}"
         )
     keys = recordings(target)
     if episode is None:

@@ -35,6 +35,7 @@ from ...formats.monitor_directory import (
     is_manifest,
     iter_monitor_files,
     trajectory_prefix,
+    where_recordings_are,
 )
 from ...formats.regular_files import regular_path
 from ...recovery.remains import Remains, has_work, is_open, remains_of
@@ -115,8 +116,8 @@ def look_for_contents(directory: Path, episodes: Iterable[int] | None) -> Conten
     _check_nobody_writes(directory)
     if not any(iter_monitor_files(directory)):
         raise InvalidArgument(
-            f"{directory} holds no recordings that could be packed. `mjrec record ENV "
-            f"--out {directory}` makes some."
+            f"{directory} holds no recordings that could be packed. "
+            f"{where_recordings_are(directory)}"
         )
     _check_all_is_done(directory)
     chosen = None if episodes is None else _chosen(directory, episodes)
