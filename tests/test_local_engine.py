@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from engine_runs import lines, outcomes, submit, values, wait_for
 from interruption import ctrl_c_soon
 from processes import children
 
@@ -52,29 +53,6 @@ def begun(
     )
 
 
-def submit(run: LocalRun, *jobs: str, **arguments: Any) -> None:
-    for key in jobs:
-        run.submit(Job(key=key, arguments=arguments))
-
-
-def outcomes(run: LocalRun) -> dict[str, JobOutcome]:
-    return {outcome.key: outcome for outcome in run.results() if outcome is not None}
-
-
-def values(run: LocalRun) -> list[dict[str, Any]]:
-    found = outcomes(run).values()
-    assert not [outcome.failure for outcome in found if outcome.failure]
-    return [dict(outcome.value or {}) for outcome in found]
-
-
-def wait_for(path: Path, run: LocalRun) -> int:
-    """Return the number of the process that has begun a job, which notes it there."""
-    for _ in run.results(patience_s=0.02):
-        if path.exists() and path.read_text():
-            break
-    return int(path.read_text())
-
-
 def wait_for_end(pid: int) -> None:
     """Wait until a process that need not be a child is gone."""
     with contextlib.suppress(ProcessLookupError):
@@ -82,10 +60,6 @@ def wait_for_end(pid: int) -> None:
         ready, _, _ = select.select([descriptor], [], [], 30)
         os.close(descriptor)
         assert ready, f"process {pid} goes on"
-
-
-def lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.exists() else []
 
 
 # Jobs and their outcomes

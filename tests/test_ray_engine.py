@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import ray
+from engine_runs import lines, outcomes, submit, values, wait_for
 from ray_clusters import (
     MARK,
     SMALL_STORE,
@@ -20,15 +21,7 @@ from ray_clusters import (
     ray_processes,
     wait_until,
 )
-from ray_runs import (
-    begun,
-    lines,
-    outcomes,
-    run_python,
-    submit,
-    values,
-    wait_for,
-)
+from ray_runs import begun, run_python
 
 import mjrec
 from mjrec.engines.ray import RayEngine
@@ -350,7 +343,8 @@ def test_a_ray_of_our_own_without_a_gpu(tmp_path: Path) -> None:
 import logging, sys
 from mjrec.engines.ray import RayEngine
 from mjrec.errors import GLError
-from ray_runs import begun, submit, values
+from engine_runs import submit, values
+from ray_runs import begun
 logging.basicConfig(stream=sys.stdout, format="%(message)s")
 with begun(engine=RayEngine(1, gpus=0.5)) as run:
     submit(run, "a", "b", do="echo")
@@ -372,7 +366,8 @@ def test_a_terminated_driver_says_so(tmp_path: Path) -> None:
 import os, signal, sys
 from pathlib import Path
 from mjrec.signals import exiting_on_signals
-from ray_runs import begun, submit
+from engine_runs import submit
+from ray_runs import begun
 place = Path(sys.argv[1]) / "begun"
 with exiting_on_signals(), begun() as run:
     submit(run, "a", do="hold", begun=str(place))

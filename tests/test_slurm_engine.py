@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from engine_runs import lines, outcomes, submit, values, wait_for
 from evaluated_files import recorded_in
 from interruption import ctrl_c_soon
 
 import mjrec
 from mjrec.engines.job_folder import HostState, JobFolder, Pace
 from mjrec.engines.slurm import DEFAULT_WORKERS, SlurmEngine
-from mjrec.engines.work import WORK_FOLDER, Engine, Job, JobOutcome, Run, Work
+from mjrec.engines.work import WORK_FOLDER, Engine, JobOutcome, Run, Work
 from mjrec.errors import ClosedError, Error, InvalidArgument, MissingDependency
 from mjrec.machine import usable_cpus
 from test_evaluating import SLOW, contents, ended
@@ -80,29 +81,6 @@ def begun(place: Path, workers: int = 1, **settings: Any) -> Run:
     return engine(workers).begin(work(place, **settings))
 
 
-def submit(run: Run, *jobs: str, **arguments: Any) -> None:
-    for key in jobs:
-        run.submit(Job(key=key, arguments=arguments))
-
-
-def outcomes(run: Run) -> dict[str, JobOutcome]:
-    return {outcome.key: outcome for outcome in run.results() if outcome is not None}
-
-
-def values(run: Run) -> list[dict[str, Any]]:
-    found = outcomes(run).values()
-    assert not [outcome.failure for outcome in found if outcome.failure]
-    return [dict(outcome.value or {}) for outcome in found]
-
-
-def wait_for(path: Path, run: Run) -> int:
-    """Return the number of the process that has begun a job, which notes it there."""
-    for _ in run.results(patience_s=0.02):
-        if path.exists() and path.read_text():
-            break
-    return int(path.read_text())
-
-
 def folder_in(place: Path) -> JobFolder:
     [path] = (place / "shared" / WORK_FOLDER).iterdir()
     return JobFolder(path)
@@ -113,10 +91,6 @@ def host_process(place: Path) -> int:
     [job] = folder_in(place).submitted()
     [host] = Path("/proc", job, "task", job, "children").read_text().split()
     return int(host)
-
-
-def lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.exists() else []
 
 
 # Jobs and their outcomes
