@@ -6,14 +6,14 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import ray
 from ray.cluster_utils import Cluster
+from waiting import wait_until
 
 __all__ = [
     "MARK",
@@ -22,7 +22,6 @@ __all__ = [
     "home_for_ray",
     "is_gone",
     "ray_processes",
-    "wait_until",
 ]
 
 MARK = "MJREC_TEST_OF_RAY"
@@ -64,19 +63,6 @@ def cluster_of(*nodes: dict[str, Any]) -> Iterator[Cluster]:
         yield cluster
     finally:
         cluster.shutdown()
-
-
-def wait_until(
-    holds: Callable[[], Any],
-    *,
-    seconds: float = 30,
-    told: Callable[[], Any] = lambda: "it has not come to hold",
-) -> None:
-    """Wait for a condition."""
-    deadline = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < deadline, told()
-        time.sleep(0.05)
 
 
 def is_gone(pid: int) -> bool:

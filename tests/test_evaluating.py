@@ -9,14 +9,14 @@ import random
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from evaluated_files import recorded_in
+from waiting import wait_until
 
 import mjrec
 from mjrec import (
@@ -457,13 +457,6 @@ def slow_run(place: Path, name: str, *arguments: str) -> subprocess.Popen[bytes]
     )
 
 
-def wait_until(condition: Callable[[], bool], seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def ended(directory: Path) -> int:
     ledgers = directory.glob("*/mjrec.evaluation.*.jsonl")
     return sum(path.read_bytes().count(b'{"ended"') for path in ledgers)
@@ -502,9 +495,9 @@ def test_a_killed_evaluation_goes_on_where_it_was(
     killed = tmp_path / "killed"
     process = slow_run(tmp_path, "killed", "2", *engine)
     if moment == "running":
-        wait_until(lambda: ended(killed) >= 5)
+        wait_until(lambda: ended(killed) >= 5, seconds=60)
     else:
-        wait_until((killed / "results.json").exists)
+        wait_until((killed / "results.json").exists, seconds=60)
     kill_with_workers(process)
     assert (killed / "results.json").exists() is (moment == "drawing")
     assert slow_run(tmp_path, "killed", "2", "resume", *engine).wait() == 0

@@ -11,8 +11,9 @@ import pytest
 import ray
 from engine_runs import lines, outcomes, submit, values
 from ray.cluster_utils import Cluster
-from ray_clusters import SMALL_STORE, cluster_of, home_for_ray, is_gone, wait_until
+from ray_clusters import SMALL_STORE, cluster_of, home_for_ray, is_gone
 from ray_runs import begun, run_python
+from waiting import wait_until
 
 import mjrec
 from mjrec.engines import ray as ray_engine

@@ -19,9 +19,9 @@ from ray_clusters import (
     home_for_ray,
     is_gone,
     ray_processes,
-    wait_until,
 )
 from ray_runs import begun, run_python
+from waiting import wait_until
 
 import mjrec
 from mjrec.engines.ray import RayEngine

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluated_files import recorded_in
-from ray_clusters import home_for_ray, wait_until
+from ray_clusters import home_for_ray
+from waiting import wait_until
 
 from mjrec.engines.ray import RayEngine
 from mjrec.evaluation.evaluating import evaluate

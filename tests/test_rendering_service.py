@@ -21,6 +21,7 @@ import pytest
 from processes import children
 from recordings import frames_of
 from trajectories_by_hand import write_log
+from waiting import wait_until
 
 from mjrec import Error, InvalidArgument, Monitor
 from mjrec.formats.trajectory_file import open_trajectory
@@ -81,14 +82,6 @@ def others() -> set[int]:
 
 def finished(logs: list[Path]) -> list[bool]:
     return [log.with_suffix(".h5").exists() and not log.exists() for log in logs]
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    """Look again and again, for half a minute at most."""
-    end = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 def test_trajectories_get_their_final_form(

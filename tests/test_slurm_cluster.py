@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from slurm_cluster import lack_of_slurm, slurm_cluster
+from waiting import wait_until
 
 from mjrec.engines.job_folder import Pace
 from mjrec.engines.slurm import SlurmEngine
@@ -20,6 +21,9 @@ from mjrec.engines.work import WORK_FOLDER, Job, Run, Work
 from mjrec.errors import Error
 
 pytest.importorskip("submitit")
+
+# Slurm looks at its queue once in a while.
+until = functools.partial(wait_until, seconds=60)
 
 lack = lack_of_slurm()
 if lack and os.environ.get("MJREC_TEST_SLURM") != "1":
@@ -38,13 +42,6 @@ def cluster(configuration: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     monkeypatch.setenv("SLURM_CONF", str(configuration))
     yield
     until(lambda: not asked("squeue", "--noheader"))
-
-
-def until(is_so: Callable[[], object], *, seconds: float = 60) -> None:
-    deadline = time.monotonic() + seconds
-    while not is_so():
-        assert time.monotonic() < deadline, "it has not come about"
-        time.sleep(0.02)
 
 
 def asked(*command: str) -> str:

@@ -7,8 +7,7 @@ import secrets
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import pytest
 from engine_runs import lines, outcomes, submit, values, wait_for
 from evaluated_files import recorded_in
 from interruption import ctrl_c_soon
+from waiting import wait_until
 
 import mjrec
 from mjrec.engines.job_folder import HostState, JobFolder, Pace
@@ -41,7 +41,7 @@ def mark(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     mark = secrets.token_hex(8)
     monkeypatch.setenv(MARK, mark)
     yield mark
-    until(lambda: not marked(mark))
+    wait_until(lambda: not marked(mark))
 
 
 def marked(mark: str) -> list[str]:
@@ -54,13 +54,6 @@ def marked(mark: str) -> list[str]:
             if wanted in environ:
                 found.append((process / "cmdline").read_text().replace("\0", " "))
     return found
-
-
-def until(is_so: Callable[[], object], *, seconds: float = 30) -> None:
-    deadline = time.monotonic() + seconds
-    while not is_so():
-        assert time.monotonic() < deadline, "it has not come about"
-        time.sleep(0.01)
 
 
 def engine(
@@ -300,7 +293,7 @@ def test_a_host_that_is_told_to_end(
         first = wait_for(tmp_path / "begun", run)
         os.kill(host_process(tmp_path), signal.SIGTERM)
         (tmp_path / "begun").unlink()
-        until(lambda: lines(tmp_path / "closed") == [str(first)])
+        wait_until(lambda: lines(tmp_path / "closed") == [str(first)])
         assert wait_for(tmp_path / "begun", run) != first
     assert not caplog.messages
     assert not (tmp_path / "shared").exists()
@@ -315,7 +308,7 @@ def test_a_host_whose_time_will_be_over(tmp_path: Path) -> None:
         host = host_process(tmp_path)
         for process in [host, *children_of(host)]:
             os.kill(process, signal.SIGUSR2)
-        until(lambda: HostState.LEAVING in folder_in(tmp_path).hosts().values())
+        wait_until(lambda: HostState.LEAVING in folder_in(tmp_path).hosts().values())
         submit(run, "b", do="where")
         for outcome in run.results(patience_s=0.02):
             if outcome is not None:
@@ -347,7 +340,9 @@ def test_hosts_that_have_nothing_to_do_end(tmp_path: Path) -> None:
     with engine(pace=pace).begin(work(tmp_path)) as run:
         submit(run, "a", do="where")
         [first] = values(run)
-        until(lambda: set(folder_in(tmp_path).hosts().values()) == {HostState.ENDED})
+        wait_until(
+            lambda: set(folder_in(tmp_path).hosts().values()) == {HostState.ENDED}
+        )
         submit(run, "b", do="where")
         [second] = values(run)
     assert first["pid"] != second["pid"]
@@ -402,7 +397,7 @@ def test_ctrl_c_in_a_terminal(tmp_path: Path) -> None:
         text=True,
         start_new_session=True,
     )
-    until(lambda: lines(tmp_path / "begun"))
+    wait_until(lambda: lines(tmp_path / "begun"))
     os.killpg(driver.pid, signal.SIGINT)
     _, said = driver.communicate(timeout=60)
     assert said.count("KeyboardInterrupt") == 1
@@ -417,7 +412,7 @@ def test_forgotten_runs_end(tmp_path: Path, mark: str) -> None:
     submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
     wait_for(tmp_path / "begun", run)
     del run
-    until(lambda: not marked(mark))
+    wait_until(lambda: not marked(mark))
 
 
 # A driver that is killed
@@ -460,7 +455,7 @@ def killed_driver(place: Path, silent_s: float) -> Iterator[None]:
         stdout=subprocess.PIPE,
     )
     with driver:
-        until(lambda: lines(place / "begun"))
+        wait_until(lambda: lines(place / "begun"))
         driver.kill()
     yield
 
@@ -469,13 +464,13 @@ def test_hosts_of_a_killed_driver_end(tmp_path: Path, mark: str) -> None:
     """They finish what they are at, and take no more."""
     with killed_driver(tmp_path, silent_s=1):
         hosts = folder_in(tmp_path).hosts
-        until(lambda: HostState.LEAVING in hosts().values())
-        until(lambda: HostState.WORKING not in hosts().values())
+        wait_until(lambda: HostState.LEAVING in hosts().values())
+        wait_until(lambda: HostState.WORKING not in hosts().values())
         [pid] = lines(tmp_path / "begun")
         assert pid not in lines(tmp_path / "closed")
         # Nobody is left who would end the one that never comes to its end.
         folder_in(tmp_path).stop()
-        until(lambda: not marked(mark))
+        wait_until(lambda: not marked(mark))
     assert pid in lines(tmp_path / "closed")
 
 
@@ -485,11 +480,11 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(
     """At once, and cleans up behind it."""
     with killed_driver(tmp_path, silent_s=600), begun(tmp_path) as run:
         [pid] = lines(tmp_path / "begun")
-        until(lambda: pid in lines(tmp_path / "closed"))
+        wait_until(lambda: pid in lines(tmp_path / "closed"))
         submit(run, "a", do="echo")
         assert len(values(run)) == 1
         # One Slurm job is this driver's: two processes, and their worker.
-        until(lambda: len(marked(mark)) <= 3)
+        wait_until(lambda: len(marked(mark)) <= 3)
     assert list((tmp_path / "shared").iterdir()) == []
 
 
@@ -651,12 +646,12 @@ def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path, mark: str) -> 
     (tmp_path / "slow_policy.py").write_text(SLOW)
     killed = tmp_path / "killed"
     with evaluating("killed") as driver:
-        until(lambda: ended(killed) >= 5)
+        wait_until(lambda: ended(killed) >= 5)
         driver.kill()
     for name in ("killed", "whole"):
         with evaluating(name) as driver:
             assert driver.wait() == 0
     assert contents(killed) == contents(tmp_path / "whole")
     assert 24 <= begun_in(killed) <= 26
-    until(lambda: not marked(mark))
+    wait_until(lambda: not marked(mark))
     assert not (killed / WORK_FOLDER).exists()

@@ -91,9 +91,9 @@ class RunPlace:
     def others(self) -> list[JobFolder]:
         """Return the folders of other runs."""
         return [
-            JobFolder(path)
+            folder
             for path in sorted(self._runs.glob(f"{_FOLDER_PREFIX}*"))
-            if path.name != self._name and (path / "driver.json").exists()
+            if path.name != self._name and (folder := JobFolder(path)).sign()
         ]
 
     def tidy_up(self, *, keep: bool) -> None:
