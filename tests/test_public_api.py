@@ -20,7 +20,7 @@ ROWS = (
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
         *("frame_grid", "annotation", "file_digests", "fingerprint", "surroundings"),
-        *("carried_errors", "child_python"),
+        *("carried_errors", "child_python", "installed_packages"),
     },
     {"engines"},
     {"formats"},

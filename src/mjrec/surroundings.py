@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a recording was made with: packages, machine, variables, command line, code.
 
-Looking costs a fifth of a second and more (a hundred packages, two calls of git), so it
-is done once in a process, on a thread, and asked for when a manifest is written.
+Looking takes a third of a second and more (a hundred packages, calls of git), nearly
+all of it in other processes. It is done once, on a thread, and asked for when a
+manifest is written.
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
-import importlib.metadata
 import logging
 import os
 import platform
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from .fingerprint import cpu_flags, cpu_model, machine_fingerprint
+from .installed_packages import installed_packages
 from .machine import usable_cpus
 
 __all__ = ["Surroundings", "look_around"]
@@ -51,8 +51,6 @@ _VARIABLES = (
     "PYTHONPATH",
     "__EGL_",
 )
-# What an installer adds to the files of a wheel, or changes.
-_OF_INSTALLATION = ("INSTALLER", "REQUESTED", "RECORD", "direct_url.json")
 _SECONDS_FOR_GIT = 5.0
 # Leaving is quick.
 _PATIENCE = 2.0
@@ -102,7 +100,7 @@ class Surroundings:
                 "command": self._command,
                 "working_directory": self._directory,
                 "python": sys.version,
-                "packages": _packages(),
+                "packages": installed_packages(),
                 "machine": dict(machine_fingerprint()),
                 "cpu": {
                     "model": cpu_model(),
@@ -138,43 +136,6 @@ def _variables(environ: Mapping[str, str]) -> dict[str, str]:
             name == v or (v.endswith("_") and name.startswith(v)) for v in _VARIABLES
         )
     }
-
-
-def _packages() -> dict[str, dict[str, str | None]]:
-    found: dict[str, dict[str, str | None]] = {}
-    for distribution in importlib.metadata.distributions():
-        name = distribution.metadata["Name"]
-        # The first on the path is the one that is imported.
-        if name and name not in found:
-            found[name] = {
-                "version": distribution.version,
-                "record_sha256": _record_sha256(distribution),
-            }
-    return dict(sorted(found.items(), key=lambda item: item[0].lower()))
-
-
-def _record_sha256(distribution: importlib.metadata.Distribution) -> str | None:
-    """Return the sha256 of the sorted lines of what a wheel says it consists of.
-
-    Lines of what an installer adds, such as compiled Python, are left out, so that two
-    installations of one wheel have the same.
-    """
-    text = distribution.read_text("RECORD")
-    if not text:
-        return None
-    lines = (line.strip() for line in text.splitlines())
-    own = sorted(line for line in lines if line and not _is_of_installation(line))
-    return hashlib.sha256("\n".join(own).encode()).hexdigest()
-
-
-def _is_of_installation(line: str) -> bool:
-    path = line.rsplit(",", 2)[0].strip('"')
-    is_outside = path.startswith(("..", "/"))
-    return (
-        is_outside
-        or path.endswith(".pyc")
-        or path.rpartition("/")[2] in _OF_INSTALLATION
-    )
 
 
 def _code_root() -> Path:

@@ -22,6 +22,7 @@ from .scenes import (
     Scenes,
     class_name,
     generator_state,
+    has_own_method,
     is_defined_by,
     overriding_class,
     plain_arguments,
@@ -140,7 +141,7 @@ def _max_geom(model: Any) -> int:
 def _obstacle(physics: Any) -> str | None:
     # Composer's is a weak proxy, whose own class says nothing.
     kind = physics.__class__
-    if "render" in physics.__dict__:
+    if has_own_method(physics, "render"):
         return f"the physics {class_name(kind)} overrides render()"
     if is_defined_by(kind.render, "dm_control.mujoco.engine", "Physics.render"):
         return None

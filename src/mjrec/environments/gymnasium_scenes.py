@@ -17,6 +17,7 @@ from .scenes import (
     Scenes,
     class_name,
     generator_state,
+    has_own_method,
     is_defined_by,
     overriding_class,
     plain_arguments,
@@ -107,7 +108,7 @@ def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
     """Return which wrapper of an environment does not show what is inside it."""
     mode = env.render_mode
     while isinstance(env, gymnasium.Wrapper):
-        if "render" in vars(env):
+        if has_own_method(env, "render"):
             return f"the wrapper {class_name(type(env))} overrides render()"
         render = type(env).render
         if not any(is_defined_by(render, *known) for known in _PASSING_ON):
@@ -120,7 +121,7 @@ def _override_above(env: gymnasium.Env[Any, Any]) -> str | None:
 def _obstacle(base: Any, shown: Any) -> str | None:
     """Return why an environment without wrappers does not show just its simulation."""
     for part in (base, shown):
-        if "render" in vars(part):
+        if has_own_method(part, "render"):
             return f"the environment {class_name(type(part))} overrides render()"
     render = type(shown).render
     if not (has_known_render(shown) or is_defined_by(render, *_MUJOCO_ENV)):
@@ -142,7 +143,7 @@ def _wrong_mode(mode: str | None) -> str | None:
 def _foreign_renderer(renderer: Any) -> str | None:
     kind = type(renderer)
     own = is_defined_by(getattr(kind, "render", None), *_RENDERER)
-    if own and kind.__module__ == _RENDERING and "render" not in vars(renderer):
+    if own and kind.__module__ == _RENDERING and not has_own_method(renderer, "render"):
         return None
     return f"the renderer {class_name(kind)} is not Gymnasium's own"
 

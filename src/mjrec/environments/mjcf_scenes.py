@@ -8,7 +8,7 @@ from typing import Any
 from ..simulation.episode_states import EpisodeStates
 from ..simulation.model_store import authored_from_file
 from .mjcf_environments import MjcfEnvironment
-from .scenes import Scenes, generator_state, overriding_class
+from .scenes import Scenes, generator_state, has_own_method, overriding_class
 from .viewer_scene import ViewerScene
 
 __all__ = ["mjcf_scenes"]
@@ -61,6 +61,6 @@ def mjcf_scenes(
 
 
 def _obstacle(env: MjcfEnvironment) -> str | None:
-    if type(env).render is MjcfEnvironment.render and "render" not in vars(env):
+    if type(env).render is MjcfEnvironment.render and not has_own_method(env, "render"):
         return None
     return f"the environment {overriding_class(type(env), 'render')} overrides render()"

@@ -66,6 +66,18 @@ def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
     )
 
 
+def has_own_method(instance: Any, name: str) -> bool:
+    """Tell whether an object has a method itself that its class has otherwise.
+
+    Asks not for `__dict__`: an object that was asked for it once finds each of its
+    attributes several times as slowly ever after (CPython 3.11 and 3.12), which costs a
+    fast environment 4 % of its steps.
+    """
+    own = getattr(instance, name, None)
+    of_class = getattr(instance.__class__, name, None)
+    return own is not of_class and getattr(own, "__func__", None) is not of_class
+
+
 def overriding_class(kind: type, name: str) -> str:
     """Return the full name of the class that gives `kind` its method `name`."""
     return class_name(next((k for k in kind.__mro__ if name in vars(k)), kind))

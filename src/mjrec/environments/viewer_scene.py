@@ -7,6 +7,7 @@ Imports mujoco, by way of the simulation: load it only where there is a simulati
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Any
 
 from ..frames import check_size
@@ -21,7 +22,7 @@ from ..simulation.viewer_settings import (
     select_camera,
     viewer_option,
 )
-from .scenes import class_name, is_defined_by
+from .scenes import class_name, has_own_method, is_defined_by
 
 __all__ = ["ViewerScene"]
 
@@ -33,6 +34,11 @@ _SIDE = 480
 
 # Of our own renderer, where the environment has none.
 _MAX_GEOM = 10000
+
+# What is looked at at every captured step: one call each, and one comparison of all.
+_OF_SIMULATION = attrgetter("mujoco_renderer", "model", "data")
+_OF_RENDERER = attrgetter("model", "camera_id", "_viewers")
+_NO_VIEWERS: dict[str, Any] = {}
 
 
 class ViewerScene:
@@ -75,6 +81,7 @@ class ViewerScene:
         """Return what is shown from here on; `at_picture` keeps it up to date."""
         self._update()
         self._data = self._simulated.data
+        self._note_unmoved()
         return SceneView(
             camera=self._camera,
             option=self._option,
@@ -89,6 +96,7 @@ class ViewerScene:
         """Call `capture` with the view as a picture of this moment has it."""
         self._update()
         self._is_settled = True
+        self._note_unmoved()
         capture()
 
     def forget(self) -> None:
@@ -105,16 +113,10 @@ class ViewerScene:
         it was asked what is shown, there is no viewer that anybody could have touched,
         and the camera does not follow fields of the model.
         """
-        renderer, simulated = self._renderer, self._simulated
-        return (
-            self._is_settled
-            and renderer is not None
-            and self._asked != FREE_CAMERA
-            and not renderer._viewers
-            and renderer.camera_id == self._camera_id
-            and simulated.mujoco_renderer is renderer
-            and simulated.data is self._data
-            and simulated.model is self._model is renderer.model
+        unmoved = self._unmoved
+        return unmoved is not None and unmoved == (
+            _OF_SIMULATION(self._simulated),
+            _OF_RENDERER(self._renderer),
         )
 
     def obstacle(self) -> str | None:
@@ -138,12 +140,23 @@ class ViewerScene:
         self._new_flags = new_scene_flags(self._model)
         self._is_settled = False
         self._camera_id: int | None = None
+        # What `is_unmoved` compares with; None where a closer look is needed.
+        self._unmoved: tuple[tuple[Any, ...], tuple[Any, ...]] | None = None
         flags = getattr(self._renderer, "_vopt", None)
         copy_members(viewer_option(flags), self._option)
         if self._asked is not None:
             # Another model may have the name elsewhere.
             camera = resolve_camera(self._model, self._asked)
             copy_members(camera, self._camera)
+
+    def _note_unmoved(self) -> None:
+        renderer, model = self._renderer, self._model
+        self._unmoved = None
+        if self._is_settled and renderer is not None and self._asked != FREE_CAMERA:
+            self._unmoved = (
+                (renderer, model, self._data),
+                (model, self._camera_id, _NO_VIEWERS),
+            )
 
     def _update(self) -> None:
         renderer = getattr(self._simulated, "mujoco_renderer", None)
@@ -203,7 +216,7 @@ def _addition(viewer: Any, new_flags: bytes) -> str | None:
     if viewer.scn.flags.tobytes() != new_flags:
         return "rendering flags of the viewer's scene were changed"
     render = type(viewer).render
-    if "render" in vars(viewer) or not is_defined_by(
+    if has_own_method(viewer, "render") or not is_defined_by(
         render, _RENDERING, "OffScreenViewer.render"
     ):
         return f"the viewer {class_name(type(viewer))} is not Gymnasium's own"

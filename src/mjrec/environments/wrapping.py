@@ -80,8 +80,7 @@ def _facts(layers: list[Any], limits: Iterable[Any]) -> dict[str, Any]:
 
 
 def _dm_env_limit(env: Any) -> Any:
-    own = _attributes(env)
-    return own.get("_max_steps", own.get("_step_limit"))
+    return _own(env, "_max_steps", _own(env, "_step_limit"))
 
 
 def _is_limit(limit: Any) -> bool:
@@ -96,10 +95,16 @@ def _is_innermost(env: Any) -> bool:
 
 
 def _inside(env: Any) -> Any:
-    own = _attributes(env)
-    return next((own[name] for name in _INSIDE if name in own), None)
+    found = (_own(env, name) for name in _INSIDE)
+    return next((inner for inner in found if inner is not None), None)
 
 
-def _attributes(env: Any) -> dict[str, Any]:
-    """Return the attributes that an object has itself, without asking what it wraps."""
-    return getattr(env, "__dict__", {})
+def _own(env: Any, name: str, default: Any = None) -> Any:
+    """Return an attribute that an object has itself, without asking what it wraps.
+
+    Not by its `__dict__`, for the reason that `has_own_method` gives.
+    """
+    try:
+        return object.__getattribute__(env, name)
+    except AttributeError:
+        return default

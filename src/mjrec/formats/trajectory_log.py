@@ -16,11 +16,11 @@ import json
 import os
 import struct
 import threading
-import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +61,7 @@ __all__ = [
     "RECORD_PREFIX",
     "STEP",
     "STEP_PREFIX",
-    "RowBlocks",
+    "RowFormat",
     "TrajectoryLogWriter",
     "checksum_seed",
     "facts_record",
@@ -95,11 +95,8 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 # With the rounds of `timely_flushing` less than a second.
 _FLUSH_SECONDS = 0.75
-_BLOCK_BYTES = 1 << 18
-_MOST_BLOCK_BYTES = 1 << 21
-_MOST_ROWS = 512
-# Model changes that wait; a texture is a megabyte.
-_MOST_PENDING_BYTES = 1 << 20
+# What waits until it is written.
+_FLUSH_BYTES = 1 << 18
 
 
 def padded(length: int) -> int:
@@ -109,14 +106,14 @@ def padded(length: int) -> int:
 
 def checksum_seed(kind: bytes, length: int) -> int:
     """Return the CRC-32 of a record's beginning, to go on from with its payload."""
-    return zlib.crc32(kind + length.to_bytes(8, "little"))
+    return crc32(kind + length.to_bytes(8, "little"))
 
 
-class RowBlocks:
-    """Memory for the rows that a log has not written yet.
+class RowFormat:
+    """What the rows of a log are like, ready to be written.
 
-    Making it costs more than a short episode's rows. One writer after the other can
-    use the same: hand `writer.blocks` to the next one.
+    Finding it out costs more than a short episode's rows: hand `writer.rows` to the
+    writer of the next log.
 
     Args:
         header: says what the rows look like; its facts do not matter.
@@ -131,22 +128,21 @@ class RowBlocks:
         except ValueError as error:
             raise InvalidArgument(f"A trajectory cannot be written: {error}.") from None
         self.layout_text = json.dumps(layout)
-        self.free = True
-        self._shape = _row_shape(header)
+        self._described = _described(header)
         arrays = [array for array in (header.action, header.observation) if array]
         filled = 8 * header.state_length + sum(array.size for array in arrays)
-        self.steps = _Block(STEP, STEP_PREFIX.size, filled)
-        self.frames = _Block(FRAME, FRAME_PREFIX.size, header.snapshot.size)
+        self.step = _RowRecord(STEP, STEP_PREFIX.size, filled)
+        self.frame = _RowRecord(FRAME, FRAME_PREFIX.size, header.snapshot.size)
 
-    def fit(self, header: TrajectoryHeader) -> bool:
-        """Tell whether rows like `header` has them go in, and nobody uses these."""
-        return self.free and self._shape == _row_shape(header)
+    def fits(self, header: TrajectoryHeader) -> bool:
+        """Tell whether the rows of `header` are like these."""
+        return self._described == _described(header)
 
 
 class TrajectoryLogWriter:
     """Writes the log of one episode.
 
-    The file appears with the first flush: when a block of rows is full, within a second
+    The file appears with the first flush: when enough rows wait, within a second
     of a row, at `flush`, or at `close`. A file of that name that is there already was
     left by a reset that another reset replaced, and is removed. What was flushed
     survives the death of the process.
@@ -158,33 +154,32 @@ class TrajectoryLogWriter:
     Args:
         path: of the log; its directory exists.
         header: what is known of the episode, and what its rows look like.
-        blocks: of a writer that is closed, to be used again; where they do not fit
-            (another model, say) or are still in use, new ones are made.
+        rows: of another writer; where they do not fit (another model, say), they are
+            found out anew.
 
     Attributes:
         path: of the log.
         is_there: the file was made.
-        blocks: the memory in use.
+        rows: what they are like.
 
     Raises:
         InvalidArgument: rows cannot look like that.
     """
 
     def __init__(
-        self, path: Path, header: TrajectoryHeader, *, blocks: RowBlocks | None = None
+        self, path: Path, header: TrajectoryHeader, *, rows: RowFormat | None = None
     ) -> None:
-        if blocks is None or not blocks.fit(header):
-            blocks = RowBlocks(header)
-        blocks.free = False
+        if rows is None or not rows.fits(header):
+            rows = RowFormat(header)
         self.path = path
-        self.blocks = blocks
-        self._steps = blocks.steps
-        self._frames = blocks.frames
+        self.rows = rows
+        self._step, self._frame = rows.step, rows.frame
         self._process_id = os.getpid()
         self._lock = threading.RLock()
         self._descriptor: int | None = None
         self.is_there = False
-        self._tail = _Tail(0, _beginning(header.facts, blocks.layout_text))
+        self._tail = _Tail(0)
+        self._tail.records = [_beginning(header.facts, rows.layout_text)]
         flush_in_time(self)
 
     @property
@@ -192,139 +187,112 @@ class TrajectoryLogWriter:
         """Whether it was closed or discarded."""
         return self._tail is _CLOSED
 
-    def step_row(
-        self, step: int, reward: float, terminated: bool, truncated: bool
-    ) -> NDArray[np.uint8]:
-        """Add the row of a step, and return the part of it that the caller fills.
+    def add_step(
+        self,
+        step: int,
+        reward: float,
+        terminated: bool,
+        truncated: bool,
+        row: Iterable[_Bytes],
+    ) -> None:
+        """Add the row of a step.
 
         Args:
             step: 0 for the reset, which has no reward and no action, then 1, 2, 3 ...
             reward: of the step.
             terminated: the task ended the episode.
             truncated: a limit from outside the task ended it.
-
-        Returns:
-            State, action and observation, one behind the other, as bytes. All of it
-            is to be filled before anything else is asked of this writer, and then
-            `seal_row` called, or `withdraw_row`: what it holds now is some earlier
-            row.
+            row: state, action and observation, in pieces as they come.
 
         Raises:
             FileNotWritten: the disk is full; nothing was added.
+            InvalidArgument: the row has another size than the header says.
             ClosedError: after `close` or `discard`.
         """
-        with self._lock:
-            tail = self._tail
-            index = tail.steps
-            block = self._steps
-            if index == block.capacity or monotonic() >= tail.due:
-                self.flush()
-                tail = self._tail
-                index = 0
-            row = block.rows[index] if index < len(block.rows) else block.next_row()
-            STEP_PREFIX.pack_into(
-                block.memory, block.starts[index], step, reward, terminated, truncated
-            )
-            tail.last = STEP
-            tail.steps = index + 1
-            return row
+        prefix = STEP_PREFIX.pack(step, reward, terminated, truncated)
+        self._add(self._step.record(prefix, row))
 
-    def frame_row(self, step: int) -> NDArray[np.uint8]:
-        """Add the row of a video frame, and return the part that the caller fills.
+    def add_frame(self, step: int, snapshot: Iterable[_Bytes]) -> None:
+        """Add the row of a video frame.
 
         Args:
             step: the step that the frame shows the end of, whose row is there.
-
-        Returns:
-            The snapshot, as bytes; as of `step_row`.
+            snapshot: in pieces as they come.
 
         Raises:
             FileNotWritten: the disk is full; nothing was added.
+            InvalidArgument: the snapshot has another size than the header says.
             ClosedError: after `close` or `discard`.
         """
-        with self._lock:
-            tail = self._tail
-            index = tail.frames
-            block = self._frames
-            if index == block.capacity or tail is _CLOSED:
-                self.flush()
-                tail = self._tail
-                index = 0
-            row = block.rows[index] if index < len(block.rows) else block.next_row()
-            FRAME_PREFIX.pack_into(block.memory, block.starts[index], step)
-            tail.last = FRAME
-            tail.frames = index + 1
-            return row
+        prefix = FRAME_PREFIX.pack(step)
+        self._add(self._frame.record(prefix, snapshot))
 
-    def add_moment(
-        self,
-        step: int,
-        reward: float,
-        terminated: bool,
-        truncated: bool,
-        row: bytes,
-        snapshot: bytes,
-    ) -> None:
-        """Add the row of a step and that of its frame: both, or none of them.
+    def moments_of(
+        self, row: Sequence[memoryview], snapshot: Sequence[memoryview]
+    ) -> Callable[[int, float], None]:
+        """Return what adds a step and its frame, both or none, from the same memory.
+
+        Every usual step of every recorded episode goes this way, in half the time of
+        `add_step` and `add_frame`.
 
         Args:
-            step: as of `step_row`, as are the three after it.
-            reward: of the step.
-            terminated: the task ended the episode.
-            truncated: a limit from outside the task ended it.
-            row: what `step_row` would have the caller fill, of the same length.
-            snapshot: likewise of `frame_row`.
+            row: state, action and observation, in the pieces in which they are kept.
+            snapshot: likewise.
+
+        Returns:
+            A function of the step's number and its reward, for steps that end no
+            episode. It raises FileNotWritten, with nothing added, where the disk is
+            full, and ClosedError after `close` or `discard`.
 
         Raises:
-            FileNotWritten: the disk is full; nothing was added.
-            ClosedError: after `close` or `discard`.
+            InvalidArgument: one of them has another size than the header says.
         """
+        self._step.check(sum(map(len, row)))
+        self._frame.check(sum(map(len, snapshot)))
+        # All at hand: nothing is looked up that can be known.
+        of_steps, of_frames = self._step, self._frame
+        step_length, step_seed, step_padding = (
+            *(of_steps.length, of_steps.seed, of_steps.padding),
+        )
+        frame_length, frame_seed, frame_padding = (
+            *(of_frames.length, of_frames.seed, of_frames.padding),
+        )
+        size = of_steps.size + of_frames.size
+        lock, join = self._lock, b"".join
+        pack, pack_step, pack_frame = (
+            *(RECORD_PREFIX.pack, STEP_PREFIX.pack, FRAME_PREFIX.pack),
+        )
+
+        def add_moment(step: int, reward: float) -> None:
+            of_step = join((pack_step(step, reward, False, False), *row))
+            of_frame = join((pack_frame(step), *snapshot))
+            records = (
+                pack(STEP, crc32(of_step, step_seed), step_length),
+                of_step,
+                step_padding,
+                pack(FRAME, crc32(of_frame, frame_seed), frame_length),
+                of_frame,
+                frame_padding,
+            )
+            with lock:
+                tail = self._tail
+                if tail.size >= _FLUSH_BYTES:
+                    self.flush()
+                    tail = self._tail
+                tail.records += records
+                tail.size += size
+
+        return add_moment
+
+    def _add(self, records: tuple[bytes, ...]) -> None:
         with self._lock:
             tail = self._tail
-            at, frame_at = tail.steps, tail.frames
-            steps, frames = self._steps, self._frames
-            if (
-                at == steps.capacity
-                or frame_at == frames.capacity
-                or monotonic() >= tail.due
-            ):
+            if tail.size >= _FLUSH_BYTES:
                 self.flush()
                 tail = self._tail
-                at = frame_at = 0
-            if at == len(steps.rows):
-                steps.next_row()
-            if frame_at == len(frames.rows):
-                frames.next_row()
-            start = steps.starts[at]
-            STEP_PREFIX.pack_into(
-                steps.memory, start, step, reward, terminated, truncated
-            )
-            start += STEP_PREFIX.size
-            steps.memory[start : start + len(row)] = row
-            start = frames.starts[frame_at]
-            FRAME_PREFIX.pack_into(frames.memory, start, step)
-            start += FRAME_PREFIX.size
-            frames.memory[start : start + len(snapshot)] = snapshot
-            tail.steps = at + 1
-            tail.frames = frame_at + 1
-            tail.last = b""
-
-    def withdraw_row(self) -> None:
-        """Take back the row that was given out last, because it could not be filled.
-
-        Does nothing where that was done already, or the row was written.
-        """
-        with self._lock:
-            tail = self._tail
-            last, tail.last = tail.last, b""
-            if last == STEP:
-                tail.steps -= 1
-            elif last == FRAME:
-                tail.frames -= 1
-
-    def seal_row(self) -> None:
-        """Say that the row that was given out last is filled, and may be written."""
-        self._tail.last = b""
+            tail.records += records
+            for record in records:
+                tail.size += len(record)
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Add to the facts of the header; of a key that is there, the newest counts.
@@ -335,7 +303,7 @@ class TrajectoryLogWriter:
         self._check_open()
         record = facts_record(facts)
         with self._lock:
-            self._tail.facts += record
+            self._tail.records.append(record)
 
     def add_model_change(self, change: ModelChange) -> None:
         """Note what is other in the model from a step on.
@@ -347,12 +315,7 @@ class TrajectoryLogWriter:
             ClosedError: after `close` or `discard`.
         """
         self._check_open()
-        record = _record(CHANGE, *_change_parts(change))
-        with self._lock:
-            tail = self._tail
-            tail.changes += record
-            if len(tail.changes) > _MOST_PENDING_BYTES:
-                self.flush()
+        self._add((_record(CHANGE, *_change_parts(change)),))
 
     def flush(self) -> None:
         """Hand everything to the operating system.
@@ -366,16 +329,7 @@ class TrajectoryLogWriter:
             self._check_open()
             self._check_process()
             tail = self._tail
-            # In this order: a frame is never there without the model that it shows and
-            # the step that it shows the end of, nor the end of the episode without all.
-            parts: list[_Bytes] = [
-                tail.beginning,
-                tail.changes,
-                self._steps.finished(tail.steps),
-                self._frames.finished(tail.frames),
-                tail.facts,
-            ]
-            size = self._write([part for part in parts if part], tail.offset)
+            size = self._write(tail.records, tail.offset)
             # One assignment: after Ctrl-C anywhere before it, the same bytes are
             # written to the same place again; after it, none of them.
             self._tail = _Tail(tail.offset + size)
@@ -383,14 +337,13 @@ class TrajectoryLogWriter:
     def flush_if_due(self) -> None:
         """Flush what has waited for long enough, on whichever thread.
 
-        Not in the midst of a row. On a full disk it does nothing: whoever writes will
-        find out.
+        On a full disk it does nothing: whoever writes will find out.
         """
         if monotonic() < self._tail.due:
             return
         with self._lock:
             tail = self._tail
-            if tail.last or tail is _CLOSED or monotonic() < tail.due:
+            if tail is _CLOSED or monotonic() < tail.due:
                 return
             with contextlib.suppress(FileNotWritten):
                 self.flush()
@@ -459,13 +412,13 @@ class TrajectoryLogWriter:
                 "from which this one was forked: write it there."
             )
 
-    def _write(self, parts: list[_Bytes], offset: int) -> int:
-        """Write `parts` at `offset`, all of them or none, and return their size."""
-        size = sum(len(part) for part in parts)
+    def _write(self, records: list[bytes], offset: int) -> int:
+        """Write `records` at `offset`, all of them or none, and return their size."""
+        whole = b"".join(records)
         try:
             descriptor = self._open() if self._descriptor is None else self._descriptor
             try:
-                write_all(descriptor, parts, offset)
+                write_all(descriptor, whole, offset)
             except OSError:
                 # A reader takes what is whole in any case, and the next try begins at
                 # the same place.
@@ -474,7 +427,7 @@ class TrajectoryLogWriter:
                 raise
         except OSError as error:
             raise FileNotWritten(self.path, error.strerror or error) from error
-        return size
+        return len(whole)
 
     def _open(self) -> int:
         self.is_there = True
@@ -489,7 +442,6 @@ class TrajectoryLogWriter:
     def _let_go(self) -> None:
         if not self.closed:
             self._tail = _CLOSED
-            self.blocks.free = True
             flush_in_time(self, is_open=False)
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
@@ -502,106 +454,81 @@ class _Tail:
     Attributes:
         offset: in the file.
         due: when to write it, by the monotonic clock.
-        beginning: the first line and the header, where they were not written yet.
-        steps: how many rows of its block are given out.
-        frames: likewise.
-        changes: whole records.
-        facts: whole records.
-        last: the kind of the row that was given out last.
+        records: in their order, in pieces.
+        size: their bytes, roughly.
     """
 
-    __slots__ = (
-        "beginning",
-        "changes",
-        "due",
-        "facts",
-        "frames",
-        "last",
-        "offset",
-        "steps",
-    )
+    __slots__ = ("due", "offset", "records", "size")
 
-    def __init__(self, offset: int, beginning: bytes = b"") -> None:
+    def __init__(self, offset: int) -> None:
         self.offset = offset
         self.due = monotonic() + _FLUSH_SECONDS
-        self.beginning = beginning
-        self.steps = 0
-        self.frames = 0
-        self.changes = bytearray()
-        self.facts = bytearray()
-        self.last = b""
+        self.records: list[bytes] = []
+        self.size: float = 0
 
 
-# Its time has always come, so that whoever adds a row asks no further.
+# It is always full, so that whoever adds a row asks no further.
 _CLOSED = _Tail(0)
 _CLOSED.due = float("-inf")
+_CLOSED.size = float("inf")
 
 
-class _Block:
-    """Memory for records of one kind and size, which are written together.
+class _RowRecord:
+    """Makes records of one kind and size.
 
-    Attributes:
-        capacity: how many there is memory for.
-        memory: of all of them.
-        starts: where the payload of each begins in it.
-        rows: of each that was used so far, the part behind `prefix_size`.
+    Args:
+        kind: of the records.
+        prefix_size: how many bytes the payload has before the row.
+        filled: how many the row has.
     """
 
     def __init__(self, kind: bytes, prefix_size: int, filled: int) -> None:
-        self._kind = kind
-        self._prefix_size = prefix_size
-        self._length = prefix_size + filled
-        self._stride = RECORD_PREFIX.size + padded(self._length)
-        self._seed = checksum_seed(kind, self._length)
-        self.capacity = _capacity(self._stride)
-        # Zeros, because of the padding. The operating system gives the memory when it
-        # is used.
-        self._bytes = np.zeros(self.capacity * self._stride, np.uint8)
-        self.memory = self._bytes.data
-        first = RECORD_PREFIX.size
-        self.starts = range(first, first + len(self._bytes), self._stride)
-        self.rows: list[NDArray[np.uint8]] = []
-        self._payloads: list[memoryview] = []
-        self._checksums: NDArray[np.uint32] = np.ndarray(
-            (self.capacity,),
-            np.dtype("<u4"),
-            buffer=self._bytes,
-            offset=_CHECKSUM_OFFSET,
-            strides=(self._stride,),
+        self.kind = kind
+        self.prefix_size = prefix_size
+        self.length = prefix_size + filled
+        self.seed = checksum_seed(kind, self.length)
+        self.padding = bytes(padded(self.length) - self.length)
+
+    @property
+    def size(self) -> int:
+        """The bytes of one, with all that is around its payload."""
+        return RECORD_PREFIX.size + padded(self.length)
+
+    def check(self, filled: int) -> None:
+        """Check that a row has the size of all of them.
+
+        Raises:
+            InvalidArgument: it has another.
+        """
+        if self.prefix_size + filled != self.length:
+            raise InvalidArgument(
+                f"A {self.kind.decode()!r} row of this log has "
+                f"{self.length - self.prefix_size} bytes, not {filled}."
+            )
+
+    def record(self, prefix: bytes, row: Iterable[_Bytes]) -> tuple[bytes, ...]:
+        """Return the record of a row, in pieces.
+
+        Raises:
+            InvalidArgument: it has another size.
+        """
+        payload = b"".join((prefix, *row))
+        self.check(len(payload) - self.prefix_size)
+        checksum = crc32(payload, self.seed)
+        return (
+            RECORD_PREFIX.pack(self.kind, checksum, self.length),
+            payload,
+            self.padding,
         )
 
-    def next_row(self) -> NDArray[np.uint8]:
-        """Return the first row that was not used so far."""
-        start = self.starts[len(self.rows)]
-        RECORD_PREFIX.pack_into(
-            self.memory, start - RECORD_PREFIX.size, self._kind, 0, self._length
-        )
-        end = start + self._length
-        row = self._bytes[start + self._prefix_size : end]
-        self._payloads[len(self.rows) :] = [self.memory[start:end]]
-        self.rows.append(row)
-        return row
 
-    def finished(self, count: int) -> memoryview:
-        """Return the first `count` records, with their checksums."""
-        crc32, seed = zlib.crc32, self._seed
-        self._checksums[:count] = [
-            crc32(payload, seed) for payload in self._payloads[:count]
-        ]
-        return self.memory[: count * self._stride]
+_Described = tuple[
+    tuple[StateComponent, ...], RowLayout, "Array | None", "Array | None"
+]
 
 
-_RowShape = tuple[tuple[StateComponent, ...], RowLayout, "Array | None", "Array | None"]
-
-
-def _row_shape(header: TrajectoryHeader) -> _RowShape:
+def _described(header: TrajectoryHeader) -> _Described:
     return header.state, header.snapshot, header.action, header.observation
-
-
-def _capacity(stride: int) -> int:
-    """Return how many rows make a block."""
-    at_least = min(8, _MOST_BLOCK_BYTES // stride)
-    return max(1, at_least, min(_MOST_ROWS, _BLOCK_BYTES // stride))
 
 
 def _beginning(facts: Mapping[str, Any], layout_text: str) -> bytes:
@@ -623,7 +550,7 @@ def _record(kind: bytes, *parts: bytes) -> bytes:
         )
     checksum = checksum_seed(kind, length)
     for part in parts:
-        checksum = zlib.crc32(part, checksum)
+        checksum = crc32(part, checksum)
     prefix = RECORD_PREFIX.pack(kind, checksum, length)
     return b"".join((prefix, *parts, bytes(padded(length) - length)))
 
@@ -666,21 +593,16 @@ def _json(values: Mapping[str, Any]) -> bytes:
         return dumps(dict(values)).encode()
 
 
-def write_all(
-    descriptor: int, parts: Sequence[bytes | bytearray | memoryview], offset: int
-) -> None:
-    """Write all parts, one behind the other, from `offset` on.
+def write_all(descriptor: int, data: _Bytes, offset: int) -> None:
+    """Write all of `data`, from `offset` on.
 
     Raises:
         OSError: the disk is full; the system may have written some of it.
     """
-    left = sum(len(part) for part in parts)
-    written = os.pwritev(descriptor, parts, offset) if parts else 0
-    if written == left:
-        return
-    rest = memoryview(b"".join(parts))
-    while written < left:
-        count = os.pwrite(descriptor, rest[written:], offset + written)
+    left = memoryview(data)
+    while left:
+        count = os.pwrite(descriptor, left, offset)
         if count == 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        written += count
+        left = left[count:]
+        offset += count

@@ -42,7 +42,7 @@ def append_facts(log: Path, facts: Mapping[str, Any]) -> None:
         try:
             os.ftruncate(descriptor, end)
             try:
-                write_all(descriptor, [record], end)
+                write_all(descriptor, record, end)
             except OSError:
                 os.ftruncate(descriptor, end)
                 raise

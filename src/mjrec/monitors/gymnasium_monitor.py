@@ -115,20 +115,34 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
             ResetNeeded: before the first reset, or after the end of an episode.
         """
         recorder = self._recorder
-        if recorder.closed:
-            return self.env.step(action)
-        if self._next_step_autoreset and recorder.done:
-            return self._reset_by_step(action)
-        recorder.before_step(action)
+        usual = recorder.usual
+        if usual is None or not usual.before_step(action):
+            if recorder.closed:
+                return self.env.step(action)
+            if self._next_step_autoreset and recorder.done:
+                return self._reset_by_step(action)
+            recorder.before_step(action)
         try:
             result = self.env.step(action)
         except BaseException as error:
             recorder.note_error(error)
             raise
-        observation, reward, terminated, truncated, info = result
+        _, reward, terminated, truncated, _ = result
+        if usual is None or terminated or truncated or not usual.step(reward):
+            self._record(*result)
+        return result
+
+    def _record(
+        self,
+        observation: Any,
+        reward: SupportsFloat,
+        terminated: bool,
+        truncated: bool,
+        info: dict[str, Any],
+    ) -> None:
         done = bool(terminated or truncated)
         resets_itself = self._same_step_autoreset and done
-        recorder.step(
+        self._recorder.step(
             reward,
             terminated=terminated,
             truncated=truncated,
@@ -142,7 +156,6 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
             self._recorder.before_reset()
             self._began = time.perf_counter()
             self._begin(observation=observation)
-        return result
 
     def _add_episode_info(self, info: dict[str, Any]) -> None:
         stats = self.stats_recorder

@@ -26,7 +26,7 @@ from typing import Any
 
 from ..errors import FileNotWritten, PicturesDiffer
 from ..formats.monitor_directory import Infix, clip_part_name
-from ..formats.trajectory_log import RowBlocks
+from ..formats.trajectory_log import RowFormat
 from ..simulation.state_source import EpisodeStart, StateSource
 from .trajectory_recorder import Pace, TrajectoryRecorder
 
@@ -51,7 +51,7 @@ class ClipLogs:
         before: returns what was before it in that episode, for `clip` in the header.
         tolerates: tells whether to go on after an error.
         on_end: called with each clip that is over and has left something.
-        blocks: memory that the next log may use.
+        rows: what those of the log before are like.
     """
 
     directory: Path
@@ -62,7 +62,7 @@ class ClipLogs:
     before: Callable[[], Mapping[str, Any]]
     tolerates: Callable[[Exception], bool]
     on_end: Callable[[DeferredClip], object]
-    blocks: RowBlocks | None = None
+    rows: RowFormat | None = None
 
 
 class DeferredClip:
@@ -182,7 +182,7 @@ class DeferredClip:
             start=start,
             pace=replace(logs.pace, max_fps=None),
             # Once the part before has ended, and nobody uses it.
-            blocks=logs.blocks if self._part is None else self._part.blocks,
+            rows=logs.rows if self._part is None else self._part.rows,
         )
 
     def _stop(
@@ -198,7 +198,7 @@ class DeferredClip:
 
     def _list(self, part: TrajectoryRecorder) -> None:
         self._is_over = True
-        self._logs.blocks = part.blocks
+        self._logs.rows = part.rows
         # Where the disk was too full for a single row there is nothing to promise.
         if self._parts > 1 or part.is_there:
             self._logs.on_end(self)

@@ -32,7 +32,7 @@ from ..formats.monitor_directory import (
     stats_prefix,
     trajectory_prefix,
 )
-from ..formats.trajectory_log import RowBlocks
+from ..formats.trajectory_log import RowFormat
 from ..results.recorded_environment import GYM_VERSION
 from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
@@ -55,6 +55,7 @@ from .subject import Subject, check_pictures, what_is_missing
 from .told_trackers import ToldTrackers
 from .tracking import FinishedEpisode, Run
 from .trajectory_recorder import Pace, TrajectoryRecorder
+from .usual_steps import UsualSteps
 from .versions import versions
 from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder, can_give_pictures
@@ -170,7 +171,7 @@ class Recorder:
             clock=subject.clock, declared=subject.declared, max_fps=options.max_fps
         )
         self._trajectory: TrajectoryRecorder | None = None
-        self._blocks: RowBlocks | None = None
+        self._rows: RowFormat | None = None
         self._said: set[str] = set()
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
         # The same, where it is drawn live, and those of further cameras.
@@ -192,6 +193,8 @@ class Recorder:
         self._surroundings = look_around()
         self._policy = _policy_facts(options)
         self.closed = False
+        # What the next step may be recorded with; None where it is not a usual one.
+        self.usual: UsualSteps | None = None
 
     @property
     def directory(self) -> Path:
@@ -254,6 +257,7 @@ class Recorder:
         """
         if self._is_forked:
             self._refuse_process()
+        self.usual = None
         self.stats_recorder.before_reset(after_error=self._ending is not None)
         if not self._is_unbegun():
             self._take_last_picture()
@@ -315,6 +319,7 @@ class Recorder:
         succeeds. A reset is then allowed in any case. Nothing more is taken of the
         environment's state, which may be half of a step.
         """
+        self.usual = None
         if self.stats_recorder.done is False and self._ending is None:
             self._ending = ending(error)
 
@@ -359,6 +364,7 @@ class Recorder:
         reward = reward_to_float(reward)
         done = bool(terminated or truncated)
         self._ending = None
+        self.usual = None
         if done:
             # Before it is counted: an end that is interrupted is taken up again.
             self._flags = {
@@ -394,6 +400,8 @@ class Recorder:
                 if done:
                     self._end_episode()
                     self._tell_of_episode()
+                else:
+                    self.usual = self._usual_steps()
 
     def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
         """End the running episode, and wait until all videos are rendered.
@@ -441,6 +449,7 @@ class Recorder:
         logger.info("Finished writing results. They are in %s.", self.directory)
 
     def _end_by_close(self) -> None:
+        self.usual = None
         with contextlib.ExitStack() as ends:
             for states in self._all_states():
                 # A trajectory without its model is worth nothing, and what stores it
@@ -523,6 +532,15 @@ class Recorder:
                 "video" if pending == 1 else "videos",
                 self.directory,
             )
+
+    def _usual_steps(self) -> UsualSteps | None:
+        """Return what the coming steps may be recorded with, if they are usual."""
+        trajectory = self._trajectory
+        if trajectory is None or trajectory.copier is None:
+            return None
+        if self._live_videos is not None or self._clips is not None:
+            return None
+        return UsualSteps(trajectory, trajectory.copier, self.stats_recorder)
 
     def _refuse_step(self) -> None:
         if self._is_forked:
@@ -618,7 +636,7 @@ class Recorder:
             start=start,
             pace=self._pace,
             observation=observation,
-            blocks=self._blocks,
+            rows=self._rows,
         )
 
     def _trajectory_facts(
@@ -794,7 +812,7 @@ class Recorder:
         trajectory, self._trajectory = self._trajectory, None
         if trajectory is not None:
             trajectory.discard()
-            self._blocks = trajectory.blocks
+            self._rows = trajectory.rows
 
     def _how_it_ended(self, otherwise: str) -> dict[str, Any]:
         """Return whether the running episode is complete, and what ended it."""
@@ -874,7 +892,7 @@ class Recorder:
             if not self._tolerates("trajectory", error):
                 raise
             trajectory.abandon()
-        self._trajectory, self._blocks = None, trajectory.blocks
+        self._trajectory, self._rows = None, trajectory.rows
         if not trajectory.is_there:
             # The disk was too full for a single row: there is nothing to promise.
             return
@@ -982,6 +1000,7 @@ _recorders: weakref.WeakSet[Recorder] = weakref.WeakSet()
 def _refuse_what_the_parent_made() -> None:
     for recorder in _recorders:
         recorder._is_forked = True
+        recorder.usual = None
 
 
 os.register_at_fork(after_in_child=_refuse_what_the_parent_made)

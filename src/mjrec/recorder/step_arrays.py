@@ -13,6 +13,8 @@ from ..formats.trajectory import Array
 
 __all__ = ["StepArray", "action_array", "step_array"]
 
+_ARRAY = np.ndarray
+
 # What every value of a kind fits into exactly: people give float32 to an environment
 # in one step and float64 in the next.
 _WIDEST = {"f": np.dtype("<f8"), "i": np.dtype("<i8"), "b": np.dtype("<i8")}
@@ -37,6 +39,9 @@ class StepArray:
         self.kind = Array(dtype.str, shape)
         self.parts = parts
         self._values: NDArray[Any] = np.zeros(shape, dtype)
+        self._shape = self._values.shape
+        # Of the array before, which the next one is usually like.
+        self._usual: np.dtype[Any] | None = None
         # What goes in without a loss: integers into floats, and not the other way.
         self._kinds = "fiub" if dtype.kind == "f" else "iub"
         if dtype.kind == "u":
@@ -55,13 +60,10 @@ class StepArray:
         """
         # The usual case, at every step.
         if (
-            type(value) is np.ndarray
-            and self.parts is None
-            and value.dtype.kind in self._kinds
+            type(value) is _ARRAY
+            and value.dtype is self._usual
+            and value.shape == self._shape
         ):
-            if value.shape != self._values.shape:
-                self._values[...] = 0
-                return False
             self._values[...] = value
             return True
         return self._set_other(value)
@@ -73,6 +75,8 @@ class StepArray:
         except (AttributeError, KeyError, TypeError, ValueError):
             fits = False
         self._values[...] = array if fits else 0
+        if fits and self.parts is None:
+            self._usual = array.dtype
         return fits
 
     def _joined(self, value: Mapping[str, Any]) -> NDArray[np.float64]:

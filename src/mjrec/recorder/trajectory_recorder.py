@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from ..errors import PicturesDiffer
 from ..formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
-from ..formats.trajectory_log import RowBlocks, TrajectoryLogWriter
+from ..formats.trajectory_log import RowFormat, TrajectoryLogWriter
 from ..rates import rate_from_timestep, stride_for
-from ..simulation.state_source import EpisodeStart, MomentMemory, StateSource
+from ..simulation.state_source import EpisodeStart, StateSource
 from .step_arrays import StepArray, action_array, step_array
 
-__all__ = ["Pace", "TrajectoryRecorder"]
+__all__ = ["MomentCopier", "Pace", "TrajectoryRecorder"]
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +40,27 @@ class Pace:
     max_fps: float | Fraction | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class MomentCopier:
+    """Copies steps and their frames from the simulation's own memory.
+
+    For a step that did not end its episode and left a picture.
+    `TrajectoryRecorder.step` does the same, and more that is rarely needed.
+
+    Attributes:
+        set_action: notes the action before the step; False where it is not like those
+            before.
+        can_copy: tells, after the step, whether nothing but the state is new.
+        copy: copies step and frame; called with the step's number and its reward.
+        stride: only steps of which this is a factor have a frame.
+    """
+
+    set_action: Callable[[Any], bool]
+    can_copy: Callable[[], bool]
+    copy: Callable[[int, float], None]
+    stride: int
+
+
 class TrajectoryRecorder:
     """Writes the trajectory of one episode: a state a step, a snapshot a frame.
 
@@ -56,14 +77,16 @@ class TrajectoryRecorder:
         start: what `states.begin_episode` returned.
         pace: how simulated time becomes frames.
         observation: of the reset; None where observations are not recorded.
-        blocks: of the trajectory before, to be used again.
+        rows: what those of the trajectory before are like, if there was one.
 
     Attributes:
         path: of the log, which is there after the first step.
         steps: how many steps were recorded.
         frame_count: how many snapshots were taken.
+        last_frame: the step of the last one; -1 before.
+        copier: for the usual steps; None where each needs a closer look.
         is_stopped: nothing more of the episode is recorded, after an error.
-        blocks: memory that the next trajectory may use, once this one has ended.
+        rows: what they are like, once there is a log.
     """
 
     def __init__(
@@ -75,12 +98,14 @@ class TrajectoryRecorder:
         start: EpisodeStart | None,
         pace: Pace,
         observation: Any = None,
-        blocks: RowBlocks | None = None,
+        rows: RowFormat | None = None,
     ) -> None:
         self.path = path
-        self.blocks = blocks
+        self.rows = rows
         self.steps = 0
         self.frame_count = 0
+        self.last_frame = -1
+        self.copier: MomentCopier | None = None
         self._facts = facts
         self._states = states
         self._start = start or _NOTHING
@@ -88,23 +113,19 @@ class TrajectoryRecorder:
         self._state_bytes = 8 * sum(c.length for c in self._start.state)
         self._takes_frames = bool(self._start.snapshot.fields)
         self._stride = 1
-        self._last_frame = -1
         self._log: TrajectoryLogWriter | None = None
         self._ended = False
         self._is_told = False
         self.is_stopped = False
         # What a row holds behind its state; and a state where there is none.
         self._behind_state: tuple[memoryview, ...] = ()
-        # Where all of a step, and its frame, can be copied without asking further.
-        self._memory: MomentMemory | None = None
-        self._step_memory: tuple[memoryview, ...] = ()
         self._no_state = np.full(self._state_bytes // 8, np.nan).tobytes()
         self._irregular: set[str] = set()
         self._action: StepArray | None = None
         self._observation = None if observation is None else step_array(observation)
         # What belongs to step 0 waits here until there is a log.
         self._first_state = self._no_state
-        self._first_snapshot = np.empty(self._start.snapshot.size, np.uint8)
+        self._snapshot = np.empty(self._start.snapshot.size, np.uint8)
         self._first_observation = _bytes_of(self._observation, observation)
         self._first_change: Mapping[str, NDArray[Any]] | None = None
         self._first_time = pace.clock()
@@ -135,12 +156,13 @@ class TrajectoryRecorder:
     def stop_frames(self, reason: str) -> None:
         """Take no more snapshots, and say why."""
         self._takes_frames = False
-        self._memory = None
+        self.copier = None
         self.note(broken_reason=reason)
 
     def stop(self, reason: str) -> None:
         """Record nothing more of the episode, and say why; what was recorded stays."""
         self.is_stopped = True
+        self.copier = None
         self.note(broken_reason=reason)
 
     def step(
@@ -177,23 +199,7 @@ class TrajectoryRecorder:
         if self._observation is not None and not self._observation.set(observation):
             self._note_irregular("observations")
         number = self.steps + 1
-        memory = self._memory
-        if (
-            memory is not None
-            and has_picture
-            and number % self._stride == 0
-            and memory.is_current()
-        ):
-            # The usual step, in half the time of the others.
-            whole = b"".join(self._step_memory)
-            snapshot = b"".join(memory.snapshot)
-            log.add_moment(number, reward, terminated, truncated, whole, snapshot)
-            self.steps = self._last_frame = number
-            self.frame_count += 1
-            return
-        row = log.step_row(number, reward, terminated, truncated)
-        self.steps = number
-        state: Any = self._no_state
+        state: bytes | memoryview = self._no_state
         try:
             if has_picture and self._states is not None:
                 state = self._states.capture_state()
@@ -202,10 +208,10 @@ class TrajectoryRecorder:
             self._states = None
             raise
         finally:
-            # Whatever was raised: a row that is half of an earlier one, or missing,
-            # would be the end of the log.
-            row.data[:] = b"".join((state, *self._behind_state))
-            log.seal_row()
+            # Whatever was raised: a step that is missing would be the end of the log.
+            row = (state, *self._behind_state)
+            log.add_step(number, reward, terminated, truncated, row)
+            self.steps = number
         if number == 1:
             self._settle_pace(log)
         if has_picture and (is_last or number % self._stride == 0):
@@ -218,25 +224,21 @@ class TrajectoryRecorder:
             PicturesDiffer: no picture of this moment can be made from its state.
         """
         log, states, number = self._log, self._states, self.steps
-        if log is None or states is None or self._last_frame == number:
+        if log is None or states is None or self.last_frame == number:
             return
         if self.is_stopped:
             return
         if not self._takes_frames:
-            self._last_frame = number
             changed = states.changed_fields()
         else:
-            row = log.frame_row(number)
-            try:
-                changed = states.capture_snapshot(row)
-            except BaseException:
-                log.withdraw_row()
-                raise
-            log.seal_row()
-            self._last_frame = number
-            self.frame_count += 1
+            changed = states.capture_snapshot(self._snapshot)
         if changed:
+            # Before the frame that shows it.
             log.add_model_change(ModelChange(step=number, fields=changed))
+        if self._takes_frames:
+            log.add_frame(number, (self._snapshot.data,))
+            self.frame_count += 1
+        self.last_frame = number
 
     def end(self, facts: Mapping[str, Any]) -> None:
         """Write what is known of the episode's end, and close the log. Idempotent.
@@ -276,7 +278,7 @@ class TrajectoryRecorder:
             return
         self._first_state = bytes(self._states.capture_state())
         if self._takes_frames:
-            self._first_change = self._states.capture_snapshot(self._first_snapshot)
+            self._first_change = self._states.capture_snapshot(self._snapshot)
 
     def _begin_log(self) -> None:
         start = self._start
@@ -289,22 +291,20 @@ class TrajectoryRecorder:
                 action=_array_of(self._action),
                 observation=_array_of(self._observation),
             ),
-            blocks=self.blocks,
+            rows=self.rows,
         )
-        self.blocks = log.blocks
+        self.rows = log.rows
         for fields in (start.model_fields, self._first_change):
             if fields:
                 log.add_model_change(ModelChange(step=0, fields=fields))
         arrays = [array for array in (self._action, self._observation) if array]
         self._behind_state = tuple(array.bytes.data for array in arrays)
         no_action = bytes(0 if self._action is None else self._action.size)
-        row = log.step_row(0, 0.0, False, False)
-        row.data[:] = b"".join((self._first_state, no_action, self._first_observation))
-        log.seal_row()
+        first = (self._first_state, no_action, self._first_observation)
+        log.add_step(0, 0.0, False, False, first)
         if self._takes_frames:
-            log.frame_row(0)[:] = self._first_snapshot
-            log.seal_row()
-            self._last_frame = 0
+            log.add_frame(0, (self._snapshot.data,))
+            self.last_frame = 0
             self.frame_count = 1
 
     def _parts(self) -> dict[str, Any]:
@@ -336,9 +336,16 @@ class TrajectoryRecorder:
         rate = rate_from_timestep(elapsed) if elapsed else self._pace.declared()
         self._stride = stride_for(rate, self._pace.max_fps)
         memory = self._start.memory
-        if self._takes_frames and memory is not None:
-            self._memory = memory
-            self._step_memory = (*memory.state, *self._behind_state)
+        action = self._action
+        is_plain = action is not None and self._observation is None
+        if self._takes_frames and memory is not None and action and is_plain:
+            row = (*memory.state, *self._behind_state)
+            self.copier = MomentCopier(
+                set_action=action.set,
+                can_copy=memory.is_current,
+                copy=log.moments_of(row, memory.snapshot),
+                stride=self._stride,
+            )
         log.add_facts(
             {
                 "rate": str(rate),

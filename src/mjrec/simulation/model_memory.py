@@ -78,8 +78,9 @@ class ModelMemory:
         pieces = [*_array_pieces(model), _struct_piece(model)]
         self._light = [piece for piece in pieces if piece.is_watched]
         self._heavy = [piece for piece in pieces if not piece.is_watched]
-        # Pairs for the comparison at every captured step.
-        self._compared = [(piece.seen, piece.raw) for piece in self._light]
+        # For the comparison at every captured step, which is one of two lists.
+        self.seen = [piece.seen for piece in self._light]
+        self.present = [piece.raw for piece in self._light]
 
     def is_of(self, model: mujoco.MjModel) -> bool:
         """Tell whether `model` is the model remembered, in whatever wrapper."""
@@ -97,11 +98,7 @@ class ModelMemory:
 
     def is_unchanged(self) -> bool:
         """Tell whether all that is watched is as it was when last looked at."""
-        # A loop, because a generator for `all` takes as long again.
-        for seen, raw in self._compared:  # noqa: SIM110
-            if seen != raw:
-                return False
-        return True
+        return self.seen == self.present
 
     def changed(self) -> dict[str, NDArray[Any]] | None:
         """Return the watched fields that are other than when last looked at.

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recording the steps of which nothing but the state is new.
+
+A fast simulation's step takes no longer than some hundred instructions of Python, so
+whatever is asked at every step shows. Nearly all steps of an episode whose pictures are
+drawn later are alike: no error, no end, the same model, the same view. Of these nothing
+is asked that is known; what is not usual goes the recorder's own way.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..errors import FileNotWritten
+from .stats_recorder import StatsRecorder
+from .trajectory_recorder import MomentCopier, TrajectoryRecorder
+
+__all__ = ["UsualSteps"]
+
+# Of rewards, which are NumPy's float64 as a rule: `+` would make one of the sum too,
+# and converting each takes ten times as long.
+_sum = float.__add__
+
+
+class UsualSteps:
+    """The usual steps of an episode, from its second one on.
+
+    In place of `Recorder.before_step` and `Recorder.step`, for as long as the recorder
+    has it: `before_step`, the environment's step, and, where that did not end the
+    episode, `step`. Where one of the two returns False, the recorder's method of that
+    name is to be called after all.
+
+    Args:
+        trajectory: of the episode.
+        copier: of the trajectory.
+        stats: counts the steps.
+    """
+
+    __slots__ = (
+        "_can_copy",
+        "_copy",
+        "_set_action",
+        "_stats",
+        "_stride",
+        "_trajectory",
+    )
+
+    def __init__(
+        self, trajectory: TrajectoryRecorder, copier: MomentCopier, stats: StatsRecorder
+    ) -> None:
+        self._trajectory = trajectory
+        self._stats = stats
+        self._set_action = copier.set_action
+        self._can_copy = copier.can_copy
+        self._copy = copier.copy
+        self._stride = copier.stride
+
+    def before_step(self, action: Any) -> bool:
+        """Note the action of the coming step; return False if it is not like others."""
+        # Not `self._set_action(...)`: calling what an attribute holds takes CPython
+        # 3.11 twice as long.
+        set_action = self._set_action
+        return set_action(action)
+
+    def step(self, reward: Any) -> bool:
+        """Record a step that did not end the episode; return False if it is not usual.
+
+        Then nothing of it was recorded.
+        """
+        trajectory, stats = self._trajectory, self._stats
+        can_copy, copy = self._can_copy, self._copy
+        number = trajectory.steps + 1
+        if not isinstance(reward, float) or number % self._stride or not can_copy():
+            return False
+        try:
+            copy(number, reward)
+        except FileNotWritten:
+            # The recorder will meet it too, and knows what is to be done.
+            return False
+        trajectory.steps = trajectory.last_frame = number
+        trajectory.frame_count += 1
+        # A number, because an episode has begun.
+        stats.rewards = _sum(stats.rewards, reward)  # type: ignore[arg-type]
+        stats.steps = number
+        stats.total_steps += 1
+        return True
