@@ -13,6 +13,7 @@ stack than its length lets one expect, is refused.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import uuid
@@ -40,13 +41,18 @@ def dumps(value: object, *, indent: int | None = None) -> str:
     """
     try:
         # Nearly everything is plain, and this is many times as fast.
-        text = json.dumps(value, indent=indent, allow_nan=False)
+        text = _encoder(indent).encode(value)
         # What is written is what `loads` will accept.
         if text.count("[") + text.count("{") > _DEEPEST:
             _check_depth(value)
     except (TypeError, ValueError, RecursionError):
         return _dumps_any(value, indent=indent)
     return text
+
+
+@functools.cache
+def _encoder(indent: int | None) -> json.JSONEncoder:
+    return json.JSONEncoder(allow_nan=False, indent=indent)
 
 
 def loads(text: str | bytes) -> Any:

@@ -21,7 +21,6 @@ anywhere. A reader leaves out what is no episode, keeps the rest, and says so.
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import io
 import logging
@@ -147,7 +146,7 @@ class JournalWriter:
             self._file = io.FileIO(self._path, "a")
             self._size = os.fstat(self._file.fileno()).st_size
         # Not `asdict`, which would copy the options deeply; they may not allow it.
-        values = {f.name: getattr(entry, f.name) for f in dataclasses.fields(entry)}
+        values = {**vars(entry)}
         if entry.success == UNKNOWN:
             del values["success"]
         if self._env_info is not None:

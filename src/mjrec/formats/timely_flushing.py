@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flushing in time, also where nobody writes any more.
+"""Flushing in time, beside whoever writes, and also where nobody does any more.
 
-A writer that flushes when something is added keeps what was added last to itself for
-as long as the next step takes: a simulation that hangs would lose it. One thread of
-this process looks after all writers that are open, and ends with the last of them.
+A writer that flushes when something is added holds up whoever adds it, and keeps what
+was added last to itself for as long as the next step takes: a simulation that hangs
+would lose it. One thread of this process looks after all writers that are open, and
+ends with the last of them.
 """
 
 from __future__ import annotations
 
 import os
+import queue
 import threading
-import time
 import weakref
+from time import monotonic
 from typing import Protocol
 
-__all__ = ["Flushed", "flush_in_time"]
+__all__ = ["Flushed", "flush_in_time", "flush_soon"]
 
 _SECONDS = 0.2
 
@@ -22,11 +24,15 @@ _SECONDS = 0.2
 class Flushed(Protocol):
     """What is looked after."""
 
-    def flush_if_due(self) -> None:
-        """Flush, if it is time to. Called on another thread; raises nothing."""
+    @property
+    def is_due(self) -> bool:
+        """Whether to flush. Asked on another thread."""
 
-    def renew_lock(self) -> None:
-        """Make a new lock, in a forked child: another thread may have held the old."""
+    def flush_beside(self) -> None:
+        """Flush. Called on another thread; raises nothing."""
+
+    def renew_locks(self) -> None:
+        """Make new locks, in a forked child: another thread may have held the old."""
 
 
 class _Watch:
@@ -35,6 +41,7 @@ class _Watch:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.writers: weakref.WeakSet[Flushed] = weakref.WeakSet()
+        self.in_haste: queue.SimpleQueue[Flushed] = queue.SimpleQueue()
         self.is_kept = False
 
     def add(self, writer: Flushed) -> None:
@@ -50,9 +57,19 @@ class _Watch:
             self.writers.discard(writer)
 
     def _keep(self) -> None:
-        time.sleep(_SECONDS)
-        while self._look_at_all():
-            time.sleep(_SECONDS)
+        next_look = monotonic() + _SECONDS
+        while True:
+            self._flush_in_haste(until=next_look)
+            if not self._look_at_all():
+                return
+            next_look = monotonic() + _SECONDS
+
+    def _flush_in_haste(self, *, until: float) -> None:
+        while (rest := until - monotonic()) > 0:
+            try:
+                self.in_haste.get(timeout=rest).flush_beside()
+            except queue.Empty:
+                return
 
     def _look_at_all(self) -> bool:
         """Flush what is due; return whether there is anything to look after."""
@@ -61,7 +78,8 @@ class _Watch:
             writers = list(self.writers)
             self.is_kept = bool(writers)
         for writer in writers:
-            writer.flush_if_due()
+            if writer.is_due:
+                writer.flush_beside()
         return bool(writers)
 
 
@@ -76,13 +94,18 @@ def flush_in_time(writer: Flushed, *, is_open: bool = True) -> None:
         _watch.discard(writer)
 
 
+def flush_soon(writer: Flushed) -> None:
+    """Flush `writer`, which is looked after, without waiting for it."""
+    _watch.in_haste.put(writer)
+
+
 def _start_anew() -> None:
     # The thread is the parent's, and so may be the locks.
     global _watch
     writers = list(_watch.writers)
     _watch = _Watch()
     for writer in writers:
-        writer.renew_lock()
+        writer.renew_locks()
 
 
 os.register_at_fork(after_in_child=_start_anew)

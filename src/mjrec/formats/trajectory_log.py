@@ -32,7 +32,7 @@ from ..errors import (
     InvalidArgument,
 )
 from ..json_text import dumps
-from .timely_flushing import flush_in_time
+from .timely_flushing import flush_in_time, flush_soon
 from .trajectory import (
     FORMAT_VERSION,
     Array,
@@ -95,8 +95,10 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 # With the rounds of `timely_flushing` less than a second.
 _FLUSH_SECONDS = 0.75
-# What waits until it is written.
-_FLUSH_BYTES = 1 << 18
+# When so much waits, the thread that flushes is called.
+_FLUSH_BYTES = 1 << 16
+# When so much waits all the same, nothing more is taken before it is written.
+_MOST_WAITING_BYTES = 1 << 18
 
 
 def padded(length: int) -> int:
@@ -147,9 +149,9 @@ class TrajectoryLogWriter:
     left by a reset that another reset replaced, and is removed. What was flushed
     survives the death of the process.
 
-    One thread uses it, and another flushes what that one leaves too long. A process
-    forked from this one cannot: it can only `close`,
-    which writes nothing there.
+    One thread uses it, and another writes to the disk meanwhile, so that a simulation
+    does not stand still for it. A process forked from this one cannot use it: it can
+    only `close`, which writes nothing there.
 
     Args:
         path: of the log; its directory exists.
@@ -175,7 +177,7 @@ class TrajectoryLogWriter:
         self.rows = rows
         self._step, self._frame = rows.step, rows.frame
         self._process_id = os.getpid()
-        self._lock = threading.RLock()
+        self.renew_locks()
         self._descriptor: int | None = None
         self.is_there = False
         self._tail = _Tail(0)
@@ -258,7 +260,7 @@ class TrajectoryLogWriter:
             *(of_frames.length, of_frames.seed, of_frames.padding),
         )
         size = of_steps.size + of_frames.size
-        lock, join = self._lock, b"".join
+        lock, join = self._adding, b"".join
         pack, pack_step, pack_frame = (
             *(RECORD_PREFIX.pack, STEP_PREFIX.pack, FRAME_PREFIX.pack),
         )
@@ -274,25 +276,31 @@ class TrajectoryLogWriter:
                 of_frame,
                 frame_padding,
             )
+            tail = self._tail
+            if tail.size >= tail.limit:
+                self._make_room(tail)
             with lock:
                 tail = self._tail
-                if tail.size >= _FLUSH_BYTES:
-                    self.flush()
-                    tail = self._tail
                 tail.records += records
                 tail.size += size
 
         return add_moment
 
     def _add(self, records: tuple[bytes, ...]) -> None:
-        with self._lock:
+        tail = self._tail
+        if tail.size >= tail.limit:
+            self._make_room(tail)
+        with self._adding:
             tail = self._tail
-            if tail.size >= _FLUSH_BYTES:
-                self.flush()
-                tail = self._tail
             tail.records += records
-            for record in records:
-                tail.size += len(record)
+            tail.size += sum(map(len, records))
+
+    def _make_room(self, tail: _Tail) -> None:
+        if tail.size < _MOST_WAITING_BYTES:
+            tail.limit = _MOST_WAITING_BYTES
+            flush_soon(self)
+        else:
+            self.flush()
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Add to the facts of the header; of a key that is there, the newest counts.
@@ -302,7 +310,7 @@ class TrajectoryLogWriter:
         """
         self._check_open()
         record = facts_record(facts)
-        with self._lock:
+        with self._adding:
             self._tail.records.append(record)
 
     def add_model_change(self, change: ModelChange) -> None:
@@ -325,7 +333,7 @@ class TrajectoryLogWriter:
                 long as before, everything is kept, and another call tries again.
             ClosedError: after `close` or `discard`, or in a forked process.
         """
-        with self._lock:
+        with self._writing:
             self._check_open()
             self._check_process()
             tail = self._tail
@@ -334,23 +342,35 @@ class TrajectoryLogWriter:
             # written to the same place again; after it, none of them.
             self._tail = _Tail(tail.offset + size)
 
-    def flush_if_due(self) -> None:
-        """Flush what has waited for long enough, on whichever thread.
+    @property
+    def is_due(self) -> bool:
+        """Whether something has waited for long enough. For any thread."""
+        return monotonic() >= self._tail.due
+
+    def flush_beside(self) -> None:
+        """Flush while rows may be added, on another thread than the one that adds them.
 
         On a full disk it does nothing: whoever writes will find out.
         """
-        if monotonic() < self._tail.due:
-            return
-        with self._lock:
-            tail = self._tail
-            if tail is _CLOSED or monotonic() < tail.due:
-                return
-            with contextlib.suppress(FileNotWritten):
-                self.flush()
+        with self._writing:
+            with self._adding:
+                tail = self._tail
+                if tail is _CLOSED or not tail.records:
+                    return
+                size = sum(map(len, tail.records))
+                self._tail = _Tail(tail.offset + size)
+            try:
+                self._write(tail.records, tail.offset)
+            except FileNotWritten:
+                with self._adding:
+                    tail.take_back(self._tail)
+                    self._tail = tail
 
-    def renew_lock(self) -> None:
-        """Make a new lock, in a forked child: another thread may have held the old."""
-        self._lock = threading.RLock()
+    def renew_locks(self) -> None:
+        """Make new locks, in a forked child: another thread may have held the old."""
+        # Whoever has `_writing` changes the file, and has `_adding` at most inside it.
+        self._writing = threading.RLock()
+        self._adding = threading.RLock()
 
     def close(self) -> None:
         """Write everything and close the file. Idempotent.
@@ -360,7 +380,7 @@ class TrajectoryLogWriter:
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
         """
-        with self._lock:
+        with self._writing:
             if self.closed:
                 return
             if os.getpid() == self._process_id:
@@ -372,7 +392,7 @@ class TrajectoryLogWriter:
 
         A file without anything in it is removed.
         """
-        with self._lock:
+        with self._writing:
             is_empty = not self.closed and self._tail.offset == 0
             self._let_go()
             if is_empty:
@@ -384,7 +404,7 @@ class TrajectoryLogWriter:
         Raises:
             DirectoryNotWritable: the file cannot be removed.
         """
-        with self._lock:
+        with self._writing:
             self._let_go()
             self._remove()
 
@@ -456,15 +476,22 @@ class _Tail:
         due: when to write it, by the monotonic clock.
         records: in their order, in pieces.
         size: their bytes, roughly.
+        limit: of the size, at which something is to be done.
     """
 
-    __slots__ = ("due", "offset", "records", "size")
+    __slots__ = ("due", "limit", "offset", "records", "size")
 
     def __init__(self, offset: int) -> None:
         self.offset = offset
         self.due = monotonic() + _FLUSH_SECONDS
         self.records: list[bytes] = []
         self.size: float = 0
+        self.limit = _FLUSH_BYTES
+
+    def take_back(self, later: _Tail) -> None:
+        """Add what has come after it."""
+        self.records += later.records
+        self.size += later.size
 
 
 # It is always full, so that whoever adds a row asks no further.
@@ -533,13 +560,16 @@ def _described(header: TrajectoryHeader) -> _Described:
 
 def _beginning(facts: Mapping[str, Any], layout_text: str) -> bytes:
     line = FIRST_LINE + str(FORMAT_VERSION).encode()
-    header = b'{"facts": %b, "rows": %b}' % (_json(facts), layout_text.encode())
+    header = b'{"facts": %b, "rows": %b}' % (
+        dumps(dict(facts)).encode(),
+        layout_text.encode(),
+    )
     return line.ljust(FIRST_LINE_SIZE - 1) + b"\n" + _record(HEADER, header)
 
 
 def facts_record(facts: Mapping[str, Any]) -> bytes:
     """Return the record by which a log learns facts."""
-    return _record(FACTS, _json(facts))
+    return _record(FACTS, dumps(dict(facts)).encode())
 
 
 def _record(kind: bytes, *parts: bytes) -> bytes:
@@ -579,18 +609,6 @@ def _kind_of(name: str, array: NDArray[Any]) -> Array:
         raise InvalidArgument(
             f"The model field {name!r} cannot be recorded: {error}."
         ) from None
-
-
-_PLAIN_JSON = json.JSONEncoder(allow_nan=False)
-
-
-def _json(values: Mapping[str, Any]) -> bytes:
-    # The plain encoder takes a tenth of the time where there is nothing but JSON's own
-    # types, as usual.
-    try:
-        return _PLAIN_JSON.encode(values).encode()
-    except (TypeError, ValueError, RecursionError):
-        return dumps(dict(values)).encode()
 
 
 def write_all(descriptor: int, data: _Bytes, offset: int) -> None:

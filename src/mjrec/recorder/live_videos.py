@@ -75,7 +75,7 @@ class LiveVideoMaker:
         return VideoRecorder(
             pictures,
             base_path=base_path,
-            metadata=self.facts(),
+            metadata=self.facts() if enabled else None,
             enabled=enabled,
             fps=options.fps,
             max_fps=options.max_fps,
