@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
+import numpy as np
 
 from mjrec.formats.trajectory import ModelChange, TrajectoryHeader
 from mjrec.formats.trajectory_log import TrajectoryLogWriter
@@ -117,6 +118,7 @@ def record(
     source = SnapshotSource(model, data, layout)
     path = directory / "openaigym.trajectory.0.1.episode000000.log"
     writer = TrajectoryLogWriter(path, TrajectoryHeader(facts=known, snapshot=layout))
+    snapshot = np.empty(layout.size, np.uint8)
     seen = []
     with SceneRenderer(
         model,
@@ -132,11 +134,12 @@ def record(
             move(model, data, number)
             # Pictures are of every second step.
             for step in sorted({max(2 * number - 1, 0), 2 * number}):
-                writer.step_row(step, 0.0, False, False)
+                writer.add_step(step, 0.0, False, False, ())
             if names:
                 fields = read_fields(model, names)
                 writer.add_model_change(ModelChange(step=2 * number, fields=fields))
-            source.take(writer.frame_row(2 * number))
+            source.take(snapshot)
+            writer.add_frame(2 * number, [snapshot.data])
             renderer.model_changed()
             seen.append(renderer.render(data))
     writer.close()

@@ -434,7 +434,7 @@ def test_arrays_that_would_fill_the_memory_are_not_read(
     path = directory / "openaigym.trajectory.0.7.episode000000.log"
     with contextlib.closing(TrajectoryLogWriter(path, header)) as writer:
         for step in range(2):
-            writer.step_row(step, 0.0, False, False)[:] = 0
+            writer.add_step(step, 0.0, False, False, [bytes(8 << 20)])
     path = finish_trajectory(path)
     rows = 500
     with h5py.File(path, "r+") as file:
@@ -529,7 +529,7 @@ def test_a_model_change_that_fits_nothing_names_the_file(directory: Path) -> Non
     header = TrajectoryHeader(facts={"model": {**stored(directory)}})
     with contextlib.closing(TrajectoryLogWriter(path, header)) as writer:
         writer.add_model_change(ModelChange(step=0, fields={"geom_rgba": np.ones(3)}))
-        writer.step_row(0, 0.0, False, False)
+        writer.add_step(0, 0.0, False, False, ())
     with pytest.raises(UnreadableFile, match="belongs to another model") as error:
         load_trajectory(path).model()
     assert error.value.path == path

@@ -248,10 +248,8 @@ def test_the_clock_counts_from_the_reset(tmp_path: Path) -> None:
     header = type(header)(facts=header.facts, state=(clock,), snapshot=header.snapshot)
     writer = trajectories_by_hand.TrajectoryLogWriter(trajectory, header)
     for step, (time, reward) in enumerate([(7.0, 0), (7.5, 0.25), (9.0, -1)]):
-        writer.step_row(step, reward, False, False)[:] = list(
-            np.float64(time).tobytes()
-        )
-        writer.frame_row(step)[:] = grey(step)
+        writer.add_step(step, reward, False, False, [np.float64(time).tobytes()])
+        writer.add_frame(step, [bytes([grey(step)])])
     writer.close()
     with open_trajectory(trajectory) as reader:
         captions = list(Captions(reader, [0, 1, 2]))

@@ -198,7 +198,7 @@ def test_a_trajectory_without_snapshots(tmp_path: Path) -> None:
     path = tmp_path / "openaigym.trajectory.0.1.episode000000.log"
     facts = {"scene": None, "refusal": "a plugin draws"}
     writer = TrajectoryLogWriter(path, TrajectoryHeader(facts=facts))
-    writer.step_row(0, 0.0, False, False)
+    writer.add_step(0, 0.0, False, False, ())
     writer.close()
 
     with pytest.raises(NoPictures, match=r"a plugin draws.*render_states"):
@@ -260,8 +260,8 @@ def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:
     header = header_of(ride)
     layout = RowLayout.packed([("geom_xpos", Array("<f8", (1, 3)))])
     writer = TrajectoryLogWriter(path, dataclasses.replace(header, snapshot=layout))
-    writer.step_row(0, 0.0, False, False)
-    writer.frame_row(0)[:] = 0
+    writer.add_step(0, 0.0, False, False, ())
+    writer.add_frame(0, [bytes(layout.size)])
     writer.close()
     [model] = ride.path.parent.glob("openaigym.model.*")
     (tmp_path / model.name).write_bytes(model.read_bytes())

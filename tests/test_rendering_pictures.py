@@ -138,7 +138,7 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
         mjrec.render(tmp_path / "lost.h5")
     path = tmp_path / "openaigym.trajectory.0.1.episode000000.log"
     writer = TrajectoryLogWriter(path, TrajectoryHeader(facts={"scene": None}))
-    writer.step_row(0, 0.0, False, False)
+    writer.add_step(0, 0.0, False, False, ())
     writer.close()
     with pytest.raises(NoPictures, match="no snapshots"):
         mjrec.render(path)

@@ -28,8 +28,8 @@ def write_saying(directory: Path, **facts: Any) -> Path:
     header = dataclasses.replace(header, facts={**header.facts, **facts})
     writer = TrajectoryLogWriter(usual.with_suffix(".log"), header)
     for step in range(2):
-        writer.step_row(step, 0.0, False, False)[:] = 0
-        writer.frame_row(step)[:] = grey(step)
+        writer.add_step(step, 0.0, False, False, [bytes(8)])
+        writer.add_frame(step, [bytes([grey(step)])])
     writer.close()
     return usual.with_suffix(".log")
 

@@ -99,15 +99,13 @@ class Recording:
             self._add(model, data, step)
 
     def _add(self, model: Any, data: Any, step: int) -> None:
-        row = self._writer.step_row(step, 0.5 * step, step == 12, False)
         self.states.append(state(model, data))
         action = self.actions[max(step - 1, 0)]
         observation = np.full(3, step, np.float32)
-        parts = (self.states[-1], action, observation)
-        row[:] = np.frombuffer(b"".join(map(bytes, parts)), np.uint8)
+        parts = [bytes(part) for part in (self.states[-1], action, observation)]
+        self._writer.add_step(step, 0.5 * step, step == 12, False, parts)
         if step % 2 == 0:
-            frame = self._writer.frame_row(step)
-            frame[:] = np.full((2, 3), step, np.float64).reshape(-1).view(np.uint8)
+            self._writer.add_frame(step, [np.full((2, 3), step, np.float64).tobytes()])
 
 
 def model_of(name: str) -> Any:
@@ -262,8 +260,8 @@ def test_a_recording_without_a_simulation_has_no_model(tmp_path: Path) -> None:
     """Its rewards are there all the same."""
     path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
     writer = TrajectoryLogWriter(path, TrajectoryHeader(facts={"model": None}))
-    writer.step_row(0, 0.0, False, False)
-    writer.step_row(1, 2.5, True, False)
+    writer.add_step(0, 0.0, False, False, ())
+    writer.add_step(1, 2.5, True, False, ())
     writer.close()
     trajectory = mjrec.load_trajectory(path)
     assert trajectory.rewards.tolist() == [2.5]

@@ -82,6 +82,11 @@ def log(tmp_path: Path) -> Path:
     return tmp_path / NAME
 
 
+def row_size(header: TrajectoryHeader) -> int:
+    arrays = [array for array in (header.action, header.observation) if array]
+    return 8 * header.state_length + sum(array.size for array in arrays)
+
+
 def write(
     log: Path,
     steps: int = 40,
@@ -95,11 +100,10 @@ def write(
     for change in CHANGES:
         writer.add_model_change(change)
     for step in range(steps + 1):
-        row = writer.step_row(step, step / 3, False, step == steps)
-        row[:] = np.frombuffer(chance.randbytes(row.size), np.uint8)
+        row = chance.randbytes(row_size(header))
+        writer.add_step(step, step / 3, False, step == steps, [row])
         if step % every == 0 and header.snapshot.fields:
-            row = writer.frame_row(step)
-            row[:] = np.frombuffer(chance.randbytes(row.size), np.uint8)
+            writer.add_frame(step, [chance.randbytes(header.snapshot.size)])
     writer.add_facts({"complete": True, "length": steps})
     writer.close()
 

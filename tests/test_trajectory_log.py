@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import errno
 import gc
+import itertools
 import os
 import random
 import signal
@@ -11,15 +15,17 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 import tracemalloc
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from full_disk import file_size_limit
+from trajectories_by_hand import kinds_of
+from waiting import wait_until
 
 import mjrec.formats.trajectory_log as trajectory_log
 from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
@@ -50,6 +56,7 @@ HEADER = TrajectoryHeader(
     observation=Array("|u1", (2, 2)),
 )
 ROW_SIZE = 3 * 8 + 3 * 4 + 4
+FRAME_SIZE = HEADER.snapshot.size
 STEP_RECORD = 16 + 24 + ROW_SIZE
 NAN = struct.pack("<Q", 0x7FF8000000BADBAD)
 
@@ -64,18 +71,23 @@ def step_bytes(step: int) -> bytes:
 
 
 def frame_bytes(step: int) -> bytes:
-    size = HEADER.snapshot.size - 1
-    return NAN + bytes((step * 11 + i) % 256 for i in range(size - 8)) + b"\x01"
+    content = bytes((step * 11 + i) % 256 for i in range(FRAME_SIZE - 9))
+    return NAN + content + b"\x01"
 
 
-def put(row: np.ndarray, data: bytes) -> None:
-    row[:] = np.frombuffer(data, np.uint8)
+@pytest.fixture
+def unattended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No thread looks after writers: only what the test does is written."""
+    monkeypatch.setattr(trajectory_log, "flush_in_time", lambda _, is_open=True: None)
+    monkeypatch.setattr(trajectory_log, "flush_soon", lambda _: None)
 
 
 def write_step(writer: TrajectoryLogWriter, step: int, *, frame: bool = True) -> None:
-    put(writer.step_row(step, step / 3, step == 8, step == 9), step_bytes(step))
+    row = step_bytes(step)
+    pieces = (row[:24], bytearray(row[24:36]), memoryview(row)[36:])
+    writer.add_step(step, step / 3, step == 8, step == 9, pieces)
     if frame:
-        put(writer.frame_row(step), frame_bytes(step))
+        writer.add_frame(step, [frame_bytes(step)])
 
 
 def write(path: Path, steps: int, *, every: int = 1) -> TrajectoryLogWriter:
@@ -117,14 +129,14 @@ def test_everything_comes_back_bit_for_bit(path: Path) -> None:
     assert content.dropped == 0
 
 
-def test_rows_beyond_one_block_come_back(path: Path) -> None:
-    """Blocks that filled up and were written in between are one sequence again."""
+def test_rows_that_were_written_at_several_times_come_back(path: Path) -> None:
+    """What was written in between and what was written last are one sequence."""
     write(path, 2000, every=2).close()
     check(read(path), 2000, every=2)
 
 
-def test_ranges_across_blocks_can_be_read(path: Path) -> None:
-    """A reader gives any range, from whichever blocks it comes."""
+def test_any_range_can_be_read(path: Path) -> None:
+    """Whenever its rows were written."""
     write(path, 1500).close()
     with TrajectoryLogReader(path) as reader:
         for start, stop in [(0, 0), (0, 8), (505, 521), (1022, 1026), (1500, 1501)]:
@@ -186,24 +198,22 @@ def test_model_changes_come_back(path: Path) -> None:
         assert first.fields[name].dtype == values.dtype.newbyteorder("<")
 
 
-def test_what_depends_on_something_else_comes_after_it(path: Path) -> None:
-    """Torn anywhere, no frame lacks its model or step, and the end lacks no row."""
-    writer = TrajectoryLogWriter(path, HEADER)
+def test_records_are_in_the_order_in_which_they_were_added(path: Path) -> None:
+    """Torn anywhere, a frame has its step and its model, and the end has every row."""
+    writer = write(path, 0)
+    writer.add_step(1, 0.5, False, False, [step_bytes(1)])
+    writer.add_model_change(ModelChange(step=1, fields={}))
+    writer.flush()
+    writer.add_frame(1, [frame_bytes(1)])
+    writer.moments_of([memoryview(step_bytes(2))], [memoryview(frame_bytes(2))])(2, 1.0)
     writer.add_facts({"complete": True})
-    put(writer.frame_row(0), frame_bytes(0))
-    put(writer.step_row(0, 0, False, False), step_bytes(0))
-    writer.add_model_change(ModelChange(step=0, fields={}))
     writer.close()
-    data = path.read_bytes()
-    kinds, offset = [], 32
-    while offset < len(data):
-        kind, _, length = struct.unpack_from("<4sIQ", data, offset)
-        kinds.append(kind)
-        offset += 16 + -(-length // 8) * 8
-    assert kinds == [b"head", b"chng", b"step", b"fram", b"fact"]
+    kinds = [b"head", b"step", b"fram", b"step", b"chng", b"fram", b"step", b"fram"]
+    assert kinds_of(path) == [*kinds, b"fact"]
 
 
-def test_a_large_model_change_is_not_kept_in_memory(path: Path) -> None:
+@pytest.mark.usefixtures("unattended")
+def test_a_large_model_change_does_not_stay_in_memory(path: Path) -> None:
     """A texture goes to the disk at once."""
     writer = write(path, 1)
     texture = np.zeros(3 << 20, np.uint8)
@@ -211,6 +221,25 @@ def test_a_large_model_change_is_not_kept_in_memory(path: Path) -> None:
     (change,) = read(path).model_changes
     assert change.fields["tex_data"].shape == texture.shape
     writer.close()
+
+
+@pytest.mark.usefixtures("unattended")
+@pytest.mark.parametrize(("size", "told"), [(8, False), (3 << 20, True)])
+def test_a_model_change_on_a_full_disk_is_not_lost(
+    path: Path, size: int, told: bool
+) -> None:
+    """Nobody would find it a second time: it is written, once, when there is room."""
+    writer = write(path, 9)
+    change = ModelChange(step=9, fields={"tex_data": np.zeros(size, np.uint8)})
+    with file_size_limit(5000):
+        refused = add_until_refused(Memory(writer).add)
+        expected = pytest.raises(FileNotWritten) if told else contextlib.nullcontext()
+        with expected:
+            writer.add_model_change(change)
+    writer.close()
+    content = read(path)
+    check(content, refused - 1)
+    assert [len(c.fields["tex_data"]) for c in content.model_changes] == [size]
 
 
 @pytest.mark.parametrize(
@@ -238,96 +267,272 @@ def test_what_no_file_can_hold_is_refused_as_a_row(path: Path) -> None:
         TrajectoryLogWriter(path, TrajectoryHeader(facts={}, action=Array(">f8", (1,))))
 
 
-def test_rows_are_where_a_simulation_can_write_them(path: Path) -> None:
-    """MuJoCo writes float64: rows begin at multiples of 8 bytes."""
-    writer = TrajectoryLogWriter(path, HEADER)
-    for step in range(3):
-        assert writer.step_row(step, 0, False, False).ctypes.data % 8 == 0
-        assert writer.frame_row(step).ctypes.data % 8 == 0
-    writer.discard()
-
-
-def test_a_withdrawn_row_was_never_there(path: Path) -> None:
-    """A row that could not be filled is taken back, once, and given out again."""
+@pytest.mark.parametrize("size", [0, ROW_SIZE - 1, ROW_SIZE + 1])
+def test_a_step_of_another_size_is_refused(path: Path, size: int) -> None:
+    """The error says what belongs there, nothing is added, and the log goes on."""
     writer = write(path, 3)
-    writer.frame_row(3)
-    writer.withdraw_row()
-    writer.withdraw_row()
-    writer.step_row(4, 5.0, True, True)
-    writer.withdraw_row()
+    with pytest.raises(InvalidArgument, match=f"has {ROW_SIZE} bytes, not {size}"):
+        writer.add_step(4, 0.0, False, False, [bytes(size)])
     write_step(writer, 4)
     writer.close()
-    writer.withdraw_row()
     check(read(path), 4)
 
 
-def add_moment(writer: TrajectoryLogWriter, step: int) -> None:
-    row, snapshot = step_bytes(step), frame_bytes(step)
-    writer.add_moment(step, step / 3, step == 8, step == 9, row, snapshot)
+@pytest.mark.parametrize("size", [0, FRAME_SIZE - 1, FRAME_SIZE + 1])
+def test_a_frame_of_another_size_is_refused(path: Path, size: int) -> None:
+    """Its step stays, and it can be added again."""
+    writer = write(path, 3)
+    write_step(writer, 4, frame=False)
+    with pytest.raises(InvalidArgument, match=f"has {FRAME_SIZE} bytes, not {size}"):
+        writer.add_frame(4, [bytes(size)])
+    writer.add_frame(4, [frame_bytes(4)])
+    writer.close()
+    check(read(path), 4)
+
+
+@pytest.mark.parametrize(("row", "snapshot"), [(-1, 0), (1, 0), (0, -1), (0, 1)])
+def test_memory_of_another_size_is_refused(path: Path, row: int, snapshot: int) -> None:
+    """Before the first moment is copied from it."""
+    writer = write(path, 3)
+    pieces = (
+        [memoryview(bytes(ROW_SIZE + row))],
+        [memoryview(bytes(FRAME_SIZE + snapshot))],
+    )
+    with pytest.raises(InvalidArgument, match="row of this log has"):
+        writer.moments_of(*pieces)
+    writer.close()
+    check(read(path), 3)
+
+
+class Memory:
+    """Memory as a simulation's, which is another at every step.
+
+    Args:
+        writer: what adds its moments.
+    """
+
+    def __init__(self, writer: TrajectoryLogWriter) -> None:
+        self.row, self.snapshot = bytearray(ROW_SIZE), bytearray(FRAME_SIZE)
+        row, snapshot = memoryview(self.row), memoryview(self.snapshot)
+        pieces = (row[:24], row[24:36], row[36:]), (snapshot[:48], snapshot[48:])
+        self._add = writer.moments_of(*pieces)
+
+    def add(self, step: int) -> None:
+        self.row[:], self.snapshot[:] = step_bytes(step), frame_bytes(step)
+        self._add(step, step / 3)
 
 
 def test_a_moment_is_a_step_with_its_frame(tmp_path: Path) -> None:
-    """The file is the same, byte for byte, also where blocks are full."""
-    path = tmp_path / "moments.log"
-    writer = TrajectoryLogWriter(path, HEADER)
-    steps = 2 * min(writer.blocks.steps.capacity, writer.blocks.frames.capacity) + 3
-    write_step(writer, 0)
-    for step in range(1, steps + 1):
-        add_moment(writer, step)
-    # There is nothing to take back.
-    writer.withdraw_row()
+    """The file is the same, byte for byte, as where both are added on their own."""
+    logs = tmp_path / "moments.log", tmp_path / "rows.log"
+    moments, rows = (TrajectoryLogWriter(log, HEADER) for log in logs)
+    memory = Memory(moments)
+    for step in range(2000):
+        memory.add(step)
+        rows.add_step(step, step / 3, False, False, [step_bytes(step)])
+        rows.add_frame(step, [frame_bytes(step)])
+    moments.close()
+    rows.close()
+    assert logs[0].read_bytes() == logs[1].read_bytes()
+
+
+def test_a_moment_is_that_at_which_it_was_added(path: Path) -> None:
+    """What becomes of the memory before it is written changes nothing."""
+    writer = write(path, 0)
+    memory = Memory(writer)
+    for step in range(1, 4):
+        memory.add(step)
+    memory.row[:], memory.snapshot[:] = bytes(ROW_SIZE), bytes(FRAME_SIZE)
     writer.close()
-    check(read(path), steps)
+    check(read(path), 3)
+
+
+def test_rows_are_copied_when_they_are_added(path: Path) -> None:
+    """Also those that are made of memory which is written over."""
+    writer = TrajectoryLogWriter(path, HEADER)
+    row, snapshot = bytearray(step_bytes(0)), bytearray(frame_bytes(0))
+    writer.add_step(0, 0.0, False, False, [row])
+    writer.add_frame(0, [snapshot])
+    row[:], snapshot[:] = bytes(ROW_SIZE), bytes(FRAME_SIZE)
+    writer.close()
+    check(read(path), 0)
+
+
+def add_until_refused(add: Callable[[int], None]) -> int:
+    """Add steps from 10 on where there is no room, and return the refused one's."""
+    for step in itertools.count(10):
+        try:
+            add(step)
+        except FileNotWritten:
+            return step
+        assert step < 100_000
+    raise AssertionError
 
 
 def test_a_moment_that_finds_no_room_was_not_added(path: Path) -> None:
     """Neither its step nor its frame; both can be added again."""
-    writer = write(path, 0)
-    rows = min(writer.blocks.steps.capacity, writer.blocks.frames.capacity)
-    for step in range(1, rows):
-        add_moment(writer, step)
-    with file_size_limit(5000), pytest.raises(FileNotWritten):
-        add_moment(writer, rows)
-    add_moment(writer, rows)
+    writer = write(path, 9)
+    memory = Memory(writer)
+    with file_size_limit(5000):
+        refused = add_until_refused(memory.add)
+    memory.add(refused)
     writer.close()
-    check(read(path), rows)
+    check(read(path), refused)
 
 
-def wait_until(condition: Callable[[], object]) -> None:
-    # Far longer than it takes, because the machine may have other work.
-    end = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
+def test_a_step_that_finds_no_room_was_not_added(path: Path) -> None:
+    """All that were added before are there, and it can be added again."""
+    writer = write(path, 9)
+    with file_size_limit(5000):
+        refused = add_until_refused(lambda step: write_step(writer, step, frame=False))
+    write_step(writer, refused, frame=False)
+    writer.close()
+    content = read(path)
+    assert content.rewards.tolist() == [step / 3 for step in range(1, refused + 1)]
+    assert content.frame_steps.tolist() == list(range(10))
+
+
+def steps_in(path: Path) -> int:
+    """Return how many rows of steps are in a log that may not be there yet."""
+    if not path.exists() or path.stat().st_size == 0:
+        return 0
+    return len(read(path).states)
 
 
 def test_rows_are_there_within_a_second_though_none_follows(path: Path) -> None:
     """A simulation that hangs after its third step loses nothing by that."""
     writer = write(path, 3)
-    writer.seal_row()
-    wait_until(path.exists)
-    check(read(path), 3)
-    write_step(writer, 4)
-    writer.seal_row()
-    wait_until(lambda: read(path).states.shape[0] == 5)
+    wait_until(lambda: steps_in(path) == 4)
+    write_step(writer, 4, frame=False)
+    wait_until(lambda: steps_in(path) == 5)
+    writer.add_frame(4, [frame_bytes(4)])
     writer.close()
     check(read(path), 4)
 
 
-def test_a_row_that_is_being_filled_is_not_written(
+def test_rows_are_written_when_enough_wait(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever fills it says when it is whole."""
-    writer = write(path, 3)
-    writer.step_row(4, 0, False, False)
-    now = time.monotonic()
-    monkeypatch.setattr(trajectory_log, "monotonic", lambda: now + 10)
-    writer.flush_if_due()
-    assert not path.exists()
-    writer.withdraw_row()
-    writer.flush_if_due()
-    check(read(path), 3)
+    """Beside whoever adds them, though none of them has waited for long."""
+    monkeypatch.setattr(trajectory_log, "monotonic", lambda: 100.0)
+    monkeypatch.setattr(trajectory_log, "_FLUSH_BYTES", 1000)
+    writer = write(path, 50)
+    wait_until(lambda: steps_in(path) > 0)
     writer.close()
+    check(read(path), 50)
+
+
+def test_few_rows_are_not_written_at_once(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A call of the operating system takes as long as the step of a fast simulation."""
+    monkeypatch.setattr(trajectory_log, "monotonic", lambda: 100.0)
+    writer = write(path, 50)
+    assert not path.exists()
+    writer.close()
+    check(read(path), 50)
+
+
+@pytest.mark.usefixtures("unattended")
+def test_rows_that_nobody_writes_beside_are_written_by_whoever_adds(
+    path: Path,
+) -> None:
+    """A thread that never gets its turn costs time, and no memory."""
+    writer = write(path, 9)
+    for step in range(10, 3000):
+        write_step(writer, step)
+    assert steps_in(path) > 0
+    writer.close()
+    check(read(path), 2999)
+
+
+class Slow:
+    """A disk whose next write waits until it is told to go on.
+
+    Args:
+        error: what the write ends with; it succeeds where there is none.
+    """
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, error: OSError | None = None
+    ) -> None:
+        self.began, self._may_go_on = threading.Event(), threading.Event()
+        self._error = error
+        self._pwrite, self._monkeypatch = os.pwrite, monkeypatch
+        monkeypatch.setattr(os, "pwrite", self._write)
+
+    def go_on(self) -> None:
+        self._may_go_on.set()
+
+    def _write(self, *arguments: Any) -> int:
+        self._monkeypatch.setattr(os, "pwrite", self._pwrite)
+        self.began.set()
+        assert self._may_go_on.wait(60)
+        if self._error is not None:
+            raise self._error
+        return self._pwrite(*arguments)
+
+
+@pytest.mark.usefixtures("unattended")
+@pytest.mark.parametrize("error", [None, OSError(errno.ENOSPC, "No space left")])
+def test_rows_are_added_while_others_are_written(
+    path: Path, monkeypatch: pytest.MonkeyPatch, error: OSError | None
+) -> None:
+    """The simulation does not wait; all are in their order, whatever came of it."""
+    writer = write(path, 3)
+    memory = Memory(writer)
+    disk = Slow(monkeypatch, error)
+    thread = threading.Thread(target=writer.flush_beside)
+    thread.start()
+    assert disk.began.wait(60)
+    for step in range(4, 7):
+        memory.add(step)
+    write_step(writer, 7)
+    disk.go_on()
+    thread.join()
+    assert steps_in(path) == (4 if error is None else 0)
+    write_step(writer, 8)
+    writer.close()
+    check(read(path), 8)
+
+
+@pytest.mark.usefixtures("unattended")
+def test_a_close_waits_for_what_is_being_written(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What came after it is behind it in the file."""
+    writer = write(path, 3)
+    disk = Slow(monkeypatch)
+    threads = [
+        threading.Thread(target=do) for do in (writer.flush_beside, writer.close)
+    ]
+    threads[0].start()
+    assert disk.began.wait(60)
+    write_step(writer, 4)
+    threads[1].start()
+    assert not writer.closed
+    disk.go_on()
+    for thread in threads:
+        thread.join()
+    assert writer.closed
+    check(read(path), 4)
+
+
+@pytest.mark.usefixtures("unattended")
+def test_a_full_disk_is_no_error_beside(path: Path) -> None:
+    """Nothing is lost: whoever adds rows or closes the log finds out."""
+    writer = write(path, 3)
+    with file_size_limit(100):
+        writer.flush_beside()
+        assert steps_in(path) == 0
+        write_step(writer, 4)
+        with pytest.raises(FileNotWritten):
+            writer.flush()
+    writer.flush_beside()
+    check(read(path), 4)
+    writer.close()
+    writer.flush_beside()
+    check(read(path), 4)
 
 
 def test_looking_after_writers_ends_with_the_last_of_them(path: Path) -> None:
@@ -340,42 +545,53 @@ def test_looking_after_writers_ends_with_the_last_of_them(path: Path) -> None:
     wait_until(lambda: "mjrec-flushing" not in names())
 
 
-def test_a_forked_child_can_close_what_is_being_flushed(path: Path) -> None:
-    """Another thread held the lock when it was forked, and is not there."""
+def wait_for_child(process_id: int) -> None:
+    """Wait for the end of a forked process, which may hang."""
+    wait_until(lambda: os.waitpid(process_id, os.WNOHANG) != (0, 0))
+
+
+def test_a_forked_child_can_close_what_is_being_flushed(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another thread was writing when it was forked, and is not there."""
     writer = write(path, 1)
-    with writer._lock:
-        child = os.fork()
-        if child == 0:
-            threading.Thread(target=writer.close).start()
-            writer.close()
-            os._exit(0)
-    end = time.monotonic() + 20
-    while os.waitpid(child, os.WNOHANG) == (0, 0):
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    disk = Slow(monkeypatch)
+    thread = threading.Thread(target=writer.flush_beside)
+    thread.start()
+    assert disk.began.wait(60)
+    child = os.fork()
+    if child == 0:
+        threading.Thread(target=writer.close).start()
+        writer.close()
+        os._exit(0)
+    wait_for_child(child)
+    disk.go_on()
+    thread.join()
     writer.close()
     check(read(path), 1)
 
 
+@pytest.mark.usefixtures("unattended")
 def test_a_flush_is_due_before_a_second_is_over(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is written before; the next row after it brings the rest."""
+    """From the flush before on."""
     now = 100.0
     monkeypatch.setattr(trajectory_log, "monotonic", lambda: now)
     writer = write(path, 2)
     now += 0.7
-    write_step(writer, 3)
-    assert not path.exists()
+    assert not writer.is_due
     now += 0.2
-    write_step(writer, 4)
-    check(read(path), 3)
+    assert writer.is_due
+    writer.flush_beside()
+    check(read(path), 2)
+    write_step(writer, 3)
     now += 0.5
-    write_step(writer, 5)
-    check(read(path), 3)
+    assert not writer.is_due
     writer.close()
 
 
+@pytest.mark.usefixtures("unattended")
 def test_a_living_log_can_be_read(path: Path) -> None:
     """What was flushed is there while the writer goes on."""
     writer = write(path, 2)
@@ -404,7 +620,7 @@ def test_rows_without_any_arrays_can_be_read(path: Path) -> None:
     """Where no simulation can be seen, rewards are recorded all the same."""
     writer = TrajectoryLogWriter(path, TrajectoryHeader(facts={}))
     for step in range(3):
-        assert writer.step_row(step, step, False, False).size == 0
+        writer.add_step(step, step, False, False, ())
     writer.close()
     content = read(path)
     assert content.rewards.tolist() == [1, 2]
@@ -435,21 +651,20 @@ def test_a_damaged_record_ends_the_log(path: Path, place: str) -> None:
     """What comes after damage is not trusted, and counted where it can be."""
     write(path, 6, every=10).close()
     data = bytearray(path.read_bytes())
-    # The rows of 7 steps and that of one frame are at the end.
-    frame_record = 16 + 8 + HEADER.snapshot.size
-    start = len(data) - -(-frame_record // 8) * 8 - 3 * STEP_RECORD
+    # The rows of steps 4, 5 and 6 are at the end.
+    start = len(data) - 3 * STEP_RECORD
     data[start + {"kind": 0, "checksum": 5, "length": 9, "payload": 70}[place]] ^= 0x41
     path.write_bytes(data)
     content = read(path)
     assert content.rewards.tolist() == [1 / 3, 2 / 3, 1.0]
-    assert content.dropped == (1 if place in {"kind", "length"} else 4)
+    assert content.dropped == (1 if place in {"kind", "length"} else 3)
     assert content.header == HEADER
 
 
 def test_a_frame_beyond_the_last_step_is_left_out(path: Path) -> None:
     """The step that it shows the end of is not known."""
     writer = write(path, 3)
-    put(writer.frame_row(4), frame_bytes(4))
+    writer.add_frame(4, [frame_bytes(4)])
     writer.close()
     content = read(path)
     check(content, 3)
@@ -461,12 +676,13 @@ def test_steps_out_of_order_end_the_log(path: Path, steps: tuple[int, ...]) -> N
     """States and actions belong together by their places."""
     writer = TrajectoryLogWriter(path, HEADER)
     for step in steps:
-        put(writer.step_row(step, 0, False, False), step_bytes(step))
+        writer.add_step(step, 0.0, False, False, [step_bytes(step)])
     writer.close()
     content = read(path)
     assert (len(content.states), content.dropped) == (len(steps) - 1, 1)
 
 
+@pytest.mark.usefixtures("unattended")
 def test_a_full_disk_costs_nothing_that_is_written(path: Path) -> None:
     """An error that names the file; a later flush writes all, once there is room."""
     writer = write(path, 2)
@@ -487,19 +703,6 @@ def test_a_full_disk_costs_nothing_that_is_written(path: Path) -> None:
     check(read(path), 9)
 
 
-def test_a_full_disk_is_noticed_where_a_block_is_full(path: Path) -> None:
-    """The row that found no room was not added, and can be asked for again."""
-    writer = TrajectoryLogWriter(path, HEADER)
-    rows = writer.blocks.steps.capacity
-    for step in range(rows):
-        write_step(writer, step)
-    with file_size_limit(5000), pytest.raises(FileNotWritten):
-        writer.step_row(rows, 0, False, False)
-    write_step(writer, rows)
-    writer.close()
-    check(read(path), rows)
-
-
 def test_a_directory_that_is_gone_is_one_clear_error(tmp_path: Path) -> None:
     """The error names the file, not an operating system call."""
     writer = write(tmp_path / "gone" / "a.log", 1)
@@ -512,9 +715,12 @@ class _Interrupt(BaseException):
     pass
 
 
-@pytest.mark.parametrize("call", ["pwritev", "pwrite", "ftruncate"])
+@pytest.mark.usefixtures("unattended")
+@pytest.mark.parametrize(
+    ("call", "room"), [("pwrite", 1 << 20), ("pwrite", 50), ("ftruncate", 50)]
+)
 def test_an_interrupted_flush_is_taken_up_again(
-    path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+    path: Path, monkeypatch: pytest.MonkeyPatch, call: str, room: int
 ) -> None:
     """After Ctrl-C just behind any of its calls the next flush writes all, once."""
     writer = write(path, 2)
@@ -530,8 +736,6 @@ def test_an_interrupted_flush_is_taken_up_again(
             raise _Interrupt
 
     monkeypatch.setattr(os, call, interrupted)
-    # The second and the third are called where the disk is full.
-    room = 50 if call != "pwritev" else 1 << 20
     with file_size_limit(path.stat().st_size + room), pytest.raises(_Interrupt):
         writer.flush()
     write_step(writer, 4)
@@ -543,10 +747,9 @@ KILLED = """
 import os, signal, sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
-from test_trajectory_log import write, write_step
+from test_trajectory_log import write
 writer = write(Path({path!r}), 700)
 writer.flush()
-write_step(writer, 701)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -559,6 +762,7 @@ def test_a_killed_process_leaves_a_readable_log(path: Path) -> None:
     check(read(path), 700)
 
 
+@pytest.mark.usefixtures("unattended")
 def test_a_forked_child_writes_nothing(path: Path) -> None:
     """A child may let go of the log; writing in it is an error, and does no harm."""
     writer = write(path, 3)
@@ -602,12 +806,13 @@ def test_a_log_that_a_discarded_reset_left_is_replaced(path: Path) -> None:
 def test_a_closed_log_takes_nothing(path: Path) -> None:
     """Closing is idempotent; everything else says that it is closed."""
     writer = write(path, 1)
+    memory = Memory(writer)
     writer.close()
     writer.close()
     for use in (
-        lambda: writer.step_row(2, 0, False, False),
-        lambda: writer.frame_row(2),
-        lambda: add_moment(writer, 2),
+        lambda: write_step(writer, 2),
+        lambda: writer.add_frame(1, [frame_bytes(1)]),
+        lambda: memory.add(2),
         lambda: writer.add_facts({}),
         lambda: writer.add_model_change(ModelChange(step=0, fields={})),
         writer.flush,
@@ -617,40 +822,63 @@ def test_a_closed_log_takes_nothing(path: Path) -> None:
     check(read(path), 1)
 
 
-def test_blocks_serve_one_writer_after_the_other(tmp_path: Path) -> None:
-    """Handed on they are used again where they fit and are free, else replaced."""
+def test_rows_serve_one_writer_after_the_other(tmp_path: Path) -> None:
+    """Handed on they are used again, also while the first writer has them."""
     first = write(tmp_path / "a.log", 3)
-    second = TrajectoryLogWriter(tmp_path / "b.log", HEADER, blocks=first.blocks)
-    assert second.blocks is not first.blocks
-    for writer in (first, second):
-        writer.close()
-    again = TrajectoryLogWriter(tmp_path / "c.log", HEADER, blocks=first.blocks)
-    assert again.blocks is first.blocks
-    for step in range(3):
-        write_step(again, step)
-    again.close()
-    check(read(tmp_path / "c.log"), 2)
-    check(read(tmp_path / "a.log"), 3)
-    other = TrajectoryHeader(facts={}, snapshot=HEADER.snapshot)
-    assert (
-        TrajectoryLogWriter(tmp_path / "d.log", other, blocks=first.blocks).blocks
-        is not first.blocks
-    )
+    facts = dataclasses.replace(HEADER, facts={"env_id": "other"})
+    second = TrajectoryLogWriter(tmp_path / "b.log", facts, rows=first.rows)
+    assert second.rows is first.rows
+    write_step(second, 0)
+    write_step(first, 4)
+    write_step(second, 1)
+    first.close()
+    second.close()
+    check(read(tmp_path / "a.log"), 4)
+    check(read(tmp_path / "b.log"), 1)
+    assert read(tmp_path / "b.log").header == facts
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"state": ()},
+        {"snapshot": RowLayout()},
+        {"action": None},
+        {"action": Array("<i4", (3,))},
+        {"observation": Array("|u1", (4,))},
+    ],
+)
+def test_rows_that_do_not_fit_are_found_out_anew(
+    tmp_path: Path, other: dict[str, Any]
+) -> None:
+    """As after a change of the model, also where the size is the same."""
+    first = write(tmp_path / "a.log", 1)
+    header = dataclasses.replace(HEADER, **other)
+    assert not first.rows.fits(header)
+    second = TrajectoryLogWriter(tmp_path / "b.log", header, rows=first.rows)
+    assert second.rows.fits(header)
+    second.close()
+    assert read(tmp_path / "b.log").header == header
+    first.close()
 
 
 @pytest.mark.parametrize("size", [1, 60_000, 3_000_000])
-def test_the_memory_of_blocks_is_bounded(path: Path, size: int) -> None:
-    """Whatever the size of a row: two blocks stay below 4 MB, or are single rows."""
+def test_the_memory_of_what_waits_is_bounded(path: Path, size: int) -> None:
+    """Whatever the size of a row: some rows, or few megabytes of many."""
     header = TrajectoryHeader(
         facts={},
         snapshot=RowLayout.packed([("a", Array("|u1", (size,)))]),
         action=Array("|u1", (size,)),
     )
+    row = bytes(size)
     tracemalloc.start()
     writer = TrajectoryLogWriter(path, header)
-    held, _ = tracemalloc.get_traced_memory()
+    for step in range(20_000 if size == 1 else 60_000_000 // size // 2):
+        writer.add_step(step, 0.0, False, False, [row])
+        writer.add_frame(step, [row])
+    _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert held < max(4 << 20, 2 * size + 50_000)
+    assert peak < max(8 << 20, 6 * size)
     writer.discard()
 
 

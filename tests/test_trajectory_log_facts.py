@@ -27,8 +27,7 @@ def log(tmp_path: Path) -> Path:
     """A log that was closed."""
     writer = TrajectoryLogWriter(tmp_path / "a.log", HEADER)
     for step in range(STEPS + 1):
-        writer.step_row(step, 1.0, False, False)[:] = step
-        writer.seal_row()
+        writer.add_step(step, 1.0, False, False, [bytes([step] * 8)])
     writer.add_facts({"complete": True})
     writer.close()
     return writer.path

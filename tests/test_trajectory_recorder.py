@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from trajectories_by_hand import kinds_of
 
 from mjrec.errors import FileNotWritten, PicturesDiffer
 from mjrec.formats.trajectory import (
@@ -19,6 +20,7 @@ from mjrec.formats.trajectory import (
     TrajectoryContent,
 )
 from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.trajectory_log import RowFormat
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
 from mjrec.simulation.state_source import EpisodeStart, MomentMemory
 
@@ -96,7 +98,12 @@ class Remembered(Counter):
 
 
 def recorder(
-    path: Path, states: Counter | None, *, max_fps: Any = None, observation: Any = None
+    path: Path,
+    states: Counter | None,
+    *,
+    max_fps: Any = None,
+    observation: Any = None,
+    rows: RowFormat | None = None,
 ) -> TrajectoryRecorder:
     """Return the recorder of an episode of `states`."""
     return TrajectoryRecorder(
@@ -110,6 +117,7 @@ def recorder(
             max_fps=max_fps,
         ),
         observation=observation,
+        rows=rows,
     )
 
 
@@ -157,6 +165,20 @@ def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:
     assert trajectory.frame_count == 4
 
 
+def take_usual_step(trajectory: TrajectoryRecorder, states: Counter, step: int) -> None:
+    """Take a step as the recorder of an episode does, by the copier if it will."""
+    action, copier = np.full(2, step, np.float32), trajectory.copier
+    if copier is None or not copier.set_action(action):
+        trajectory.before_step(action)
+    states.step = step
+    if copier is None or step % copier.stride or not copier.can_copy():
+        trajectory.step(step / 2, False, False, None, False, True)
+        return
+    copier.copy(step, step / 2)
+    trajectory.steps = trajectory.last_frame = step
+    trajectory.frame_count += 1
+
+
 @pytest.mark.parametrize(("max_fps", "hidden_from"), [(None, 99), (25, 99), (None, 7)])
 def test_memory_of_the_simulation_gives_the_same(
     tmp_path: Path, max_fps: Any, hidden_from: int
@@ -169,16 +191,19 @@ def test_memory_of_the_simulation_gives_the_same(
         path = tmp_path / f"{type(states).__name__}.log"
         trajectory = recorder(path, states, max_fps=max_fps)
         for step in range(1, 10):
-            trajectory.before_step(np.full(2, step, np.float32))
-            states.step = step
             try:
-                trajectory.step(step / 2, False, False, None, False, True)
+                take_usual_step(trajectory, states, step)
             except PicturesDiffer as error:
                 trajectory.stop_frames(str(error))
+        trajectory.take_frame()
         trajectory.end({})
         logs.append(path)
     read, expected = content(logs[1]), content(logs[0])
     assert read.states.tobytes() == expected.states.tobytes()
+    assert read.actions is not None
+    assert expected.actions is not None
+    assert read.actions.tobytes() == expected.actions.tobytes()
+    assert read.rewards.tolist() == expected.rewards.tolist()
     assert read.snapshots.tobytes() == expected.snapshots.tobytes()
     assert read.frame_steps.tolist() == expected.frame_steps.tolist()
     assert read.header.facts == expected.header.facts
@@ -186,8 +211,104 @@ def test_memory_of_the_simulation_gives_the_same(
         change.step for change in expected.model_changes
     ]
     assert isinstance(states, Remembered)
-    if max_fps is None:
-        assert states.asked == [0, 1, 5, *range(hidden_from, 10)]
+    skipped = [k for k in range(2, 10) if max_fps is not None and k % 2]
+    asked = {0, 1, 5, *skipped, *range(hidden_from, 10)}
+    assert states.asked == sorted(asked)
+
+
+def test_steps_can_be_copied_from_the_second_one_on(tmp_path: Path) -> None:
+    """As long as frames are taken: the first one tells how long a step is."""
+    states = Remembered()
+    trajectory = recorder(tmp_path / "t.log", states, max_fps=25)
+    assert trajectory.copier is None
+    play(trajectory, states, 1, done=False)
+    assert trajectory.copier is not None
+    assert trajectory.copier.stride == 2
+    trajectory.stop_frames("a marker is in the way")
+    assert trajectory.copier is None
+    trajectory.discard()
+
+
+def test_no_steps_are_copied_after_a_stop(tmp_path: Path) -> None:
+    """Nothing more is recorded, by whichever way."""
+    states = Remembered()
+    trajectory = recorder(tmp_path / "t.log", states)
+    play(trajectory, states, 1, done=False)
+    assert trajectory.copier is not None
+    trajectory.stop("the disk is full")
+    assert trajectory.copier is None
+    trajectory.discard()
+
+
+@pytest.mark.parametrize("observation", [None, np.zeros(2)])
+def test_what_needs_a_closer_look_is_not_copied(
+    tmp_path: Path, observation: Any
+) -> None:
+    """A simulation without memory that is known, and observations of its steps."""
+    states = Counter() if observation is None else Remembered()
+    trajectory = recorder(tmp_path / "t.log", states, observation=observation)
+    play(trajectory, states, 2, done=False, observe=lambda _: observation)
+    assert trajectory.copier is None
+    trajectory.discard()
+
+
+def test_an_odd_action_is_not_set_for_a_copy(tmp_path: Path) -> None:
+    """`before_step` is to be asked, which notes it."""
+    states = Remembered()
+    trajectory = recorder(tmp_path / "t.log", states)
+    play(trajectory, states, 1, done=False)
+    assert trajectory.copier is not None
+    assert trajectory.copier.set_action(np.zeros(2, np.float32)) is True
+    assert trajectory.copier.set_action(np.zeros(5)) is False
+    trajectory.discard()
+
+
+def test_rows_are_handed_from_one_episode_to_the_next(tmp_path: Path) -> None:
+    """There are none before the first log; those of other rows are replaced."""
+    states = Counter()
+    first = recorder(tmp_path / "a.log", states)
+    assert first.rows is None
+    play(first, states, 2)
+    first.end({})
+    states.step = 0
+    second = recorder(tmp_path / "b.log", states, rows=first.rows)
+    play(second, states, 3)
+    second.end({})
+    assert second.rows is first.rows
+    assert content(tmp_path / "b.log").states[:, 1].tolist() == [0, 1, 2, 3]
+    third = recorder(tmp_path / "c.log", None, rows=first.rows)
+    third.end({})
+    assert third.rows is not first.rows
+    assert content(tmp_path / "c.log").states.shape == (1, 0)
+
+
+def test_the_step_of_the_last_frame_is_known(tmp_path: Path) -> None:
+    """None is taken twice, and -1 is none."""
+    states = Counter()
+    trajectory = recorder(tmp_path / "t.log", states, max_fps=25)
+    seen = [trajectory.last_frame]
+    for step in range(1, 4):
+        trajectory.before_step(np.full(2, step, np.float32))
+        states.step = step
+        trajectory.step(0.0, False, False, None, False, True)
+        seen.append(trajectory.last_frame)
+    trajectory.take_frame()
+    assert [*seen, trajectory.last_frame] == [-1, 0, 2, 2, 3]
+    assert trajectory.frame_count == 3
+    trajectory.discard()
+
+
+def test_a_model_change_is_before_the_frame_that_shows_it(tmp_path: Path) -> None:
+    """And behind the step: a log that is torn between them has no wrong picture."""
+    states, path = Remembered(), tmp_path / "t.log"
+    states.changes[2] = {"site_rgba": np.zeros((1, 4), np.float32)}
+    trajectory = recorder(path, states)
+    for step in range(1, 4):
+        take_usual_step(trajectory, states, step)
+    trajectory.end({})
+    kinds = [kind for kind in kinds_of(path) if kind not in {b"head", b"fact"}]
+    moment, changed = [b"step", b"fram"], [b"step", b"chng", b"fram"]
+    assert kinds == [b"chng", *moment, *moment, *changed, *moment]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ its snapshots, with a white pixel in a corner.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -111,15 +112,27 @@ def write_log(
     writer = TrajectoryLogWriter(path, header)
     taken = 0
     for step in range(steps + 1):
-        writer.step_row(step, 0.5 * bool(step), False, ended and step == steps)[:] = 0
+        last = ended and step == steps
+        writer.add_step(step, 0.5 * bool(step), False, last, [bytes(8)])
         if frames and (step % stride == 0 or step == steps):
-            writer.frame_row(step)[:] = grey(taken)
+            writer.add_frame(step, [bytes([grey(taken)])])
             taken += 1
     if ended:
         ending = {"complete": True, "terminated": False, "truncated": True}
         writer.add_facts({**ending, "length": steps, "reward": 0.5 * steps})
     writer.close()
     return path
+
+
+def kinds_of(path: Path) -> list[bytes]:
+    """Return the kinds of the records in a log, in their order."""
+    data = path.read_bytes()
+    kinds, offset = [], 32
+    while offset < len(data):
+        kind, _, length = struct.unpack_from("<4sIQ", data, offset)
+        kinds.append(kind)
+        offset += 16 + -(-length // 8) * 8
+    return kinds
 
 
 def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:

@@ -43,6 +43,9 @@ def installed_packages() -> Packages:
         the sha256 of what the wheel's own list of its files says, None without one.
     """
     places = [entry for entry in sys.path if isinstance(entry, str)]
+    if not sys.executable or getattr(sys, "frozen", False):
+        # There is no Python to start: it is part of another program.
+        return _packages_in(places)
     try:
         finished = subprocess.run(
             python_command(__name__),
@@ -53,7 +56,9 @@ def installed_packages() -> Packages:
             check=True,
         )
         found: Packages = json.loads(finished.stdout)
-    except (OSError, subprocess.SubprocessError, ValueError) as error:
+        if not isinstance(found, dict):
+            raise ValueError("it said something else")
+    except (OSError, RuntimeError, subprocess.SubprocessError, ValueError) as error:
         logger.debug("Packages are looked for in this process: %s", error)
         return _packages_in(places)
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import sys
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -75,7 +76,13 @@ def has_own_method(instance: Any, name: str) -> bool:
     """
     own = getattr(instance, name, None)
     of_class = getattr(instance.__class__, name, None)
-    return own is not of_class and getattr(own, "__func__", None) is not of_class
+    if own is of_class:
+        return False
+    # What a weak reference stands for is not to be had from it.
+    is_stand_in = type(instance) in weakref.ProxyTypes
+    is_bound = is_stand_in or getattr(own, "__self__", None) is instance
+    function = getattr(own, "__func__", None)
+    return of_class is None or not (is_bound and function is of_class)
 
 
 def overriding_class(kind: type, name: str) -> str:

@@ -104,7 +104,11 @@ def _own(env: Any, name: str, default: Any = None) -> Any:
 
     Not by its `__dict__`, for the reason that `has_own_method` gives.
     """
+    of_class = next((vars(k)[name] for k in type(env).__mro__ if name in vars(k)), None)
+    if hasattr(of_class, "__get__"):
+        return default
     try:
-        return object.__getattribute__(env, name)
+        found = object.__getattribute__(env, name)
     except AttributeError:
         return default
+    return default if found is of_class else found

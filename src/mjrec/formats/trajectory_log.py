@@ -99,6 +99,8 @@ _FLUSH_SECONDS = 0.75
 _FLUSH_BYTES = 1 << 16
 # When so much waits all the same, nothing more is taken before it is written.
 _MOST_WAITING_BYTES = 1 << 18
+# Model changes that wait; a texture is a megabyte.
+_MOST_CHANGED_BYTES = 1 << 20
 
 
 def padded(length: int) -> int:
@@ -323,7 +325,13 @@ class TrajectoryLogWriter:
             ClosedError: after `close` or `discard`.
         """
         self._check_open()
-        self._add((_record(CHANGE, *_change_parts(change)),))
+        record = _record(CHANGE, *_change_parts(change))
+        with self._adding:
+            tail = self._tail
+            tail.records.append(record)
+            tail.changed += len(record)
+        if tail.changed > _MOST_CHANGED_BYTES:
+            self.flush()
 
     def flush(self) -> None:
         """Hand everything to the operating system.
@@ -475,11 +483,12 @@ class _Tail:
         offset: in the file.
         due: when to write it, by the monotonic clock.
         records: in their order, in pieces.
-        size: their bytes, roughly.
+        size: the bytes of those that are rows.
         limit: of the size, at which something is to be done.
+        changed: the bytes of those that are model changes.
     """
 
-    __slots__ = ("due", "limit", "offset", "records", "size")
+    __slots__ = ("changed", "due", "limit", "offset", "records", "size")
 
     def __init__(self, offset: int) -> None:
         self.offset = offset
@@ -487,11 +496,13 @@ class _Tail:
         self.records: list[bytes] = []
         self.size: float = 0
         self.limit = _FLUSH_BYTES
+        self.changed = 0
 
     def take_back(self, later: _Tail) -> None:
         """Add what has come after it."""
         self.records += later.records
         self.size += later.size
+        self.changed += later.changed
 
 
 # It is always full, so that whoever adds a row asks no further.

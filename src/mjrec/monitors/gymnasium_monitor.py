@@ -127,6 +127,9 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         except BaseException as error:
             recorder.note_error(error)
             raise
+        if usual is not recorder.usual:
+            # Within the step this monitor was closed, or its process forked.
+            usual = None
         _, reward, terminated, truncated, _ = result
         if usual is None or terminated or truncated or not usual.step(reward):
             self._record(*result)
@@ -140,6 +143,8 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         truncated: bool,
         info: dict[str, Any],
     ) -> None:
+        if self._recorder.closed:
+            return
         done = bool(terminated or truncated)
         resets_itself = self._same_step_autoreset and done
         self._recorder.step(

@@ -337,7 +337,10 @@ class Recorder:
         if self._clips is not None:
             self._clips.before_step(stats.total_steps)
         if self._trajectory is not None:
-            self._trajectory.before_step(action)
+            try:
+                self._trajectory.before_step(action)
+            except FileNotWritten as error:
+                self._stop_recording(self._trajectory, error)
 
     def step(
         self,

@@ -57,9 +57,12 @@ class UsualSteps:
 
     def before_step(self, action: Any) -> bool:
         """Note the action of the coming step; return False if it is not like others."""
+        stats, set_action = self._stats, self._set_action
+        # Others may have ended the episode, or its recording.
+        if stats.done is not False or stats.closed:
+            return False
         # Not `self._set_action(...)`: calling what an attribute holds takes CPython
         # 3.11 twice as long.
-        set_action = self._set_action
         return set_action(action)
 
     def step(self, reward: Any) -> bool:

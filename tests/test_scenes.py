@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is asked of an environment before its states are recorded, and what it costs."""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import sys
+import weakref
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import mjrec
+from mjrec.environments.scenes import has_own_method
+
+STEPPING = """
+import dis, sys
+import gymnasium, mjrec
+env = gymnasium.make("HalfCheetah-v5", max_episode_steps=1000)
+{first}
+with mjrec.Monitor(env, sys.argv[1], lambda _: True, workers=0) as monitor:
+    monitor.reset(seed=0)
+    for _ in range(400):
+        monitor.step(monitor.action_space.sample())
+step = gymnasium.wrappers.TimeLimit.step
+for instruction in dis.get_instructions(step, adaptive=True):
+    print(instruction.opname, instruction.argval)
+"""
+LOOKING = "each = env\nwhile each is not each.unwrapped: vars(each); each = each.env"
+
+
+class Shown:
+    """Has a method of each kind."""
+
+    def render(self) -> str:
+        return "shown"
+
+    @staticmethod
+    def size() -> int:
+        return 3
+
+
+class Derived(Shown):
+    """Has the other's."""
+
+
+@pytest.mark.parametrize("name", ["render", "size", "nothing"])
+@pytest.mark.parametrize("kind", [Shown, Derived])
+def test_methods_of_a_class_are_not_an_instances_own(
+    kind: type[Shown], name: str
+) -> None:
+    """Nor is one that is missing; also where a proxy stands for the instance."""
+    instance = kind()
+    assert not has_own_method(instance, name)
+    assert not has_own_method(weakref.proxy(instance), name)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [lambda: "other", functools.partial(str, "other"), None, str.upper],
+    ids=["function", "partial", "none", "builtin"],
+)
+@pytest.mark.parametrize("name", ["render", "size"])
+def test_methods_set_on_an_instance_are_its_own(method: Any, name: str) -> None:
+    """Whatever they are; also where a proxy stands for the instance."""
+    instance = Shown()
+    setattr(instance, name, method)
+    assert has_own_method(instance, name)
+    assert has_own_method(weakref.proxy(instance), name)
+    assert not has_own_method(Shown(), name)
+
+
+def test_an_instances_own_method_may_be_its_classs() -> None:
+    """Set on it as it was found there, it does what it did."""
+    instance = Shown()
+    instance.render = instance.render  # type: ignore[method-assign]
+    instance.size = Shown.size  # type: ignore[method-assign]
+    assert not has_own_method(instance, "render")
+    assert not has_own_method(instance, "size")
+
+
+def test_a_method_of_another_class_is_an_instances_own() -> None:
+    """Although its name is the same."""
+
+    class Other:
+        def render(self) -> str:
+            return "other"
+
+    instance = Shown()
+    instance.render = Other().render  # type: ignore[method-assign]
+    assert has_own_method(instance, "render")
+
+
+def test_another_instances_method_is_an_instances_own() -> None:
+    """It shows the other one, though it is of the same class."""
+    instance = Shown()
+    instance.render = Shown().render  # type: ignore[method-assign]
+    assert has_own_method(instance, "render")
+
+
+@pytest.mark.parametrize("part", ["wrapper", "environment"])
+def test_an_environment_that_shows_another_is_drawn_live(
+    part: str, tmp_path: Path
+) -> None:
+    """Its pictures do not follow from its own states."""
+    options: dict[str, Any] = {"render_mode": "rgb_array", "width": 48, "height": 32}
+    env, other = (gymnasium.make("HalfCheetah-v5", **options) for _ in range(2))
+    other.reset()
+    changed = env if part == "wrapper" else env.unwrapped
+    changed.render = (other if part == "wrapper" else other.unwrapped).render  # type: ignore[method-assign]
+    monitor: Any = mjrec.Monitor(env, tmp_path, lambda _: True, workers=0)
+    with monitor:
+        monitor.reset(seed=0)
+        monitor.step(np.zeros(6))
+        assert isinstance(monitor.video_recorder, mjrec.VideoRecorder)
+    other.close()
+
+
+def instructions_of_a_step(directory: Path, first: str = "") -> list[str]:
+    """Return what CPython has made of TimeLimit.step under a monitor."""
+    if sys.implementation.name != "cpython" or sys.version_info[:2] != (3, 11):
+        pytest.skip("What CPython has specialised is named so in 3.11 only.")
+    done = subprocess.run(
+        [sys.executable, "-c", STEPPING.format(first=first), str(directory)],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    return [line for line in done.stdout.splitlines() if line.endswith(" env")]
+
+
+def test_a_monitor_leaves_attributes_of_environments_fast(tmp_path: Path) -> None:
+    """Nothing has asked the wrappers for their `__dict__`."""
+    assert instructions_of_a_step(tmp_path) == ["LOAD_ATTR_INSTANCE_VALUE env"]
+
+
+def test_looking_into_a_wrapper_makes_its_attributes_slow(tmp_path: Path) -> None:
+    """So the test before tells the one from the other."""
+    assert instructions_of_a_step(tmp_path, LOOKING) == ["LOAD_ATTR_ADAPTIVE env"]
