@@ -86,8 +86,6 @@ STEP_PREFIX = struct.Struct("<qd??6x")
 FRAME_PREFIX = struct.Struct("<q")
 CHANGE_PREFIX = struct.Struct("<qQ")
 
-_CHECKSUM_OFFSET = 4
-
 _Bytes = bytes | bytearray | memoryview
 
 # Half as expensive as a file object, in an episode of twenty steps.
@@ -254,18 +252,11 @@ class TrajectoryLogWriter:
         self._step.check(sum(map(len, row)))
         self._frame.check(sum(map(len, snapshot)))
         # All at hand: nothing is looked up that can be known.
-        of_steps, of_frames = self._step, self._frame
-        step_length, step_seed, step_padding = (
-            *(of_steps.length, of_steps.seed, of_steps.padding),
-        )
-        frame_length, frame_seed, frame_padding = (
-            *(of_frames.length, of_frames.seed, of_frames.padding),
-        )
-        size = of_steps.size + of_frames.size
-        lock, join = self._adding, b"".join
-        pack, pack_step, pack_frame = (
-            *(RECORD_PREFIX.pack, STEP_PREFIX.pack, FRAME_PREFIX.pack),
-        )
+        step_length, step_seed, step_padding = self._step.constants
+        frame_length, frame_seed, frame_padding = self._frame.constants
+        size = self._step.size + self._frame.size
+        pack_step, pack_frame = STEP_PREFIX.pack, FRAME_PREFIX.pack
+        pack, join, lock = RECORD_PREFIX.pack, b"".join, self._adding
 
         def add_moment(step: int, reward: float) -> None:
             of_step = join((pack_step(step, reward, False, False), *row))
@@ -298,6 +289,8 @@ class TrajectoryLogWriter:
             tail.size += sum(map(len, records))
 
     def _make_room(self, tail: _Tail) -> None:
+        # Called beside `_adding`, never inside it: who flushes may have to wait for
+        # the other thread, which asks for it while it writes.
         if tail.size < _MOST_WAITING_BYTES:
             tail.limit = _MOST_WAITING_BYTES
             flush_soon(self)
@@ -526,6 +519,11 @@ class _RowRecord:
         self.length = prefix_size + filled
         self.seed = checksum_seed(kind, self.length)
         self.padding = bytes(padded(self.length) - self.length)
+
+    @property
+    def constants(self) -> tuple[int, int, bytes]:
+        """What all have: length and seed for the prefix, and the padding."""
+        return self.length, self.seed, self.padding
 
     @property
     def size(self) -> int:

@@ -72,8 +72,8 @@ class Recorder:
 
     It is told what happens to an environment and never calls it, except for pictures
     and states: `before_reset`, the environment's reset inside `resetting`, `reset`;
-    `before_step`, the environment's step, `step`; `close`. It belongs to the process
-    that made it.
+    `before_step`, the environment's step, `step`, or, while there is `usual`, what that
+    has instead; `close`. It belongs to the process that made it.
 
     Args:
         directory: the monitor directory.

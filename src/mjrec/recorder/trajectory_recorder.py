@@ -330,22 +330,26 @@ class TrajectoryRecorder:
                 what,
             )
 
+    def _new_copier(self, log: TrajectoryLogWriter) -> MomentCopier | None:
+        memory, action = self._start.memory, self._action
+        if memory is None or action is None:
+            return None
+        if self._observation is not None or not self._takes_frames:
+            return None
+        row = (*memory.state, *self._behind_state)
+        return MomentCopier(
+            set_action=action.set,
+            can_copy=memory.is_current,
+            copy=log.moments_of(row, memory.snapshot),
+            stride=self._stride,
+        )
+
     def _settle_pace(self, log: TrajectoryLogWriter) -> None:
         """Measure the time of a step over the first one, and choose the stride."""
         elapsed = _difference(self._first_time, self._pace.clock())
         rate = rate_from_timestep(elapsed) if elapsed else self._pace.declared()
         self._stride = stride_for(rate, self._pace.max_fps)
-        memory = self._start.memory
-        action = self._action
-        is_plain = action is not None and self._observation is None
-        if self._takes_frames and memory is not None and action and is_plain:
-            row = (*memory.state, *self._behind_state)
-            self.copier = MomentCopier(
-                set_action=action.set,
-                can_copy=memory.is_current,
-                copy=log.moments_of(row, memory.snapshot),
-                stride=self._stride,
-            )
+        self.copier = self._new_copier(log)
         log.add_facts(
             {
                 "rate": str(rate),
