@@ -29,6 +29,7 @@ from waiting import wait_until
 
 import mjrec.formats.trajectory_log as trajectory_log
 from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
+from mjrec.formats.timely_flushing import flush_in_time, flush_soon
 from mjrec.formats.trajectory import (
     Array,
     Field,
@@ -533,6 +534,51 @@ def test_a_full_disk_is_no_error_beside(path: Path) -> None:
     writer.close()
     writer.flush_beside()
     check(read(path), 4)
+
+
+@pytest.mark.usefixtures("unattended")
+def test_what_fails_beside_is_written_by_the_next_flush(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever was raised, nothing of it is lost."""
+    writer = write(path, 3)
+
+    def fail(*_: object) -> int:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", fail)
+        with pytest.raises(MemoryError):
+            writer.flush_beside()
+    write_step(writer, 4)
+    writer.close()
+    check(read(path), 4)
+
+
+class Failing:
+    """A writer that cannot be flushed."""
+
+    is_due = True
+
+    def flush_beside(self) -> None:
+        raise MemoryError
+
+    def renew_locks(self) -> None: ...
+
+
+def test_a_writer_that_fails_does_not_keep_others_from_being_flushed(
+    path: Path,
+) -> None:
+    """It is met first, and the thread goes on."""
+    failing = Failing()
+    flush_in_time(failing)
+    flush_soon(failing)
+    writer = write(path, 3)
+    flush_soon(writer)
+    wait_until(lambda: path.exists() and steps_in(path) > 0)
+    flush_in_time(failing, is_open=False)
+    writer.close()
+    check(read(path), 3)
 
 
 def test_looking_after_writers_ends_with_the_last_of_them(path: Path) -> None:

@@ -9,6 +9,7 @@ ends with the last of them.
 
 from __future__ import annotations
 
+import logging
 import os
 import queue
 import threading
@@ -17,6 +18,8 @@ from time import monotonic
 from typing import Protocol
 
 __all__ = ["Flushed", "flush_in_time", "flush_soon"]
+
+logger = logging.getLogger(__name__)
 
 _SECONDS = 0.2
 
@@ -29,7 +32,7 @@ class Flushed(Protocol):
         """Whether to flush. Asked on another thread."""
 
     def flush_beside(self) -> None:
-        """Flush. Called on another thread; raises nothing."""
+        """Flush. Called on another thread."""
 
     def renew_locks(self) -> None:
         """Make new locks, in a forked child: another thread may have held the old."""
@@ -67,7 +70,7 @@ class _Watch:
     def _flush_in_haste(self, *, until: float) -> None:
         while (rest := until - monotonic()) > 0:
             try:
-                self.in_haste.get(timeout=rest).flush_beside()
+                _flush(self.in_haste.get(timeout=rest))
             except queue.Empty:
                 return
 
@@ -79,8 +82,16 @@ class _Watch:
             self.is_kept = bool(writers)
         for writer in writers:
             if writer.is_due:
-                writer.flush_beside()
+                _flush(writer)
         return bool(writers)
+
+
+def _flush(writer: Flushed) -> None:
+    try:
+        writer.flush_beside()
+    except Exception:
+        # Whoever writes will meet it too, and the others are to be looked after.
+        logger.warning("%r could not be flushed.", writer, exc_info=True)
 
 
 _watch = _Watch()

@@ -249,14 +249,14 @@ class TrajectoryLogWriter:
         Raises:
             InvalidArgument: one of them has another size than the header says.
         """
-        self._step.check(sum(map(len, row)))
-        self._frame.check(sum(map(len, snapshot)))
+        self._step.check(sum(piece.nbytes for piece in row))
+        self._frame.check(sum(piece.nbytes for piece in snapshot))
         # All at hand: nothing is looked up that can be known.
         step_length, step_seed, step_padding = self._step.constants
         frame_length, frame_seed, frame_padding = self._frame.constants
         size = self._step.size + self._frame.size
         pack_step, pack_frame = STEP_PREFIX.pack, FRAME_PREFIX.pack
-        pack, join, lock = RECORD_PREFIX.pack, b"".join, self._adding
+        pack, join = RECORD_PREFIX.pack, b"".join
 
         def add_moment(step: int, reward: float) -> None:
             of_step = join((pack_step(step, reward, False, False), *row))
@@ -272,7 +272,7 @@ class TrajectoryLogWriter:
             tail = self._tail
             if tail.size >= tail.limit:
                 self._make_room(tail)
-            with lock:
+            with self._adding:
                 tail = self._tail
                 tail.records += records
                 tail.size += size
@@ -362,10 +362,12 @@ class TrajectoryLogWriter:
                 self._tail = _Tail(tail.offset + size)
             try:
                 self._write(tail.records, tail.offset)
-            except FileNotWritten:
+            except BaseException as error:
                 with self._adding:
                     tail.take_back(self._tail)
                     self._tail = tail
+                if not isinstance(error, FileNotWritten):
+                    raise
 
     def renew_locks(self) -> None:
         """Make new locks, in a forked child: another thread may have held the old."""

@@ -176,8 +176,7 @@ class TrajectoryRecorder:
     ) -> None:
         """Record what the environment is like after a step.
 
-        Whatever goes wrong, the step is in the log: without a state, where there is
-        none to be had.
+        Where there is no state to be had, the step is in the log without one.
 
         Args:
             reward: of the step.
@@ -189,7 +188,8 @@ class TrajectoryRecorder:
                 state is the next episode's.
 
         Raises:
-            FileNotWritten: the disk is full; all is kept, and another call tries again.
+            FileNotWritten: the disk is full; the step was not recorded, and all before
+                it is kept.
             PicturesDiffer: no picture of this moment can be made from its state.
         """
         if self.is_stopped:
