@@ -6,6 +6,7 @@ A few environments here, all that are installed with MJREC_TEST_ALL=1.
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import json
 import os
@@ -103,6 +104,9 @@ def draw_quickly(model: Any) -> None:
 
 def record(env: Any, directory: Path, **options: Any) -> list[list[Any]]:
     """Record two episodes, and return the pictures of `render()` of every moment."""
+    # MuJoCo frees what an environment has drawn with in whatever OpenGL context is
+    # current: one that an earlier test has left is not to go between two pictures.
+    gc.collect()
     live = []
     env.action_space.seed(0)
     monitor = mjrec.Monitor(
