@@ -1,23 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flushing in time, beside whoever writes, and also where nobody does any more.
+"""Flushing in time, also where nobody writes any more.
 
-A writer that flushes when something is added holds up whoever adds it, and keeps what
-was added last to itself for as long as the next step takes: a simulation that hangs
-would lose it. One thread of this process looks after all writers that are open, and
-ends with the last of them.
+A writer that flushes when something is added keeps what was added last to itself for
+as long as the next step takes: a simulation that hangs would lose it. One thread of
+this process looks after all writers that are open, and ends with the last of them.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import queue
 import threading
+import time
 import weakref
-from time import monotonic
 from typing import Protocol
 
-__all__ = ["Flushed", "flush_in_time", "flush_soon"]
+__all__ = ["Flushed", "flush_in_time"]
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +42,6 @@ class _Watch:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.writers: weakref.WeakSet[Flushed] = weakref.WeakSet()
-        self.in_haste: queue.SimpleQueue[Flushed] = queue.SimpleQueue()
         self.is_kept = False
 
     def add(self, writer: Flushed) -> None:
@@ -60,19 +57,9 @@ class _Watch:
             self.writers.discard(writer)
 
     def _keep(self) -> None:
-        next_look = monotonic() + _SECONDS
-        while True:
-            self._flush_in_haste(until=next_look)
-            if not self._look_at_all():
-                return
-            next_look = monotonic() + _SECONDS
-
-    def _flush_in_haste(self, *, until: float) -> None:
-        while (rest := until - monotonic()) > 0:
-            try:
-                _flush(self.in_haste.get(timeout=rest))
-            except queue.Empty:
-                return
+        time.sleep(_SECONDS)
+        while self._look_at_all():
+            time.sleep(_SECONDS)
 
     def _look_at_all(self) -> bool:
         """Flush what is due; return whether there is anything to look after."""
@@ -103,11 +90,6 @@ def flush_in_time(writer: Flushed, *, is_open: bool = True) -> None:
         _watch.add(writer)
     else:
         _watch.discard(writer)
-
-
-def flush_soon(writer: Flushed) -> None:
-    """Flush `writer`, which is looked after, without waiting for it."""
-    _watch.in_haste.put(writer)
 
 
 def _start_anew() -> None:

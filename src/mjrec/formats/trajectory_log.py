@@ -32,7 +32,7 @@ from ..errors import (
     InvalidArgument,
 )
 from ..json_text import dumps
-from .timely_flushing import flush_in_time, flush_soon
+from .timely_flushing import flush_in_time
 from .trajectory import (
     FORMAT_VERSION,
     Array,
@@ -93,10 +93,10 @@ _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
 
 # With the rounds of `timely_flushing` less than a second.
 _FLUSH_SECONDS = 0.75
-# When so much waits, the thread that flushes is called.
-_FLUSH_BYTES = 1 << 16
-# When so much waits all the same, nothing more is taken before it is written.
-_MOST_WAITING_BYTES = 1 << 18
+# When so much waits, nothing more is taken before it is written. Not on the thread that
+# flushes: it would have to share the interpreter's lock with the simulation, which
+# costs more than writing does.
+_FLUSH_BYTES = 1 << 18
 # Model changes that wait; a texture is a megabyte.
 _MOST_CHANGED_BYTES = 1 << 20
 
@@ -149,9 +149,8 @@ class TrajectoryLogWriter:
     left by a reset that another reset replaced, and is removed. What was flushed
     survives the death of the process.
 
-    One thread uses it, and another writes to the disk meanwhile, so that a simulation
-    does not stand still for it. A process forked from this one cannot use it: it can
-    only `close`, which writes nothing there.
+    One thread uses it, and another flushes what that one leaves too long. A process
+    forked from this one cannot use it: it can only `close`, which writes nothing there.
 
     Args:
         path: of the log; its directory exists.
@@ -269,9 +268,8 @@ class TrajectoryLogWriter:
                 of_frame,
                 frame_padding,
             )
-            tail = self._tail
-            if tail.size >= tail.limit:
-                self._make_room(tail)
+            if self._tail.size >= _FLUSH_BYTES:
+                self.flush()
             with self._adding:
                 tail = self._tail
                 tail.records += records
@@ -280,22 +278,14 @@ class TrajectoryLogWriter:
         return add_moment
 
     def _add(self, records: tuple[bytes, ...]) -> None:
-        tail = self._tail
-        if tail.size >= tail.limit:
-            self._make_room(tail)
+        # Beside `_adding`, never inside it: who flushes may have to wait for the other
+        # thread, which asks for it while it writes.
+        if self._tail.size >= _FLUSH_BYTES:
+            self.flush()
         with self._adding:
             tail = self._tail
             tail.records += records
             tail.size += sum(map(len, records))
-
-    def _make_room(self, tail: _Tail) -> None:
-        # Called beside `_adding`, never inside it: who flushes may have to wait for
-        # the other thread, which asks for it while it writes.
-        if tail.size < _MOST_WAITING_BYTES:
-            tail.limit = _MOST_WAITING_BYTES
-            flush_soon(self)
-        else:
-            self.flush()
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Add to the facts of the header; of a key that is there, the newest counts.
@@ -479,18 +469,16 @@ class _Tail:
         due: when to write it, by the monotonic clock.
         records: in their order, in pieces.
         size: the bytes of those that are rows.
-        limit: of the size, at which something is to be done.
         changed: the bytes of those that are model changes.
     """
 
-    __slots__ = ("changed", "due", "limit", "offset", "records", "size")
+    __slots__ = ("changed", "due", "offset", "records", "size")
 
     def __init__(self, offset: int) -> None:
         self.offset = offset
         self.due = monotonic() + _FLUSH_SECONDS
         self.records: list[bytes] = []
         self.size: float = 0
-        self.limit = _FLUSH_BYTES
         self.changed = 0
 
     def take_back(self, later: _Tail) -> None:
