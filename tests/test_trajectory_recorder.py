@@ -21,7 +21,9 @@ from mjrec.formats.trajectory import (
 )
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_log import RowFormat
+from mjrec.recorder.stats_recorder import StatsRecorder
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
+from mjrec.recorder.usual_steps import UsualSteps
 from mjrec.simulation.state_source import EpisodeStart, MomentMemory
 
 
@@ -165,18 +167,25 @@ def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:
     assert trajectory.frame_count == 4
 
 
-def take_usual_step(trajectory: TrajectoryRecorder, states: Counter, step: int) -> None:
-    """Take a step as the recorder of an episode does, by the copier if it will."""
+def stats_of_an_episode(directory: Path) -> StatsRecorder:
+    """Return what counts the steps of an episode that has begun."""
+    stats = StatsRecorder(str(directory), "stats")
+    stats.before_reset()
+    stats.after_reset()
+    return stats
+
+
+def take_usual_step(
+    trajectory: TrajectoryRecorder, states: Counter, step: int, stats: StatsRecorder
+) -> None:
+    """Take a step as the recorder of an episode does, the usual way if it can."""
     action, copier = np.full(2, step, np.float32), trajectory.copier
-    if copier is None or not copier.set_action(action):
+    usual = None if copier is None else UsualSteps(trajectory, copier, stats)
+    if usual is None or not usual.before_step(action):
         trajectory.before_step(action)
     states.step = step
-    if copier is None or step % copier.stride or not copier.can_copy():
+    if usual is None or not usual.step(step / 2):
         trajectory.step(step / 2, False, False, None, False, True)
-        return
-    copier.copy(step, step / 2)
-    trajectory.steps = trajectory.last_frame = step
-    trajectory.frame_count += 1
 
 
 @pytest.mark.parametrize(("max_fps", "hidden_from"), [(None, 99), (25, 99), (None, 7)])
@@ -190,9 +199,10 @@ def test_memory_of_the_simulation_gives_the_same(
         states.hidden_from = hidden_from
         path = tmp_path / f"{type(states).__name__}.log"
         trajectory = recorder(path, states, max_fps=max_fps)
+        stats = stats_of_an_episode(tmp_path)
         for step in range(1, 10):
             try:
-                take_usual_step(trajectory, states, step)
+                take_usual_step(trajectory, states, step, stats)
             except PicturesDiffer as error:
                 trajectory.stop_frames(str(error))
         trajectory.take_frame()
@@ -302,9 +312,9 @@ def test_a_model_change_is_before_the_frame_that_shows_it(tmp_path: Path) -> Non
     """And behind the step: a log that is torn between them has no wrong picture."""
     states, path = Remembered(), tmp_path / "t.log"
     states.changes[2] = {"site_rgba": np.zeros((1, 4), np.float32)}
-    trajectory = recorder(path, states)
+    trajectory, stats = recorder(path, states), stats_of_an_episode(tmp_path)
     for step in range(1, 4):
-        take_usual_step(trajectory, states, step)
+        take_usual_step(trajectory, states, step, stats)
     trajectory.end({})
     kinds = [kind for kind in kinds_of(path) if kind not in {b"head", b"fact"}]
     moment, changed = [b"step", b"fram"], [b"step", b"chng", b"fram"]

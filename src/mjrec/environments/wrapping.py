@@ -33,6 +33,7 @@ _TRANSPARENT = frozenset(
 )
 # Where dm_env's wrappers, dm_control's and ours, keep what they wrap.
 _INSIDE = ("_env", "_environment", "environment")
+_MISSING = object()
 
 
 def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
@@ -95,8 +96,8 @@ def _is_innermost(env: Any) -> bool:
 
 
 def _inside(env: Any) -> Any:
-    found = (_own(env, name) for name in _INSIDE)
-    return next((inner for inner in found if inner is not None), None)
+    found = (_own(env, name, _MISSING) for name in _INSIDE)
+    return next((inner for inner in found if inner is not _MISSING), None)
 
 
 def _own(env: Any, name: str, default: Any = None) -> Any:
@@ -104,7 +105,8 @@ def _own(env: Any, name: str, default: Any = None) -> Any:
 
     Not by its `__dict__`, for the reason that `has_own_method` gives.
     """
-    of_class = next((vars(k)[name] for k in type(env).__mro__ if name in vars(k)), None)
+    kinds = type(env).__mro__
+    of_class = next((vars(k)[name] for k in kinds if name in vars(k)), _MISSING)
     if hasattr(of_class, "__get__"):
         return default
     try:

@@ -181,7 +181,6 @@ class DeferredClip:
             states=logs.states,
             start=start,
             pace=replace(logs.pace, max_fps=None),
-            # Once the part before has ended, and nobody uses it.
             rows=logs.rows if self._part is None else self._part.rows,
         )
 

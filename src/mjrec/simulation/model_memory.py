@@ -70,6 +70,12 @@ class ModelMemory:
 
     Args:
         model: the model, which is only read.
+
+    Attributes:
+        model: the model.
+        seen: what is watched, in pieces, as it was when last looked at.
+        present: the same pieces as they are: where the lists are equal, nothing of
+            what is watched has changed.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
