@@ -157,9 +157,12 @@ def test_states_are_those_of_the_environment(cheetah: Any, tmp_path: Path) -> No
     np.testing.assert_array_equal(trajectory.states, states)
 
 
-def test_steps_are_usual_from_the_second_one_on(cheetah: Any, tmp_path: Path) -> None:
-    """And no longer once an episode is over, until the next has had its first."""
-    with monitored(cheetah, tmp_path) as monitor:
+@pytest.mark.parametrize("max_fps", [None, 8])
+def test_steps_are_usual_from_the_second_one_on(
+    max_fps: int | None, cheetah: Any, tmp_path: Path
+) -> None:
+    """With a frame or without, until the episode is over and the next has had one."""
+    with monitored(cheetah, tmp_path, max_fps=max_fps) as monitor:
         seen = []
         for _ in range(2):
             begin(monitor)
@@ -300,6 +303,23 @@ def test_a_reward_that_is_no_number_is_told(tmp_path: Path) -> None:
 
 
 # --- what is noticed -----------------------------------------------------------------
+
+
+def test_a_model_that_changes_between_frames(cheetah: Any, tmp_path: Path) -> None:
+    """The next frame shows it, and is no less a frame for that."""
+    model = cheetah.unwrapped.model
+
+    def paint(number: int, monitor: Any) -> None:
+        if number == 4:
+            assert is_usual(monitor)
+            model.geom_rgba[1, 3] = 0.5
+
+    with monitored(cheetah, tmp_path, max_fps=8) as monitor:
+        begin(monitor)
+        go(monitor, 8, before=paint)
+    [trajectory] = trajectories(tmp_path)
+    assert trajectory.frame_steps.tolist() == [0, 3, 6, 8]
+    assert [trajectory.model(k).geom_rgba[1, 3] for k in (3, 6, 8)] == [1, 0.5, 0.5]
 
 
 def test_a_changed_model_is_noticed_at_the_very_step(

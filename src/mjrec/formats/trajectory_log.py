@@ -228,6 +228,19 @@ class TrajectoryLogWriter:
         prefix = FRAME_PREFIX.pack(step)
         self._add(self._frame.record(prefix, snapshot))
 
+    def steps_of(self, row: Sequence[memoryview]) -> Callable[[int, float], None]:
+        """Return what adds a step from the same memory, as `moments_of` does.
+
+        Raises:
+            InvalidArgument: the row has another size than the header says.
+        """
+        self._step.check(sum(piece.nbytes for piece in row))
+
+        def add_step(step: int, reward: float) -> None:
+            self.add_step(step, reward, False, False, row)
+
+        return add_step
+
     def moments_of(
         self, row: Sequence[memoryview], snapshot: Sequence[memoryview]
     ) -> Callable[[int, float], None]:

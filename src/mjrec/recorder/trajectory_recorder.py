@@ -51,13 +51,15 @@ class MomentCopier:
         set_action: notes the action before the step; False where it is not like those
             before.
         can_copy: tells, after the step, whether nothing but the state is new.
-        copy: copies step and frame; called with the step's number and its reward.
+        copy_step: copies a step; called with its number and its reward.
+        copy_moment: copies a step and its frame; likewise.
         stride: only steps of which this is a factor have a frame.
     """
 
     set_action: Callable[[Any], bool]
     can_copy: Callable[[], bool]
-    copy: Callable[[int, float], None]
+    copy_step: Callable[[int, float], None]
+    copy_moment: Callable[[int, float], None]
     stride: int
 
 
@@ -340,7 +342,8 @@ class TrajectoryRecorder:
         return MomentCopier(
             set_action=action.set,
             can_copy=memory.is_current,
-            copy=log.moments_of(row, memory.snapshot),
+            copy_step=log.steps_of(row),
+            copy_moment=log.moments_of(row, memory.snapshot),
             stride=self._stride,
         )
 

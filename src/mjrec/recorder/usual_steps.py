@@ -38,7 +38,8 @@ class UsualSteps:
 
     __slots__ = (
         "_can_copy",
-        "_copy",
+        "_copy_moment",
+        "_copy_step",
         "_set_action",
         "_stats",
         "_stride",
@@ -52,7 +53,8 @@ class UsualSteps:
         self._stats = stats
         self._set_action = copier.set_action
         self._can_copy = copier.can_copy
-        self._copy = copier.copy
+        self._copy_step = copier.copy_step
+        self._copy_moment = copier.copy_moment
         self._stride = copier.stride
 
     def before_step(self, action: Any) -> bool:
@@ -71,17 +73,21 @@ class UsualSteps:
         Then nothing of it was recorded.
         """
         trajectory, stats = self._trajectory, self._stats
-        can_copy, copy = self._can_copy, self._copy
-        number = trajectory.steps + 1
-        if not isinstance(reward, float) or number % self._stride or not can_copy():
+        can_copy = self._can_copy
+        if not isinstance(reward, float) or not can_copy():
             return False
+        number = trajectory.steps + 1
+        has_frame = number % self._stride == 0
+        copy = self._copy_moment if has_frame else self._copy_step
         try:
             copy(number, reward)
         except FileNotWritten:
             # The recorder will meet it too, and knows what is to be done.
             return False
-        trajectory.steps = trajectory.last_frame = number
-        trajectory.frame_count += 1
+        trajectory.steps = number
+        if has_frame:
+            trajectory.last_frame = number
+            trajectory.frame_count += 1
         # A number, because an episode has begun.
         stats.rewards = _sum(stats.rewards, reward)  # type: ignore[arg-type]
         stats.steps = number
