@@ -24,14 +24,9 @@ __all__ = ["EpisodeVideos"]
 
 
 class EpisodeVideos:
-    """The videos of the episodes that are over.
-
-    Attributes:
-        scheduled: the numbers of the episodes that the schedule chose.
-    """
+    """The videos of the episodes that are over."""
 
     def __init__(self) -> None:
-        self.scheduled: list[int] = []
         self._finished: list[tuple[str, str]] = []
         # What is finished and was not told of: episode, video and metadata.
         self._news: list[tuple[int, Path, Path]] = []

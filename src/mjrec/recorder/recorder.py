@@ -16,16 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..annotation import Caption
-from ..errors import (
-    DirectoryNotWritable,
-    Error,
-    FileNotWritten,
-    NoPictures,
-    PicturesDiffer,
-)
-from ..file_digests import file_sha256
-from ..fingerprint import machine_fingerprint
-from ..formats.manifest import Manifest, write_manifest
+from ..errors import DirectoryNotWritable, Error, FileNotWritten, PicturesDiffer
 from ..formats.monitor_directory import (
     journal_name,
     manifest_name,
@@ -34,37 +25,37 @@ from ..formats.monitor_directory import (
 )
 from ..formats.trajectory_log import RowFormat
 from ..results.recorded_environment import GYM_VERSION
-from ..schedules import disable_videos, schedule_name, to_schedule
 from ..simulation.state_source import EpisodeStart, StateSource
-from ..surroundings import look_around
+from .begun_episode import BegunEpisode
 from .clip_maker import ClipMaker
 from .clips import Clips
+from .deferral import Deferral
 from .deferred_video import DeferredVideo
 from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
+from .episode_choice import EpisodeChoice
 from .episode_journal import EpisodeJournal
 from .episode_videos import EpisodeVideos
 from .faults import Faults, What
 from .kept_videos import KeptVideos
 from .live_videos import LiveVideoMaker, LiveVideos
 from .opening import OpenDirectory, open_directory
-from .options import DEFERRED, LIVE, OFF, RecorderOptions, type_of_mode
-from .selection import Standing, selection_from
+from .options import DEFERRED, LIVE, RecorderOptions, type_of_mode
+from .recording_facts import RecordingFacts
+from .run_manifest import RunManifest
+from .selection import Standing
 from .stats_recorder import StatsRecorder, reward_to_float
-from .subject import Subject, check_pictures, what_is_missing
+from .subject import Subject, check_pictures
 from .told_trackers import ToldTrackers
 from .tracking import FinishedEpisode, Run
 from .trajectory_recorder import Pace, TrajectoryRecorder
 from .usual_steps import UsualSteps
-from .versions import versions
 from .video_promises import VideoPromises
-from .video_recorder import VideoRecorder, can_give_pictures
+from .video_recorder import VideoRecorder
 
 __all__ = ["Recorder"]
 
 logger = logging.getLogger(__name__)
-
-_FORMAT_VERSION = 1
 
 
 class Recorder:
@@ -94,28 +85,19 @@ class Recorder:
         rendering: Callable[[Path], Rendering] | None = None,
         finish_log: Callable[[Path], object],
     ) -> None:
-        self._schedule = to_schedule(options.video_callable)
-        selection = None if options.keep is None else selection_from(options.keep)
-        if selection is not None:
-            self._schedule = selection
-        if options.step_trigger is not None:
-            self._schedule = disable_videos
-        self._choice = subject.rendering
-        if self._choice.mode == OFF:
-            self._schedule = disable_videos
-        draws = self._schedule is not disable_videos or options.has_clips
-        if draws and self._choice.mode == LIVE:
+        self._mode = subject.rendering.mode
+        self._choice = EpisodeChoice(options, mode=self._mode)
+        draws = self._choice.has_videos or options.has_clips
+        if draws and self._mode == LIVE:
             check_pictures(subject)
         self._subject = subject
         self._states = subject.states
         self._clip_states = subject.clip_states
         self._options = options
-        self._env_info = {"gym_version": GYM_VERSION, "env_id": subject.env_id}
         self._pid = os.getpid()
         self._is_forked = False
         _recorders.add(self)
         self._videos = EpisodeVideos()
-        self._decision = (-1, False)
         self._faults = Faults(options.on_error)
         # Why the running episode ends early, once the environment has raised.
         self._ending: dict[str, Any] | None = None
@@ -124,12 +106,13 @@ class Recorder:
         self._success: bool | None = None
         # The last one that is over.
         self._finished: FinishedEpisode | None = None
+        env_info = {"gym_version": GYM_VERSION, "env_id": subject.env_id}
         self._place: OpenDirectory = open_directory(
             directory,
             force=options.force,
             resume=options.resume,
             uid=options.uid,
-            env_info=self._env_info,
+            env_info=env_info,
         )
         for states in self._all_states():
             states.open(self.directory)
@@ -137,15 +120,17 @@ class Recorder:
             rendering(self.directory) if rendering else None, finish_log
         )
         self._kept: KeptVideos | None = None
-        if selection is not None:
-            self._kept = KeptVideos(selection, videos=self._videos, ended=self._ended)
+        if self._choice.selection is not None:
+            self._kept = KeptVideos(
+                self._choice.selection, videos=self._videos, ended=self._ended
+            )
         # Whether the running episode's trajectory stays also without a video.
         self._stays = False
         self._next_episode_id = self._place.first_episode_id
-        self._episode_start: dict[str, Any] = {}
+        self._episode: BegunEpisode | None = None
         self._journal = EpisodeJournal(
             self.directory / journal_name(self._place.infix),
-            env_info=self._env_info,
+            env_info=env_info,
             tolerates=functools.partial(self._tolerates, "journal"),
         )
         self.stats_recorder = StatsRecorder(
@@ -172,7 +157,7 @@ class Recorder:
         )
         self._trajectory: TrajectoryRecorder | None = None
         self._rows: RowFormat | None = None
-        self._said: set[str] = set()
+        self._deferral = Deferral(subject)
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
         # The same, where it is drawn live, and those of further cameras.
         self._live_videos: LiveVideos | None = None
@@ -182,16 +167,28 @@ class Recorder:
             facts=self.live_video_facts,
             caption=self._caption,
         )
+        selection = {} if self._kept is None else self._kept.facts()
         self._promises = VideoPromises(
             directory=self.directory,
             infix=self._place.infix,
             subject=subject,
             options=options,
-            selection=None if self._kept is None else self._kept.facts(),
+            selection=selection or None,
+        )
+        self._facts = RecordingFacts(
+            infix=str(self._place.infix), subject=subject, selection=selection
         )
         self._clips = self._new_clips() if options.has_clips else None
-        self._surroundings = look_around()
-        self._policy = _policy_facts(options)
+        self._manifest = RunManifest(
+            self.directory / manifest_name(self._place.infix),
+            env_info=env_info,
+            options=options,
+            first_episode_id=self._place.first_episode_id,
+            choice=self._choice,
+            kept=self._kept,
+            videos=self._videos,
+            faults=self._faults,
+        )
         self.closed = False
         # What the next step may be recorded with; None where it is not a usual one.
         self.usual: UsualSteps | None = None
@@ -244,7 +241,7 @@ class Recorder:
 
     def resetting(self) -> AbstractContextManager[None]:
         """Return what to put around the reset of the environment."""
-        if self._states is None or self._choice.mode == LIVE:
+        if self._states is None or self._mode == LIVE:
             return contextlib.nullcontext()
         return self._states.resetting()
 
@@ -262,7 +259,9 @@ class Recorder:
         if not self._is_unbegun():
             self._take_last_picture()
         self._reset_time = time.time()
-        self._random_state = self._subject.random_state() if self._will_keep() else None
+        self._random_state = None
+        if self._choice.may_keep_trajectory(self.stats_recorder.type):
+            self._random_state = self._subject.random_state()
 
     def reset(
         self, *, seed: Any = None, options: Any = None, observation: Any = None
@@ -288,15 +287,17 @@ class Recorder:
         self._ending = None
         self.stats_recorder.after_reset()
         self._reset_clock = self._subject.clock() if self._options.annotate else None
-        self._episode_start = {
-            "start_time": self._reset_time,
-            "seed": seed,
-            "options": options,
-        }
-        episode_id = self._next_episode_id
+        self._episode = BegunEpisode(
+            episode_id=self._next_episode_id,
+            type=self.stats_recorder.episode_type,
+            start_time=self._reset_time,
+            seed=seed,
+            options=options,
+            random_state=self._random_state,
+        )
         self._next_episode_id += 1
         try:
-            self._begin_episode(episode_id, observation)
+            self._begin_episode(self._episode, observation)
         except Exception as error:
             if not self._tolerates("video", error):
                 raise
@@ -304,7 +305,7 @@ class Recorder:
             if self._live_videos is not None:
                 self._live_videos.give_up(str(error))
             else:
-                self._begin_live_videos(episode_id, enabled=False)
+                self._begin_live_videos(self._episode.episode_id, enabled=False)
         if self._options.write_upon_reset:
             try:
                 self._write_results()
@@ -474,9 +475,9 @@ class Recorder:
             promises=self._promises,
             live=self._live_maker,
             pace=self._pace,
-            episode_facts=self._episode_facts,
+            episode_facts=lambda start: self._facts.of_log(self._running, start),
             before=self._before_clip,
-            can_be_deferred=self._can_be_deferred,
+            can_be_deferred=self._deferral.is_possible,
             tolerates=functools.partial(self._tolerates, "video"),
             videos=self._videos,
             ended=self._ended,
@@ -562,26 +563,38 @@ class Recorder:
         stats = self.stats_recorder
         return stats.done is False and stats.steps == 0 and self._ending is None
 
-    def _begin_episode(self, episode_id: int, observation: Any) -> None:
-        wanted = self._decide(episode_id)
+    @property
+    def _running(self) -> BegunEpisode:
+        assert self._episode is not None, "there was no reset"
+        return self._episode
+
+    def _begin_episode(self, episode: BegunEpisode, observation: Any) -> None:
+        episode_id = episode.episode_id
+        wanted = self._choice.decide(episode_id)
         if self._clips is not None:
             self._clips.reset(episode_id, is_chosen=wanted)
             # The episode has no video of its own.
             wanted = False
-        keeps = self._keeps_trajectory(episode_id, has_video=wanted)
-        self._stays = keeps and not self._depends_on_video()
-        deferred = wanted and self._choice.mode == DEFERRED
+        keeps = self._choice.keeps_trajectory(
+            episode_id, episode_type=episode.type, has_video=wanted
+        )
+        self._stays = keeps and self._choice.keeps_without_video(episode.type)
+        deferred = wanted and self._mode == DEFERRED
         start = None
         if self._states is not None and (keeps or deferred):
             start = self._states.begin_episode()
-            deferred = deferred and self._can_be_deferred(start)
+            deferred = deferred and self._deferral.is_possible(start)
         self._trajectory = self._live_videos = self.video_recorder = None
         if keeps or deferred:
+            video = None
+            if wanted:
+                recording = DEFERRED if deferred else LIVE
+                video = self._promises.of_episode(episode_id, recording)
             self._trajectory = self._new_trajectory(
-                episode_id,
                 start,
-                video=("deferred" if deferred else "live") if wanted else None,
-                is_kept=keeps,
+                facts=self._facts.of_trajectory(
+                    episode, start, video=video, is_kept=keeps
+                ),
                 observation=observation if self._options.observations else None,
             )
         if deferred:
@@ -621,110 +634,17 @@ class Recorder:
         )
 
     def _new_trajectory(
-        self,
-        episode_id: int,
-        start: EpisodeStart | None,
-        *,
-        video: str | None,
-        is_kept: bool,
-        observation: Any,
+        self, start: EpisodeStart | None, *, facts: Mapping[str, Any], observation: Any
     ) -> TrajectoryRecorder:
-        name = trajectory_prefix(self._place.infix, episode_id)
+        name = trajectory_prefix(self._place.infix, self._running.episode_id)
         return TrajectoryRecorder(
             self.directory / f"{name}.log",
-            facts=self._trajectory_facts(
-                episode_id, start, video=video, is_kept=is_kept
-            ),
+            facts=facts,
             states=None if start is None else self._states,
             start=start,
             pace=self._pace,
             observation=observation,
             rows=self._rows,
-        )
-
-    def _trajectory_facts(
-        self,
-        episode_id: int,
-        start: EpisodeStart | None,
-        *,
-        video: str | None,
-        is_kept: bool,
-    ) -> dict[str, Any]:
-        promise = None
-        if video is not None:
-            promise = self._promises.of_episode(episode_id, video)
-        return {
-            **self._episode_facts(start),
-            "random_state": self._random_state,
-            "kept": is_kept,
-            "video": promise,
-            **({} if self._kept is None else {"candidate": video is not None}),
-        }
-
-    def _episode_facts(self, start: EpisodeStart | None) -> dict[str, Any]:
-        """Return what a log says of the running episode."""
-        return {
-            "episode_id": self._next_episode_id - 1,
-            "infix": str(self._place.infix),
-            "env_id": self._subject.env_id,
-            "type": self.stats_recorder.episode_type,
-            **self._episode_start,
-            "environment": self._subject.environment,
-            "versions": dict(versions()),
-            "machine": dict(machine_fingerprint()),
-            "model": None if start is None else start.model,
-            "scene": None if start is None else start.scene,
-            "refusal": None if start is None else start.refusal,
-        }
-
-    def _can_be_deferred(self, start: EpisodeStart) -> bool:
-        if start.refusal is None:
-            return True
-        if self._choice.is_forced:
-            raise PicturesDiffer(
-                f"The videos of {self._subject.env_id} were to be rendered later, from "
-                f'recorded states, and cannot be: {start.refusal}. Use render="live".'
-            )
-        if not can_give_pictures(self._subject.pictures):
-            raise NoPictures(
-                f"The videos of {self._subject.env_id} cannot be rendered from its "
-                f"states: {start.refusal}. They cannot be drawn live either: "
-                f"{what_is_missing(self._subject.pictures)}."
-            )
-        if start.refusal not in self._said:
-            self._said.add(start.refusal)
-            logger.warning(
-                "The videos of %s are drawn live: %s.",
-                self._subject.env_id,
-                start.refusal,
-            )
-        return False
-
-    def _decide(self, episode_id: int) -> bool:
-        """Ask the schedule; only once for a number, which resets may share."""
-        if self._decision[0] != episode_id:
-            self._decision = (episode_id, bool(self._schedule(episode_id)))
-            if self._decision[1]:
-                self._videos.scheduled.append(episode_id)
-        return self._decision[1]
-
-    def _keeps_trajectory(self, episode_id: int, *, has_video: bool) -> bool:
-        chosen = self._options.trajectory_callable
-        if chosen is None:
-            return has_video or self.stats_recorder.episode_type == "e"
-        return bool(chosen(episode_id)) if callable(chosen) else chosen
-
-    def _depends_on_video(self) -> bool:
-        """Whether a trajectory of the running episode is kept for its video only."""
-        is_asked = self._options.trajectory_callable is not None
-        return not is_asked and self.stats_recorder.episode_type != "e"
-
-    def _will_keep(self) -> bool:
-        """Whether the episode that the coming reset begins may have a trajectory."""
-        return (
-            self._options.trajectory_callable is not None
-            or self.stats_recorder.type == "e"
-            or self._schedule is not disable_videos
         )
 
     def _stop_recording(
@@ -769,17 +689,19 @@ class Recorder:
             self._live_videos.take_last()
 
     def _finished_episode(self) -> FinishedEpisode:
-        stats = self.stats_recorder
+        stats, episode = self.stats_recorder, self._running
         return FinishedEpisode(
-            episode_id=self._next_episode_id - 1,
+            episode_id=episode.episode_id,
             length=stats.episode_lengths[-1],
             reward=stats.episode_rewards[-1],
             type=stats.episode_types[-1],
             success=self._success,
+            seed=episode.seed,
+            options=episode.options,
+            start_time=episode.start_time,
             end_time=stats.timestamps[-1],
             total_steps=stats.total_steps,
             **self._flags,
-            **self._episode_start,
         )
 
     def _tell_of_episode(self) -> None:
@@ -835,7 +757,7 @@ class Recorder:
 
     def _standing(self, *, is_complete: bool) -> Standing:
         """Return how the running episode stands, which is over."""
-        if self._kept is None or not self._decision[1]:
+        if self._kept is None or not self._choice.is_scheduled:
             # What the schedule has said is final.
             return Standing.CHOSEN
         return self._kept.judge(
@@ -879,7 +801,7 @@ class Recorder:
         deferred = video if isinstance(video, DeferredVideo) else None
         promise = self._promises.of_episode(episode_id, DEFERRED if deferred else LIVE)
         verdict: Mapping[str, Any] = {}
-        if self._kept is not None and self._decision[1]:
+        if self._kept is not None and self._choice.is_scheduled:
             verdict = self._kept.verdict(standing, promise)
         try:
             trajectory.end(
@@ -940,60 +862,16 @@ class Recorder:
 
     def live_video_facts(self) -> dict[str, Any]:
         """Return what is known of a live video from its episode's beginning."""
-        reason = self._choice.reason
-        return {
-            "episode_id": self._next_episode_id - 1,
-            **({} if reason is None else {"recording_reason": reason}),
-            "type": self.stats_recorder.episode_type,
-            "env_id": self._env_info["env_id"],
-            "seed": self._episode_start.get("seed"),
-            "options": self._episode_start.get("options"),
-            "recording": LIVE,
-            "versions": dict(versions()),
-            "machine": dict(machine_fingerprint()),
-            **({} if self._kept is None else {"selection": self._kept.facts()}),
-        }
+        return self._facts.of_live_video(self._running)
 
     def _write_results(self, *, is_last: bool = False) -> None:
         self.stats_recorder.flush()
-        write_manifest(
-            self.directory / manifest_name(self._place.infix),
-            Manifest(
-                stats=Path(self.stats_recorder.path).name,
-                videos=tuple(self._videos.finished()),
-                env_info=self._env_info,
-                mjrec=self._details(is_last=is_last),
-            ),
+        self._manifest.write(
+            stats=Path(self.stats_recorder.path),
+            next_episode_id=self._next_episode_id,
+            failures=self.failures(),
+            is_last=is_last,
         )
-
-    def _details(self, *, is_last: bool) -> dict[str, Any]:
-        """Return what gym's manifests do not say."""
-        kept = self._kept
-        # Nobody waits for it in mid-recording.
-        around = self._surroundings.found(wait=is_last)
-        return {
-            "format_version": _FORMAT_VERSION,
-            "schedule": {
-                "name": schedule_name(self._schedule),
-                # It decided about every number from first to next; these got a yes.
-                "recorded": self._videos.scheduled if kept is None else kept.recorded,
-            },
-            **({} if kept is None else {"keep": kept.details()}),
-            "first_episode_id": self._place.first_episode_id,
-            "next_episode_id": self._next_episode_id,
-            "pending": self._videos.pending(self.failures()),
-            "broken": self._videos.broken(),
-            "faults": self._faults.listed(),
-            "versions": dict(versions()),
-            "surroundings": None if around is None else {**around, **self._policy},
-        }
-
-
-def _policy_facts(options: RecorderOptions) -> dict[str, Any]:
-    if options.policy_file is None:
-        return {"policy": None}
-    path = Path(options.policy_file).absolute()
-    return {"policy": {"file": str(path), "sha256": file_sha256(path)}}
 
 
 # Asking the system for the process's number at every step takes as long as counting it.

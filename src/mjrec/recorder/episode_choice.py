@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which episodes get a video, and which keep their trajectory."""
+
+from __future__ import annotations
+
+from ..schedules import Schedule, disable_videos, schedule_name, to_schedule
+from .options import OFF, RecorderOptions
+from .selection import Selection, selection_from
+
+__all__ = ["EpisodeChoice"]
+
+_EVALUATION = "e"
+
+
+class EpisodeChoice:
+    """Chooses as an episode begins, from what was asked for.
+
+    Args:
+        options: what was asked for.
+        mode: when pictures are drawn.
+
+    Attributes:
+        selection: chooses among the episodes that are over; None where that is settled
+            when they begin.
+        scheduled: the numbers of the episodes that the schedule chose.
+    """
+
+    def __init__(self, options: RecorderOptions, *, mode: str) -> None:
+        self.selection: Selection | None = None
+        self.scheduled: list[int] = []
+        self._schedule: Schedule = to_schedule(options.video_callable)
+        if options.keep is not None:
+            self._schedule = self.selection = selection_from(options.keep)
+        if options.step_trigger is not None or mode == OFF:
+            self._schedule = disable_videos
+        self._trajectories = options.trajectory_callable
+        # The episode that was asked about last.
+        self._decided = (-1, False)
+
+    @property
+    def schedule_name(self) -> str:
+        """What a manifest calls the schedule."""
+        return schedule_name(self._schedule)
+
+    @property
+    def has_videos(self) -> bool:
+        """Whether any episode may get a video of its own."""
+        return self._schedule is not disable_videos
+
+    @property
+    def is_scheduled(self) -> bool:
+        """Whether the schedule chose the episode that `decide` was asked about last."""
+        return self._decided[1]
+
+    def decide(self, episode_id: int) -> bool:
+        """Return whether an episode gets a video.
+
+        The schedule is asked once for a number, which resets may share.
+        """
+        if self._decided[0] != episode_id:
+            self._decided = (episode_id, bool(self._schedule(episode_id)))
+            if self._decided[1]:
+                self.scheduled.append(episode_id)
+        return self._decided[1]
+
+    def may_keep_trajectory(self, episode_type: str) -> bool:
+        """Return whether an episode of a type may have one, before `decide`."""
+        return (
+            self.has_videos
+            or self._trajectories is not None
+            or episode_type == _EVALUATION
+        )
+
+    def keeps_trajectory(
+        self, episode_id: int, *, episode_type: str, has_video: bool
+    ) -> bool:
+        """Return whether an episode keeps its trajectory.
+
+        Args:
+            episode_id: its number.
+            episode_type: "t" for training, "e" for evaluation.
+            has_video: it gets a video.
+        """
+        asked = self._trajectories
+        if asked is None:
+            return has_video or episode_type == _EVALUATION
+        return bool(asked(episode_id)) if callable(asked) else asked
+
+    def keeps_without_video(self, episode_type: str) -> bool:
+        """Return whether a trajectory that is kept stays where its video does not."""
+        return self._trajectories is not None or episode_type == _EVALUATION
