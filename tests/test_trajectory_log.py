@@ -553,14 +553,21 @@ def test_what_fails_beside_is_written_by_the_next_flush(
 
 
 class Failing:
-    """A writer that cannot be flushed."""
+    """A writer that cannot be flushed, but for some of the calls."""
 
     is_due = True
-    calls = 0
+
+    def __init__(self, *, good: tuple[int, ...] = ()) -> None:
+        self.good = good
+        self.calls = 0
+
+    def __repr__(self) -> str:
+        return "<Failing>"
 
     def flush_beside(self) -> None:
         self.calls += 1
-        raise MemoryError
+        if self.calls not in self.good:
+            raise MemoryError
 
     def renew_locks(self) -> None: ...
 
@@ -577,6 +584,16 @@ def test_a_writer_that_fails_does_not_keep_others_from_being_flushed(
     flush_in_time(failing, is_open=False)
     writer.close()
     check(read(path), 3)
+
+
+def test_that_a_writer_fails_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    """Not at every round of the thread; again where it has not failed in between."""
+    failing = Failing(good=(3,))
+    flush_in_time(failing)
+    wait_until(lambda: failing.calls > 4)
+    flush_in_time(failing, is_open=False)
+    messages = [record.getMessage() for record in caplog.records]
+    assert messages == 2 * ["<Failing> could not be flushed."]
 
 
 def test_looking_after_writers_ends_with_the_last_of_them(path: Path) -> None:

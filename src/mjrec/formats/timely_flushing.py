@@ -42,6 +42,8 @@ class _Watch:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.writers: weakref.WeakSet[Flushed] = weakref.WeakSet()
+        # Of the writers those of which it was said, and has not changed since.
+        self.failing: weakref.WeakSet[Flushed] = weakref.WeakSet()
         self.is_kept = False
 
     def add(self, writer: Flushed) -> None:
@@ -69,16 +71,19 @@ class _Watch:
             self.is_kept = bool(writers)
         for writer in writers:
             if writer.is_due:
-                _flush(writer)
+                self._flush(writer)
         return bool(writers)
 
-
-def _flush(writer: Flushed) -> None:
-    try:
-        writer.flush_beside()
-    except Exception:
-        # Whoever writes will meet it too, and the others are to be looked after.
-        logger.warning("%r could not be flushed.", writer, exc_info=True)
+    def _flush(self, writer: Flushed) -> None:
+        try:
+            writer.flush_beside()
+        except Exception:
+            # Whoever writes will meet it too, and the others are to be looked after.
+            if writer not in self.failing:
+                self.failing.add(writer)
+                logger.warning("%r could not be flushed.", writer, exc_info=True)
+        else:
+            self.failing.discard(writer)
 
 
 _watch = _Watch()
