@@ -67,11 +67,13 @@ def installed_packages() -> Packages:
 def _packages_in(places: Sequence[str]) -> Packages:
     found: Packages = {}
     for distribution in importlib.metadata.distributions(path=list(places)):
-        name = distribution.metadata["Name"]
+        # Parsed at each access.
+        metadata = distribution.metadata
+        name = metadata["Name"]
         # The first on the path is the one that is imported.
         if name and name not in found:
             found[name] = {
-                "version": distribution.version,
+                "version": metadata["Version"],
                 "record_sha256": _record_sha256(distribution),
             }
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
