@@ -422,6 +422,30 @@ def test_list_says_which_videos_are_pending(mjrec: Any, tmp_path: Path) -> None:
     assert second["video"] is None
 
 
+def test_list_shows_the_directories_in_one(mjrec: Any, tmp_path: Path) -> None:
+    """As of an evaluation, which has one for each task; others are passed over."""
+    for name, episodes in (("b", 1), ("a", 2)):
+        mjrec(*CHEETAH, "--out", tmp_path / name, "--episodes", episodes)
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "c.txt").touch()
+    status, out, _ = mjrec("list", tmp_path)
+    assert status == 0
+    assert [line for line in out.splitlines() if line.endswith(":")] == [
+        f"{tmp_path / name}:" for name in "ab"
+    ]
+    assert out.count("truncated") == 3
+    _, out, _ = mjrec("list", tmp_path, "--json")
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert [line["directory"] for line in lines] == ["a", "a", "b"]
+
+
+def test_list_says_that_there_is_nothing(mjrec: Any, tmp_path: Path) -> None:
+    """Not an empty table, and no error: a run may not have come to an end yet."""
+    status, out, _ = mjrec("list", tmp_path)
+    assert (status, out) == (0, f"No episode is recorded in {tmp_path}.\n")
+    assert mjrec("list", tmp_path, "--json")[:2] == (0, "")
+
+
 def test_list_of_nothing_is_an_error(mjrec: Any, tmp_path: Path) -> None:
     """The directory is named."""
     status, _, err = mjrec("list", tmp_path / "nothing")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +16,7 @@ import rich.table
 import tyro
 
 from .. import json_text
-from ..formats.monitor_directory import iter_monitor_files
+from ..formats.monitor_directory import iter_monitor_files, monitor_directories_in
 from ..formats.video_metadata import finished_videos, metadata_path
 from ..results import Episode, iter_episodes
 from .help_text import flowing_help
@@ -34,24 +34,55 @@ def list_episodes(
 ) -> int:
     """List the recorded episodes of a monitor directory.
 
+    Of a directory that has none of its own, such as an evaluation's, those of the
+    monitor directories in it.
+
     Args:
-        directory: the monitor directory.
-        as_json: print one JSON object a line and episode, instead of a table.
+        directory: the monitor directory, or one that holds some.
+        as_json: print one JSON object a line and episode, instead of a table; it says
+            `directory` where there are several.
     """
-    episodes = iter_episodes(directory)
+    places = _monitor_directories(directory)
     if as_json:
-        for episode in episodes:
-            sys.stdout.write(json_text.dumps(_fields(episode)) + "\n")
+        for place in places:
+            _print_json(place, {} if place == directory else {"directory": place.name})
         return 0
     console = result_console()
+    for place in places:
+        if place != directory:
+            _print_lines(console, f"{place}:")
+        _print_table(console, place)
+    return 0
+
+
+def _monitor_directories(directory: Path) -> list[Path]:
+    """Return the directory itself, or those in it that have what it has not."""
+    if not directory.is_dir() or any(iter_monitor_files(directory)):
+        return [directory]
+    return monitor_directories_in(directory) or [directory]
+
+
+def _print_json(directory: Path, more: Mapping[str, object]) -> None:
+    for episode in iter_episodes(directory):
+        sys.stdout.write(json_text.dumps({**more, **_fields(episode)}) + "\n")
+
+
+def _print_table(console: rich.console.Console, directory: Path) -> None:
     shown: list[Episode] = []
-    console.print(episode_table(_kept(episodes, shown)))
+    table = episode_table(_kept(iter_episodes(directory), shown))
+    if table.row_count:
+        console.print(table)
+    else:
+        _print_lines(console, f"No episode is recorded in {directory}.")
     others = _other_videos(directory, shown)
     if others:
-        # Names must survive copying, so no line is folded.
-        lines = ["Other videos:", *(f"  {name}" for name in others)]
-        console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
-    return 0
+        _print_lines(console, "Other videos:", *(f"  {name}" for name in others))
+
+
+def _print_lines(console: rich.console.Console, *lines: str) -> None:
+    # Names must survive copying, so no line is folded.
+    text = "\n".join(lines)
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def episode_table(episodes: Iterator[Episode]) -> rich.table.Table:

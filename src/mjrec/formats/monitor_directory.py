@@ -63,6 +63,7 @@ __all__ = [
     "lock_name",
     "manifest_lock_name",
     "manifest_name",
+    "monitor_directories_in",
     "names_in",
     "render_lock_name",
     "stats_prefix",
@@ -298,16 +299,21 @@ def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Pat
         yield directory / name
 
 
+def monitor_directories_in(directory: Path) -> list[Path]:
+    """Return the folders of a directory that hold monitor files, sorted by name."""
+    return [
+        path
+        for path in sorted(directory.iterdir())
+        if path.is_dir() and any(iter_monitor_files(path))
+    ]
+
+
 def where_recordings_are(directory: Path) -> str:
     """Return what to tell whoever looks for recordings in a directory without any.
 
     Its own folders are looked at, because an evaluation has one for each task.
     """
-    folders = [
-        path.name
-        for path in sorted(directory.iterdir())
-        if path.is_dir() and any(iter_monitor_files(path))
-    ]
+    folders = [path.name for path in monitor_directories_in(directory)]
     if not folders:
         return f"`mjrec record ENV --out {shlex.quote(str(directory))}` makes some."
     rest = len(folders) - _SHOWN
