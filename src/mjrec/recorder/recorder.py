@@ -124,8 +124,10 @@ class Recorder:
             self._kept = KeptVideos(
                 self._choice.selection, videos=self._videos, ended=self._ended
             )
-        # Whether the running episode's trajectory stays also without a video.
+        # Whether the running episode's trajectory stays also without a video, and what
+        # it says of the video.
         self._stays = False
+        self._promise: Mapping[str, Any] | None = None
         self._next_episode_id = self._place.first_episode_id
         self._episode: BegunEpisode | None = None
         self._journal = EpisodeJournal(
@@ -585,15 +587,15 @@ class Recorder:
             start = self._states.begin_episode()
             deferred = deferred and self._deferral.is_possible(start)
         self._trajectory = self._live_videos = self.video_recorder = None
+        self._promise = None
         if keeps or deferred:
-            video = None
             if wanted:
                 recording = DEFERRED if deferred else LIVE
-                video = self._promises.of_episode(episode_id, recording)
+                self._promise = self._promises.of_episode(episode_id, recording)
             self._trajectory = self._new_trajectory(
                 start,
                 facts=self._facts.of_trajectory(
-                    episode, start, video=video, is_kept=keeps
+                    episode, start, video=self._promise, is_kept=keeps
                 ),
                 observation=observation if self._options.observations else None,
             )
@@ -799,10 +801,9 @@ class Recorder:
         episode_id = self._next_episode_id - 1
         video = self.video_recorder
         deferred = video if isinstance(video, DeferredVideo) else None
-        promise = self._promises.of_episode(episode_id, DEFERRED if deferred else LIVE)
         verdict: Mapping[str, Any] = {}
         if self._kept is not None and self._choice.is_scheduled:
-            verdict = self._kept.verdict(standing, promise)
+            verdict = self._kept.verdict(standing, self._promise or {})
         try:
             trajectory.end(
                 {
@@ -827,7 +828,7 @@ class Recorder:
             self._kept.hold_trajectory(
                 episode_id,
                 trajectory.path,
-                promise=promise,
+                promise=self._promise or {},
                 stays=self._stays,
                 deferred=deferred,
             )
