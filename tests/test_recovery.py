@@ -220,7 +220,7 @@ def test_deferred_episodes_become_trajectories_and_stay_pending(
     directory = killed(
         "env = cheetah(workers=0)\nrun(env)\nrun(env, 6)\n"
         "env._recorder._states.finish()\n"
-        "env._recorder._trajectory._log.flush()\ndie()"
+        "env._recorder._trajectory.recorder._log.flush()\ndie()"
     )
     before = results_of(directory)
     mjrec.recover(directory)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..annotation import Caption
-from ..errors import DirectoryNotWritable, Error, FileNotWritten, PicturesDiffer
+from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.monitor_directory import (
     journal_name,
     manifest_name,
@@ -35,6 +35,7 @@ from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
 from .episode_choice import EpisodeChoice
 from .episode_journal import EpisodeJournal
+from .episode_trajectory import EpisodeTrajectory
 from .episode_videos import EpisodeVideos
 from .faults import Faults, What
 from .kept_videos import KeptVideos
@@ -124,10 +125,6 @@ class Recorder:
             self._kept = KeptVideos(
                 self._choice.selection, videos=self._videos, ended=self._ended
             )
-        # Whether the running episode's trajectory stays also without a video, and what
-        # it says of the video.
-        self._stays = False
-        self._promise: Mapping[str, Any] | None = None
         self._next_episode_id = self._place.first_episode_id
         self._episode: BegunEpisode | None = None
         self._journal = EpisodeJournal(
@@ -157,7 +154,7 @@ class Recorder:
         self._pace = Pace(
             clock=subject.clock, declared=subject.declared, max_fps=options.max_fps
         )
-        self._trajectory: TrajectoryRecorder | None = None
+        self._trajectory: EpisodeTrajectory | None = None
         self._rows: RowFormat | None = None
         self._deferral = Deferral(subject)
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
@@ -340,10 +337,7 @@ class Recorder:
         if self._clips is not None:
             self._clips.before_step(stats.total_steps)
         if self._trajectory is not None:
-            try:
-                self._trajectory.before_step(action)
-            except FileNotWritten as error:
-                self._stop_recording(self._trajectory, error)
+            self._trajectory.before_step(action)
 
     def step(
         self,
@@ -387,12 +381,9 @@ class Recorder:
         finally:
             try:
                 if self._trajectory is not None:
-                    try:
-                        self._trajectory.step(
-                            reward, terminated, truncated, observation, done, picture
-                        )
-                    except (PicturesDiffer, FileNotWritten) as error:
-                        self._stop_recording(self._trajectory, error)
+                    self._trajectory.step(
+                        reward, terminated, truncated, observation, done, picture
+                    )
                 if self._live_videos is not None:
                     self._live_videos.take(is_there=picture, last=done)
                 if self._clips is not None:
@@ -541,12 +532,14 @@ class Recorder:
 
     def _usual_steps(self) -> UsualSteps | None:
         """Return what the coming steps may be recorded with, if they are usual."""
-        trajectory = self._trajectory
-        if trajectory is None or trajectory.copier is None:
+        if self._trajectory is None:
+            return None
+        recorder = self._trajectory.recorder
+        if recorder.copier is None:
             return None
         if self._live_videos is not None or self._clips is not None:
             return None
-        return UsualSteps(trajectory, trajectory.copier, self.stats_recorder)
+        return UsualSteps(recorder, recorder.copier, self.stats_recorder)
 
     def _refuse_step(self) -> None:
         if self._is_forked:
@@ -580,29 +573,24 @@ class Recorder:
         keeps = self._choice.keeps_trajectory(
             episode_id, episode_type=episode.type, has_video=wanted
         )
-        self._stays = keeps and self._choice.keeps_without_video(episode.type)
         deferred = wanted and self._mode == DEFERRED
         start = None
         if self._states is not None and (keeps or deferred):
             start = self._states.begin_episode()
             deferred = deferred and self._deferral.is_possible(start)
         self._trajectory = self._live_videos = self.video_recorder = None
-        self._promise = None
         if keeps or deferred:
+            promise = None
             if wanted:
                 recording = DEFERRED if deferred else LIVE
-                self._promise = self._promises.of_episode(episode_id, recording)
+                promise = self._promises.of_episode(episode_id, recording)
             self._trajectory = self._new_trajectory(
-                start,
-                facts=self._facts.of_trajectory(
-                    episode, start, video=self._promise, is_kept=keeps
-                ),
-                observation=observation if self._options.observations else None,
+                episode, start, observation, promise=promise, is_kept=keeps
             )
         if deferred:
             assert self._trajectory is not None
-            self.video_recorder = DeferredVideo(
-                self._promises.path(episode_id), self._trajectory
+            self.video_recorder = self._trajectory.deferred = DeferredVideo(
+                self._promises.path(episode_id), self._trajectory.recorder
             )
         else:
             self._begin_live_videos(episode_id, enabled=wanted)
@@ -636,57 +624,40 @@ class Recorder:
         )
 
     def _new_trajectory(
-        self, start: EpisodeStart | None, *, facts: Mapping[str, Any], observation: Any
-    ) -> TrajectoryRecorder:
-        name = trajectory_prefix(self._place.infix, self._running.episode_id)
-        return TrajectoryRecorder(
+        self,
+        episode: BegunEpisode,
+        start: EpisodeStart | None,
+        observation: Any,
+        *,
+        promise: Mapping[str, Any] | None,
+        is_kept: bool,
+    ) -> EpisodeTrajectory:
+        name = trajectory_prefix(self._place.infix, episode.episode_id)
+        recorder = TrajectoryRecorder(
             self.directory / f"{name}.log",
-            facts=facts,
+            facts=self._facts.of_trajectory(
+                episode, start, video=promise, is_kept=is_kept
+            ),
             states=None if start is None else self._states,
             start=start,
             pace=self._pace,
-            observation=observation,
+            observation=observation if self._options.observations else None,
             rows=self._rows,
         )
-
-    def _stop_recording(
-        self, trajectory: TrajectoryRecorder, error: PicturesDiffer | FileNotWritten
-    ) -> None:
-        """Record no more frames, or nothing more at all, after an error."""
-        if isinstance(error, PicturesDiffer):
-            self._stop_frames(trajectory, error)
-            return
-        trajectory.stop(str(error))
-        self._break_deferred(str(error))
-        if not self._tolerates("trajectory", error):
-            raise error
-
-    def _stop_frames(
-        self, trajectory: TrajectoryRecorder, error: PicturesDiffer
-    ) -> None:
-        trajectory.stop_frames(str(error))
-        self._break_deferred(str(error))
-        logger.warning(
-            "The frames of episode %d end at step %d: %s",
-            self._next_episode_id - 1,
-            trajectory.steps,
-            error,
+        return EpisodeTrajectory(
+            recorder,
+            episode_id=episode.episode_id,
+            promise=promise,
+            stays=is_kept and self._choice.keeps_without_video(episode.type),
+            tolerates=functools.partial(self._tolerates, "trajectory"),
         )
-
-    def _break_deferred(self, reason: str) -> None:
-        if isinstance(self.video_recorder, DeferredVideo):
-            self.video_recorder.broken = True
-            self.video_recorder.metadata["broken_reason"] = reason
 
     def _take_last_picture(self) -> None:
         """Take the picture of the running episode's last step, if it was left out."""
         if self.stats_recorder.done is not False or self._ending is not None:
             return
         if self._trajectory is not None:
-            try:
-                self._trajectory.take_frame()
-            except PicturesDiffer as error:
-                self._stop_frames(self._trajectory, error)
+            self._trajectory.take_frame()
         if self._live_videos is not None:
             self._live_videos.take_last()
 
@@ -752,10 +723,8 @@ class Recorder:
 
     def _lacks_last_step(self) -> bool:
         """Whether a signal's handler raised before the last step's row was written."""
-        trajectory = self._trajectory
-        if trajectory is None or trajectory.is_stopped:
-            return False
-        return trajectory.steps < (self.stats_recorder.steps or 0)
+        steps = self.stats_recorder.steps or 0
+        return self._trajectory is not None and self._trajectory.lacks(steps)
 
     def _standing(self, *, is_complete: bool) -> Standing:
         """Return how the running episode stands, which is over."""
@@ -795,41 +764,37 @@ class Recorder:
         trajectory = self._trajectory
         if trajectory is None:
             return
-        if standing is Standing.DROPPED and not self._stays:
+        if standing is Standing.DROPPED and not trajectory.stays:
             self._discard_trajectory()
             return
-        episode_id = self._next_episode_id - 1
-        video = self.video_recorder
-        deferred = video if isinstance(video, DeferredVideo) else None
         verdict: Mapping[str, Any] = {}
         if self._kept is not None and self._choice.is_scheduled:
-            verdict = self._kept.verdict(standing, self._promise or {})
-        try:
-            trajectory.end(
-                {
-                    **facts,
-                    **verdict,
-                    "length": trajectory.steps,
-                    "reward": self.stats_recorder.rewards,
-                    "end_time": time.time(),
-                }
-            )
-        except FileNotWritten as error:
-            if not self._tolerates("trajectory", error):
-                raise
-            trajectory.abandon()
+            verdict = self._kept.verdict(standing, trajectory.promise or {})
+        trajectory.end(
+            {
+                **facts,
+                **verdict,
+                "length": trajectory.recorder.steps,
+                "reward": self.stats_recorder.rewards,
+                "end_time": time.time(),
+            }
+        )
         self._trajectory, self._rows = None, trajectory.rows
-        if not trajectory.is_there:
-            # The disk was too full for a single row: there is nothing to promise.
-            return
+        if trajectory.is_there:
+            self._hand_on(trajectory, standing)
+        # Else the disk was too full for a single row: there is nothing to promise.
+
+    def _hand_on(self, trajectory: EpisodeTrajectory, standing: Standing) -> None:
+        """Let others keep, render or finish a trajectory that is whole."""
+        episode_id, deferred = self._next_episode_id - 1, trajectory.deferred
         if deferred is not None:
             deferred.close()
         if self._kept is not None and standing is Standing.CANDIDATE:
             self._kept.hold_trajectory(
                 episode_id,
                 trajectory.path,
-                promise=self._promise or {},
-                stays=self._stays,
+                promise=trajectory.promise or {},
+                stays=trajectory.stays,
                 deferred=deferred,
             )
             return
