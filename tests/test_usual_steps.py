@@ -88,10 +88,10 @@ def trajectories(directory: Path) -> list[mjrec.Trajectory]:
 
 
 def recorded(
-    env: Any, directory: Path, count: int = 8, **steps: Any
+    env: Any, directory: Path, count: int = 8, *, camera: Any = None, **steps: Any
 ) -> mjrec.Trajectory:
     """Record the first steps of an episode and return its trajectory."""
-    with monitored(env, directory) as monitor:
+    with monitored(env, directory, camera=camera) as monitor:
         begin(monitor)
         go(monitor, count, **steps)
     [trajectory] = trajectories(directory)
@@ -142,6 +142,27 @@ def test_usual_steps_are_recorded_as_others_are(env_id: str, tmp_path: Path) -> 
     assert len(usual) == 5
     assert usual.frame_steps.tolist() == list(range(6))
     assert_same(usual, other)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    ["track", 0, -1, mujoco.MjvCamera()],
+    ids=["name", "number", "free", "own"],
+)
+def test_usual_steps_are_shown_by_any_camera(camera: Any, tmp_path: Path) -> None:
+    """One that was asked for is no reason to look more closely."""
+
+    def check(number: int, monitor: Any) -> None:
+        assert is_usual(monitor) == (number > 1)
+        assert number < 3 or monitor._recorder._states._quick.is_current()
+
+    directories = tmp_path / "usual", tmp_path / "other"
+    env = make(max_episode_steps=5)
+    usual = recorded(env, directories[0], 5, camera=camera, before=check)
+    env = make(max_episode_steps=5)
+    other = recorded(env, directories[1], 5, camera=camera, usual=False)
+    assert_same(usual, other)
+    assert usual.facts["scene"] == other.facts["scene"]
 
 
 def test_states_are_those_of_the_environment(cheetah: Any, tmp_path: Path) -> None:
@@ -403,6 +424,33 @@ def test_another_camera_is_noticed_at_the_very_step(
     [(step, fields)] = changes_in(tmp_path).items()
     assert step == 4
     assert "camera.fixedcamid" in fields
+
+
+def test_a_camera_of_ones_own_may_be_moved(tmp_path: Path) -> None:
+    """At any step, which is noticed at it."""
+    camera = mujoco.MjvCamera()
+
+    def turn(number: int, monitor: Any) -> None:
+        if number in (3, 4, 7):
+            assert is_usual(monitor)
+            camera.azimuth += 10
+
+    recorded(make(), tmp_path, camera=camera, before=turn)
+    assert changes_in(tmp_path) == {k: {"camera.azimuth"} for k in (3, 4, 7)}
+
+
+def test_the_free_camera_follows_the_model(tmp_path: Path) -> None:
+    """Where it was asked for: it is placed anew for every picture."""
+    env = make()
+    model = env.unwrapped.model
+
+    def turn(number: int, monitor: Any) -> None:
+        if number == 4:
+            assert is_usual(monitor)
+            model.vis.global_.azimuth += 30
+
+    recorded(env, tmp_path, camera=-1, before=turn)
+    assert changes_in(tmp_path) == {4: {"camera.azimuth", "vis.global_.azimuth"}}
 
 
 # --- actions -------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from operator import attrgetter
 from typing import Any
 
 from dm_control.mujoco import wrapper
@@ -32,6 +33,9 @@ from .wrapping import around_dm_env
 __all__ = ["dm_control_scenes"]
 
 _SUITE = "dm_control/"
+
+# Asked at every captured step. It is dm_control's own, which belongs to one model.
+_DATA = attrgetter("physics.data")
 
 # Of ScenePictures, which draws what `physics.render()` cannot.
 _MAX_GEOM = 10000
@@ -77,6 +81,7 @@ def dm_control_scenes(
             at_picture=scene.at_picture,
             resetting=ContextsOnDemand(env).resetting,
             authored=lambda: _authored(env),
+            is_unmoved=scene.is_unmoved,
         ),
         obstacle=_obstacle(env.physics) if by_physics else None,
         environment=_environment(env, env_id),
@@ -102,6 +107,10 @@ class _PhysicsScene:
         self._size = size
         self._by_physics = by_physics
         self._option = option_without_rangefinder()
+        # When it was last asked what is shown.
+        self._data: Any = None
+        # Whether the camera was put in its place since.
+        self._is_placed = False
         self._start(env.physics.model)
 
     def __call__(self) -> SceneView:
@@ -109,6 +118,8 @@ class _PhysicsScene:
         model = self._env.physics.model
         if raw_model(model) is not self._model:
             self._start(model)
+        self._data = _DATA(self._env)
+        self._is_placed = False
         return self._view
 
     def at_picture(self, capture: Callable[[], None]) -> None:
@@ -116,7 +127,16 @@ class _PhysicsScene:
         if self._camera == FREE_CAMERA:
             # It moves with the model's fields.
             place_free_camera(self._model, self._view.camera)
+        self._is_placed = True
         capture()
+
+    def is_unmoved(self) -> bool:
+        """Tell, in a moment, that nothing is other than at the picture before.
+
+        But for what is in model, camera and option: it is the same simulation as when
+        it was asked what is shown.
+        """
+        return self._is_placed and _DATA(self._env) is self._data
 
     def _start(self, model: Any) -> None:
         self._model = raw_model(model)

@@ -109,9 +109,9 @@ class ViewerScene:
     def is_unmoved(self) -> bool:
         """Tell, in a moment, that nothing is other than at the picture before.
 
-        As far as that is sure without a closer look: it is the same simulation as when
-        it was asked what is shown, there is no viewer that anybody could have touched,
-        and the camera does not follow fields of the model.
+        As far as that is sure without a closer look, and as far as it does not follow
+        from what is in model, camera and option: it is the same simulation as when it
+        was asked what is shown, and there is no viewer that anybody could have touched.
         """
         unmoved = self._unmoved
         return unmoved is not None and unmoved == (
@@ -152,10 +152,10 @@ class ViewerScene:
     def _note_unmoved(self) -> None:
         renderer, model = self._renderer, self._model
         self._unmoved = None
-        if self._is_settled and renderer is not None and self._asked != FREE_CAMERA:
+        if self._is_settled and renderer is not None:
             self._unmoved = (
                 (renderer, model, self._data),
-                (model, self._camera_id, _NO_VIEWERS),
+                (model, renderer.camera_id, _NO_VIEWERS),
             )
 
     def _update(self) -> None:

@@ -99,21 +99,23 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
 
     def step(self, action: Any) -> dm_env.TimeStep:
         """Step the environment and record what happened."""
-        if self._recorder.closed:
-            return self._env.step(action)
-        if self._recorder.done is not False:
-            return self.reset()
-        self._recorder.before_step(action)
+        recorder = self._recorder
+        usual = recorder.usual
+        if usual is None or not usual.before_step(action):
+            if recorder.closed:
+                return self._env.step(action)
+            if recorder.done is not False:
+                return self.reset()
+            recorder.before_step(action)
         try:
             timestep = self._env.step(action)
         except BaseException as error:
-            self._recorder.note_error(error)
+            recorder.note_error(error)
             raise
-        if timestep.first():
-            # The environment was reset behind the monitor's back.
-            self._recorder.before_reset()
-            self._begin(seed=self.seed, observation=timestep.observation)
-        else:
+        if usual is not recorder.usual:
+            # Within the step this monitor was closed, or its process forked.
+            usual = None
+        if usual is None or not timestep.mid() or not usual.step(timestep.reward):
             self._record(timestep)
         return timestep
 
@@ -141,6 +143,13 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
         return getattr(self._env, name)
 
     def _record(self, timestep: dm_env.TimeStep) -> None:
+        if self._recorder.closed:
+            return
+        if timestep.first():
+            # The environment was reset behind the monitor's back.
+            self._recorder.before_reset()
+            self._begin(seed=self.seed, observation=timestep.observation)
+            return
         self._recorder.step(
             0.0 if timestep.reward is None else timestep.reward,
             terminated=is_terminated(timestep),

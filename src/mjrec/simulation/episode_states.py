@@ -54,7 +54,7 @@ class EpisodeStates:
             or None.
         is_unmoved: tells, faster than the others do, that simulation and view are as
             when `view` was asked, and nothing stands in the way: no other is then
-            called.
+            called. What is in model, camera and option is looked at besides.
         forget: lets the view be again as if nothing had been shown.
     """
 
@@ -355,8 +355,8 @@ class _QuickCapture:
         pictures: PictureStates,
     ) -> None:
         self._is_unmoved = is_unmoved
-        self._seen = [*stored.memory.seen]
-        self._present = stored.memory.present
+        self._seen = [*stored.memory.seen, *pictures.watched.seen]
+        self._present = [*stored.memory.present, *pictures.watched.present]
         self._state_memory = stored.state_memory
         self._source = pictures.source
         self.take = pictures.source.take

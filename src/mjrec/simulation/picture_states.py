@@ -100,6 +100,7 @@ class PictureStates:
         layout: of the snapshots.
         view: as given.
         source: of the snapshots themselves.
+        watched: the camera and the options of the view.
         stand_alone: no picture has an influence on the next.
     """
 
@@ -121,7 +122,7 @@ class PictureStates:
         self.stand_alone = kept is None
         self._checked = checked
         self.source = SnapshotSource(model, data, self.layout)
-        self._watched = ViewMemory(view)
+        self.watched = ViewMemory(view)
         self._facts = view.facts()
         # Moved as pictures move it; the environment's own stays where it is.
         self._camera = copy.copy(view.camera)
@@ -146,7 +147,7 @@ class PictureStates:
         return (
             data._address == self._data._address
             and _is_same(view, self.view)
-            and self._watched.changed() is None
+            and self.watched.changed() is None
             and not self._has_moved
             and not (self._is_settled_anew or _settle(changed_fields))
         )
@@ -184,7 +185,7 @@ class PictureStates:
     def take(self, out: NDArray[np.uint8]) -> dict[str, NDArray[Any]] | None:
         """Write a snapshot into `out`, and return what of the view has changed."""
         self.source.take(out)
-        changed = self._watched.changed()
+        changed = self.watched.changed()
         if changed is not None:
             self._has_moved = True
             self._camera = copy.copy(self.view.camera)

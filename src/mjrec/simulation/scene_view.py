@@ -103,16 +103,19 @@ class ViewMemory:
 
     Args:
         view: whose objects are watched, and kept alive.
+
+    Attributes:
+        seen: camera and option as they were when last asked.
+        present: the same as they are: where the lists are equal, nothing has changed.
     """
 
     def __init__(self, view: SceneView) -> None:
-        self._view = view
-        self._camera = _memory_of(view.camera)
-        self._option = _memory_of(view.option)
-        self._camera_seen = self._camera.copy()
-        self._option_seen = self._option.copy()
-        self._camera_raw = self._camera.raw
-        self._option_raw = self._option.raw
+        self._structs = {"camera": view.camera, "option": view.option}
+        self._memory = {
+            name: _memory_of(struct) for name, struct in self._structs.items()
+        }
+        self.seen = [memory.copy() for memory in self._memory.values()]
+        self.present = [memory.raw for memory in self._memory.values()]
 
     def changed(self) -> dict[str, NDArray[Any]] | None:
         """Return what is other than when last asked, as `camera.lookat` and so on.
@@ -120,19 +123,15 @@ class ViewMemory:
         Returns:
             Copies by their names; None, at once, where all is the same.
         """
-        if (
-            self._camera_seen == self._camera_raw
-            and self._option_seen == self._option_raw
-        ):
+        if self.seen == self.present:
             return None
-        fields = {
-            f"camera.{name}": read_member(self._view.camera, name)
-            for name in self._camera.differing(self._camera_seen)
-        }
-        for name in self._option.differing(self._option_seen):
-            fields[f"option.{name}"] = read_member(self._view.option, name)
-        self._camera_seen = self._camera.copy()
-        self._option_seen = self._option.copy()
+        fields = {}
+        for seen, (name, memory) in zip(self.seen, self._memory.items(), strict=True):
+            for member in memory.differing(seen):
+                value = read_member(self._structs[name], member)
+                fields[f"{name}.{member}"] = value
+            # In place: somebody may hold it.
+            seen[:] = memory.copy()
         return fields or None
 
 

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Usual steps of dm_control's environments are recorded as all others are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
+
+import mujoco  # noqa: E402  after importorskip
+from recordings import stats_of  # noqa: E402  after importorskip
+
+import mjrec  # noqa: E402  after importorskip
+from mjrec import Monitor  # noqa: E402  after importorskip
+from mjrec.formats.trajectory_file import open_trajectory  # noqa: E402
+
+pytestmark = pytest.mark.dm_control
+
+Before = Callable[[int, Any], None]
+
+
+def load(domain: str = "cheetah", task: str = "run", **options: Any) -> Any:
+    """Return a task whose episodes have eight steps of its own."""
+    task_kwargs = {"random": 0, "time_limit": 8 * _TIMESTEPS[domain]}
+    return suite.load(domain, task, task_kwargs=task_kwargs, **options)
+
+
+_TIMESTEPS = {"cheetah": 0.01, "cartpole": 0.01, "reacher": 0.02, "hopper": 0.02}
+
+
+def monitored(env: Any, directory: Path, **options: Any) -> Any:
+    size = {"height": 32, "width": 48}
+    options = {"env_id": "dm_control/some-task", "workers": 0, **size, **options}
+    return Monitor(env, directory, lambda _: True, **options)
+
+
+def is_usual(monitor: Any) -> bool:
+    return monitor._recorder.usual is not None
+
+
+def go(
+    monitor: Any, count: int, *, usual: bool = True, before: Before | None = None
+) -> list[Any]:
+    """Take so many steps, and return what they returned."""
+    spec, timesteps = monitor.action_spec(), []
+    for number in range(1, count + 1):
+        if not usual:
+            monitor._recorder.usual = None
+        if before is not None:
+            before(number, monitor)
+        action = np.full(spec.shape, np.cos(number)).clip(spec.minimum, spec.maximum)
+        timesteps.append(monitor.step(action))
+    return timesteps
+
+
+def recorded(env: Any, directory: Path, *, camera: Any = None, **steps: Any) -> Any:
+    """Record an episode of eight steps and return its trajectory."""
+    with monitored(env, directory, camera=camera) as monitor:
+        monitor.reset()
+        go(monitor, 8, **steps)
+    [trajectory] = trajectories(directory)
+    return trajectory
+
+
+def trajectories(directory: Path) -> list[mjrec.Trajectory]:
+    return [mjrec.load_trajectory(path) for path in sorted(directory.glob("*.h5"))]
+
+
+def changes_in(directory: Path) -> dict[int, set[str]]:
+    """Return which fields of model and view changed in an episode, by the step."""
+    [path] = directory.glob("*.h5")
+    with open_trajectory(path) as reader:
+        return {change.step: set(change.fields) for change in reader.model_changes}
+
+
+def assert_same(found: mjrec.Trajectory, expected: mjrec.Trajectory) -> None:
+    """All that was recorded of two episodes is the same, bit for bit."""
+    for name in ("states", "actions", "rewards", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    np.testing.assert_array_equal(found.frame_steps, expected.frame_steps)
+    assert found.snapshots.keys() == expected.snapshots.keys()
+    for name, values in expected.snapshots.items():
+        np.testing.assert_array_equal(found.snapshots[name], values)
+
+
+@pytest.mark.parametrize(
+    ("domain", "task", "camera"),
+    [
+        ("cheetah", "run", None),
+        ("cheetah", "run", "side"),
+        ("cheetah", "run", mujoco.MjvCamera()),
+        ("cartpole", "balance", None),
+        ("reacher", "easy", 0),
+        ("hopper", "stand", None),
+    ],
+)
+def test_usual_steps_are_recorded_as_others_are(
+    domain: str, task: str, camera: Any, tmp_path: Path
+) -> None:
+    """States, actions, rewards, ends and frames are the same, bit for bit."""
+    env = load(domain, task)
+    usual = recorded(env, tmp_path / "usual", camera=camera)
+    env = load(domain, task)
+    other = recorded(env, tmp_path / "other", camera=camera, usual=False)
+    assert len(usual) == 8
+    assert usual.truncated.tolist() == [False] * 7 + [True]
+    assert_same(usual, other)
+
+
+@pytest.mark.parametrize("max_fps", [None, 40])
+def test_steps_are_usual_from_the_second_one_on(
+    max_fps: int | None, tmp_path: Path
+) -> None:
+    """Until the episode is over; the step after it is a reset."""
+    with monitored(load(), tmp_path, max_fps=max_fps) as monitor:
+        seen = []
+        for _ in range(2):
+            assert monitor.step(np.zeros(6)).first()
+            for _ in range(8):
+                seen.append(is_usual(monitor))
+                last = go(monitor, 1)[0]
+            assert last.last()
+            assert not is_usual(monitor)
+    assert seen == 2 * [False, *7 * [True]]
+    assert stats_of(tmp_path)["episode_lengths"] == [8, 8]
+
+
+def test_rewards_are_added_up(tmp_path: Path) -> None:
+    """In the statistics, to the last bit, as they are in the trajectory."""
+    with monitored(load(), tmp_path) as monitor:
+        monitor.reset()
+        rewards = [float(timestep.reward) for timestep in go(monitor, 8)]
+    [trajectory] = trajectories(tmp_path)
+    assert trajectory.rewards.tolist() == rewards
+    assert stats_of(tmp_path)["episode_rewards"] == [sum(rewards)]
+
+
+def test_a_changed_model_is_noticed_at_the_very_step(tmp_path: Path) -> None:
+    """A colour set before step 4 is that of frame 4."""
+
+    def paint(number: int, monitor: Any) -> None:
+        if number == 4:
+            assert is_usual(monitor)
+            monitor.physics.model.geom_rgba[1, 3] = 0.5
+
+    trajectory = recorded(load(), tmp_path, before=paint)
+    assert [trajectory.model(k).geom_rgba[1, 3] for k in (3, 4, 8)] == [1, 0.5, 0.5]
+
+
+def test_rewards_that_are_shown_are_recorded(tmp_path: Path) -> None:
+    """`visualize_reward` paints the robot anew at every step."""
+    env = load("cartpole", "balance", visualize_reward=True)
+    trajectory = recorded(env, tmp_path)
+    plain = recorded(load("cartpole", "balance"), tmp_path / "plain")
+    np.testing.assert_array_equal(trajectory.states, plain.states)
+    changed = changes_in(tmp_path)
+    assert [step for step in changed if "mat_rgba" in changed[step]] == [*range(1, 9)]
+
+
+def test_the_free_camera_follows_the_model(tmp_path: Path) -> None:
+    """physics.render() places it anew for every picture, from the model's fields."""
+
+    def turn(number: int, monitor: Any) -> None:
+        if number in (4, 6):
+            assert is_usual(monitor)
+            monitor.physics.model.vis.global_.azimuth += 30
+
+    recorded(load(), tmp_path, before=turn)
+    changed = changes_in(tmp_path)
+    assert list(changed) == [4, 6]
+    assert all("camera.azimuth" in fields for fields in changed.values())
+
+
+def test_a_camera_of_ones_own_may_be_moved(tmp_path: Path) -> None:
+    """At any step, which is noticed at it."""
+    camera = mujoco.MjvCamera()
+
+    def turn(number: int, monitor: Any) -> None:
+        if number in (3, 4, 7):
+            assert is_usual(monitor)
+            camera.azimuth += 10
+
+    recorded(load(), tmp_path, camera=camera, before=turn)
+    assert changes_in(tmp_path) == {k: {"camera.azimuth"} for k in (3, 4, 7)}
+
+
+def test_other_data_is_recorded_from_its_first_step_on(tmp_path: Path) -> None:
+    """Where the physics goes over to it in mid-episode."""
+    states = []
+
+    def note(monitor: Any) -> None:
+        physics = monitor.physics
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(physics.model.ptr, spec))
+        mujoco.mj_getState(physics.model.ptr, physics.data.ptr, state, spec)
+        states.append(state)
+
+    def swap(number: int, monitor: Any) -> None:
+        note(monitor)
+        if number == 4:
+            assert is_usual(monitor)
+            physics = monitor.physics
+            physics._data = physics.copy(share_model=True).data
+            physics._data.qpos[2] += 0.1
+
+    with monitored(load(), tmp_path) as monitor:
+        monitor.reset()
+        go(monitor, 8, before=swap)
+        note(monitor)
+    [trajectory] = trajectories(tmp_path)
+    np.testing.assert_array_equal(trajectory.states, states)
+    assert len(trajectory.snapshots["geom_xpos"]) == 9
+
+
+def test_a_monitor_may_be_closed_within_a_step(tmp_path: Path) -> None:
+    """As by a signal's handler that only closes it: the step returns as ever."""
+    env = load()
+    monitor = monitored(env, tmp_path)
+    after = type(env.task).after_step
+
+    def close(task: Any, physics: Any) -> None:
+        after(task, physics)
+        monitor.close()
+
+    monitor.reset()
+    go(monitor, 3)
+    assert is_usual(monitor)
+    env.task.after_step = close.__get__(env.task)
+    [timestep] = go(monitor, 1)
+    assert timestep.mid()
+    [trajectory] = trajectories(tmp_path)
+    assert len(trajectory) == 3
