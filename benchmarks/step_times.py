@@ -15,26 +15,58 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from dm_control import suite
 
 import mjrec
 
-STEPS = {"HalfCheetah-v5": 6000, "Humanoid-v5": 3000}
+_SUITE = "dm_control/"
+STEPS = {"HalfCheetah-v5": 6000, "Humanoid-v5": 3000, f"{_SUITE}cheetah-run": 6000}
 ROUNDS = 5
 QUANTILES = (5, 25, 50)
+
+
+def make(env_id: str) -> Any:
+    """Return an environment of Gymnasium's or of dm_control's suite."""
+    if not env_id.startswith(_SUITE):
+        return gymnasium.make(env_id)
+    domain, task = env_id.removeprefix(_SUITE).split("-", 1)
+    return suite.load(domain, task, task_kwargs={"random": 0})
+
+
+def random_actions(env: Any, count: int) -> list[Any]:
+    """Return so many actions, the same ones at every call."""
+    if hasattr(env, "action_space"):
+        env.action_space.seed(0)
+        return [env.action_space.sample() for _ in range(count)]
+    spec, generator = env.action_spec(), np.random.default_rng(0)
+    return [generator.uniform(spec.minimum, spec.maximum) for _ in range(count)]
+
+
+def reset(env: Any, seed: int) -> None:
+    """Begin an episode; those of dm_control go on with their generator."""
+    if hasattr(env, "action_space"):
+        env.reset(seed=seed)
+    else:
+        env.reset()
+
+
+def is_over(result: Any) -> bool:
+    """Tell whether what a step returned ends an episode."""
+    return bool(result[2] or result[3] if len(result) == 5 else result.last())
 
 
 def times(env: Any, actions: list[Any]) -> tuple[list[int], list[int]]:
     """Return the nanoseconds of every step, and of every episode with its reset."""
     steps, episodes, seed = [], [], 0
     began = perf_counter_ns()
-    env.reset(seed=seed)
+    reset(env, seed)
     for action in actions:
         start = perf_counter_ns()
-        _, _, terminated, truncated, _ = env.step(action)
+        result = env.step(action)
         steps.append(perf_counter_ns() - start)
-        if terminated or truncated:
+        if is_over(result):
             seed += 1
-            env.reset(seed=seed)
+            reset(env, seed)
             episodes.append(perf_counter_ns() - began)
             began = perf_counter_ns()
     return steps, episodes
@@ -42,9 +74,8 @@ def times(env: Any, actions: list[Any]) -> tuple[list[int], list[int]]:
 
 def measure(env_id: str, count: int) -> None:
     """Print the quantiles of one environment."""
-    bare = gymnasium.make(env_id)
-    bare.action_space.seed(0)
-    actions = [bare.action_space.sample() for _ in range(count)]
+    bare = make(env_id)
+    actions = random_actions(bare, count)
     with (
         tempfile.TemporaryDirectory() as counted,
         tempfile.TemporaryDirectory() as all_,
@@ -68,7 +99,7 @@ def measure(env_id: str, count: int) -> None:
         for quantile in QUANTILES:
             values = [np.percentile(found[name][index], quantile) for name in variants]
             print(
-                f"{env_id:15} {unit:8} {quantile:3}% "
+                f"{env_id:22} {unit:8} {quantile:3}% "
                 + " ".join(f"{value / 1e3:10.1f}us" for value in values)
                 + f"   {values[0] / values[1]:.3f} {values[0] / values[2]:.3f} of bare"
             )
@@ -76,13 +107,13 @@ def measure(env_id: str, count: int) -> None:
 
 def _monitored(env_id: str, directory: str, schedule: Any) -> Any:
     return mjrec.Monitor(
-        gymnasium.make(env_id), directory, schedule, workers=0, allow_early_reset=True
+        make(env_id), directory, schedule, workers=0, allow_early_reset=True
     )
 
 
 def main() -> None:
     """Measure every environment."""
-    print(f"{'':30} {'bare':>12} {'counted':>12} {'captured':>12}")
+    print(f"{'':37} {'bare':>12} {'counted':>12} {'captured':>12}")
     for env_id, count in STEPS.items():
         measure(env_id, count)
 

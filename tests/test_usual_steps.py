@@ -295,6 +295,38 @@ def test_statistics_are_up_to_date_after_every_step(
         assert (stats.steps, stats.total_steps) == (3, 11)
 
 
+def test_episodes_that_are_only_counted(tmp_path: Path) -> None:
+    """Lengths, sums and ends are those of episodes whose states are recorded."""
+    found = []
+    for name, schedule in (("counted", False), ("recorded", lambda _: True)):
+        env = make(HOPPER, max_episode_steps=30)
+        with Monitor(env, tmp_path / name, schedule, workers=0) as monitor:
+            begin(monitor)
+            seen = []
+            for steps in range(1, 101):
+                seen.append(is_usual(monitor))
+                [(_, _, terminated, truncated, _)] = go(monitor, 1)
+                assert monitor.get_total_steps() == steps
+                if terminated or truncated:
+                    assert not is_usual(monitor)
+                    monitor.reset()
+        stats = stats_of(tmp_path / name)
+        found.append((seen, stats["episode_lengths"], stats["episode_rewards"]))
+    assert found[0] == found[1]
+    assert not list((tmp_path / "counted").glob("*trajectory*"))
+
+
+@pytest.mark.parametrize("reward", [int, np.float32], ids=["int", "float32"])
+def test_odd_rewards_are_counted_too(reward: Any, tmp_path: Path) -> None:
+    """And once only, where nothing but statistics is recorded."""
+    env = Changed(make(max_episode_steps=8), reward=lambda r: reward(10 * r))
+    with Monitor(env, tmp_path, False) as monitor:
+        begin(monitor)
+        total = sum(float(result[1]) for result in go(monitor, 8))
+    stats = stats_of(tmp_path)
+    assert (stats["episode_rewards"], stats["episode_lengths"]) == ([total], [8])
+
+
 def test_types_of_rewards_may_change_in_mid_episode(tmp_path: Path) -> None:
     """What is no float is recorded in its place among those that are."""
     kinds = iter([float, int, np.float32, np.float64, int, float, float, float])
@@ -605,6 +637,36 @@ def test_a_disk_that_is_full_in_mid_episode(on_error: str, tmp_path: Path) -> No
     faults = [fault["what"] for fault in manifest_of(tmp_path)["mjrec"]["faults"]]
     assert faults.count("trajectory") == (on_error == "warn")
     assert errors == (on_error == "raise")
+
+
+@pytest.mark.parametrize("way", ["done", "closed", "reset", "error"])
+def test_episodes_that_are_only_counted_end_like_others(
+    way: str, tmp_path: Path
+) -> None:
+    """Whoever ends them, and however."""
+    env = Changed(make())
+    monitor = Monitor(env, tmp_path, False, allow_early_reset=True)
+    begin(monitor)
+    go(monitor, 3)
+    assert is_usual(monitor)
+    if way == "done":
+        monitor.stats_recorder.done = True
+        with pytest.raises(ResetNeeded):
+            go(monitor, 1)
+    elif way == "closed":
+        monitor.close()
+        go(monitor, 1)
+    elif way == "reset":
+        begin(monitor)
+        go(monitor, 1)
+    else:
+        env.after[4] = lambda: 1 // 0
+        with pytest.raises(ZeroDivisionError):
+            go(monitor, 1)
+        assert not is_usual(monitor)
+    assert monitor.get_total_steps() == (4 if way == "reset" else 3)
+    monitor.close()
+    assert stats_of(tmp_path)["episode_lengths"] == []
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")

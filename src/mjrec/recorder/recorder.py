@@ -50,7 +50,7 @@ from .subject import Subject, check_pictures
 from .told_trackers import ToldTrackers
 from .tracking import FinishedEpisode, Run
 from .trajectory_recorder import Pace, TrajectoryRecorder
-from .usual_steps import UsualSteps
+from .usual_steps import CountedSteps, UsualSteps
 from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder
 
@@ -190,7 +190,7 @@ class Recorder:
         )
         self.closed = False
         # What the next step may be recorded with; None where it is not a usual one.
-        self.usual: UsualSteps | None = None
+        self.usual: UsualSteps | CountedSteps | None = None
 
     @property
     def directory(self) -> Path:
@@ -530,14 +530,14 @@ class Recorder:
                 self.directory,
             )
 
-    def _usual_steps(self) -> UsualSteps | None:
+    def _usual_steps(self) -> UsualSteps | CountedSteps | None:
         """Return what the coming steps may be recorded with, if they are usual."""
-        if self._trajectory is None:
+        if self._live_videos is not None or self._clips is not None:
             return None
+        if self._trajectory is None:
+            return CountedSteps(self.stats_recorder)
         recorder = self._trajectory.recorder
         if recorder.copier is None:
-            return None
-        if self._live_videos is not None or self._clips is not None:
             return None
         return UsualSteps(recorder, recorder.copier, self.stats_recorder)
 

@@ -3,8 +3,14 @@
 
 A fast simulation's step takes no longer than some hundred instructions of Python, so
 whatever is asked at every step shows. Nearly all steps of an episode whose pictures are
-drawn later are alike: no error, no end, the same model, the same view. Of these nothing
-is asked that is known; what is not usual goes the recorder's own way.
+drawn later, or that gets none, are alike: no error, no end, the same model, the same
+view. Of these nothing is asked that is known; what is not usual goes the recorder's own
+way.
+
+What is here stands in place of `Recorder.before_step` and `Recorder.step` for as long
+as the recorder has it: `before_step`, the environment's step, and, where that did not
+end the episode, `step`. Where one of the two returns False, the recorder's method of
+that name is to be called after all.
 """
 
 from __future__ import annotations
@@ -15,20 +21,48 @@ from ..errors import FileNotWritten
 from .stats_recorder import StatsRecorder
 from .trajectory_recorder import MomentCopier, TrajectoryRecorder
 
-__all__ = ["UsualSteps"]
+__all__ = ["CountedSteps", "UsualSteps"]
 
 # Of rewards, which are NumPy's float64 as a rule: `+` would make one of the sum too,
 # and converting each takes ten times as long.
 _sum = float.__add__
 
 
-class UsualSteps:
-    """The usual steps of an episode, from its second one on.
+class CountedSteps:
+    """The usual steps of an episode of which nothing but statistics is recorded.
 
-    In place of `Recorder.before_step` and `Recorder.step`, for as long as the recorder
-    has it: `before_step`, the environment's step, and, where that did not end the
-    episode, `step`. Where one of the two returns False, the recorder's method of that
-    name is to be called after all.
+    Args:
+        stats: counts them.
+    """
+
+    __slots__ = ("_stats",)
+
+    def __init__(self, stats: StatsRecorder) -> None:
+        self._stats = stats
+
+    def before_step(self, action: Any) -> bool:
+        """Tell whether a step may be taken."""
+        stats = self._stats
+        # Others may have ended the episode, or its recording.
+        return stats.done is False and not stats.closed
+
+    def step(self, reward: Any) -> bool:
+        """Count a step that did not end the episode; return False if it is not usual.
+
+        Then it was not counted.
+        """
+        if not isinstance(reward, float):
+            return False
+        stats = self._stats
+        # Numbers, because an episode has begun.
+        stats.rewards = _sum(stats.rewards, reward)  # type: ignore[arg-type]
+        stats.steps += 1  # type: ignore[operator]
+        stats.total_steps += 1
+        return True
+
+
+class UsualSteps:
+    """The usual steps of an episode whose states are recorded, from its second one on.
 
     Args:
         trajectory: of the episode.
