@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from gymnasium.vector import AsyncVectorEnv
 from vector_environments import DISABLED, NEXT_STEP, SAME_STEP, hashes_at, play
+from waiting import wait_until
 
 import mjrec
 from mjrec.formats.locks import is_locked
@@ -113,7 +114,8 @@ def test_a_parent_that_is_gone_leaves_nothing_hanging(
     expected = -signal.SIGKILL if ending == "kill" else 1
     assert parent.returncode == expected
     _wait_for_end(workers)
-    assert not [path for path in target.glob(".*.lock") if is_locked(path)]
+    # Whoever renders for them ends after them, when it sees that they are gone.
+    wait_until(lambda: not [p for p in target.glob(".*.lock") if is_locked(p)])
     mjrec.recover(target)
     for worker in workers:
         [manifest] = target.glob(f"*.manifest.*.{worker}.manifest.json")
