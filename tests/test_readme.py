@@ -82,8 +82,10 @@ def needed_by(line: str) -> list[str]:
 @pytest.mark.parametrize("line", [x for x in shell_lines() if x.startswith("mjrec")])
 def test_command_runs(line: str, checkout: Path) -> None:
     """As it stands, with the recordings that the ones before it made."""
-    needs_extras(line)
-    for earlier in needed_by(line):
+    needed = needed_by(line)
+    for each in (*needed, line):
+        needs_extras(each)
+    for earlier in needed:
         run(sys.executable, "-m", *shlex.split(earlier), cwd=checkout)
     out = run(sys.executable, "-m", *shlex.split(line), cwd=checkout)
     assert out.strip()
