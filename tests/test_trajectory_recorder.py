@@ -180,7 +180,7 @@ def take_usual_step(
 ) -> None:
     """Take a step as the recorder of an episode does, the usual way if it can."""
     action, copier = np.full(2, step, np.float32), trajectory.copier
-    usual = None if copier is None else UsualSteps(trajectory, copier, stats)
+    usual = None if copier is None else UsualSteps(copier, stats)
     if usual is None or not usual.before_step(action):
         trajectory.before_step(action)
     states.step = step

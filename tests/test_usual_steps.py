@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -442,6 +444,44 @@ def test_other_data_is_recorded_from_its_first_step_on(tmp_path: Path) -> None:
     np.testing.assert_array_equal(positions[-1], first.geom_xpos)
 
 
+def test_data_that_come_back_are_looked_at_closely(
+    cheetah: Any, tmp_path: Path
+) -> None:
+    """What was told of a change meanwhile is told of all of them."""
+    inner = cheetah.unwrapped
+    first, second = inner.data, copy.copy(inner.data)
+    mass = float(inner.model.body_mass[1])
+
+    def swap(number: int, monitor: Any) -> None:
+        if number == 3:
+            inner.data = second
+        if number == 5:
+            inner.data = first
+            inner.model.body_mass[1] = 2 * mass
+            monitor.model_changed()
+
+    trajectory = recorded(cheetah, tmp_path, before=swap)
+    masses = [trajectory.model(k).body_mass[1] for k in (4, 5, 8)]
+    assert masses == [mass, 2 * mass, 2 * mass]
+
+
+def test_a_camera_may_be_moved_where_the_data_change(tmp_path: Path) -> None:
+    """Within one step, and while the other data are there."""
+    camera = mujoco.MjvCamera()
+    env = make()
+    inner = env.unwrapped
+    first, second = inner.data, copy.copy(inner.data)
+
+    def swap(number: int, monitor: Any) -> None:
+        if number in (3, 5):
+            inner.data = second if number == 3 else first
+        if number in (3, 4, 6):
+            camera.azimuth += 10
+
+    recorded(env, tmp_path, camera=camera, before=swap)
+    assert changes_in(tmp_path) == {k: {"camera.azimuth"} for k in (3, 4, 6)}
+
+
 def test_another_camera_is_noticed_at_the_very_step(
     cheetah: Any, tmp_path: Path
 ) -> None:
@@ -637,6 +677,83 @@ def test_a_disk_that_is_full_in_mid_episode(on_error: str, tmp_path: Path) -> No
     faults = [fault["what"] for fault in manifest_of(tmp_path)["mjrec"]["faults"]]
     assert faults.count("trajectory") == (on_error == "warn")
     assert errors == (on_error == "raise")
+
+
+@pytest.mark.parametrize("schedule", [False, lambda _: True], ids=["counted", "all"])
+def test_statistics_may_be_set_in_mid_episode(schedule: Any, tmp_path: Path) -> None:
+    """As with gym's recorder, which is there to be used."""
+    with Monitor(make(max_episode_steps=8), tmp_path, schedule, workers=0) as monitor:
+        begin(monitor)
+        go(monitor, 3)
+        assert is_usual(monitor)
+        monitor.stats_recorder.rewards = 0
+        monitor.stats_recorder.steps = 100
+        rewards = [float(result[1]) for result in go(monitor, 5)]
+    stats = stats_of(tmp_path)
+    assert stats["episode_rewards"] == [sum(rewards)]
+    assert stats["episode_lengths"] == [105]
+
+
+def interrupt_in(monitor: Any, event_number: int) -> bool:
+    """Take a step, and raise behind one of the calls in it, as a signal's handler does.
+
+    Returns:
+        Whether there were so many calls.
+    """
+    left = event_number
+
+    def profile(frame: Any, event: str, _: object) -> None:
+        nonlocal left
+        if event in ("return", "c_return") and "mjrec" in frame.f_code.co_filename:
+            left -= 1
+            if left == 0:
+                raise KeyboardInterrupt
+
+    sys.setprofile(profile)
+    try:
+        monitor.step(monitor.action_space.sample())
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(None)
+    return False
+
+
+@pytest.mark.parametrize(
+    ("max_fps", "schedule"),
+    [(None, lambda _: True), (8, lambda _: True), (None, False)],
+    ids=["frames", "few frames", "counted"],
+)
+def test_an_interrupted_step_is_recorded_or_is_not(
+    max_fps: Any, schedule: Any, tmp_path: Path
+) -> None:
+    """Wherever it is interrupted, who goes on has statistics and rows of all others."""
+    numbers = itertools.count(1)
+    for number in numbers:
+        directory = tmp_path / str(number)
+        env = make(max_episode_steps=8)
+        options = {"max_fps": max_fps, "workers": 0}
+        with Monitor(env, directory, schedule, **options) as monitor:
+            begin(monitor)
+            go(monitor, 4)
+            assert is_usual(monitor)
+            was_interrupted = interrupt_in(monitor, number)
+            while not monitor.stats_recorder.done:
+                go(monitor, 1)
+            total = monitor.get_total_steps()
+            [length] = monitor.get_episode_lengths()
+            [reward] = monitor.get_episode_rewards()
+        assert length == total
+        assert length in (7, 8)
+        for trajectory in trajectories(directory):
+            assert len(trajectory) == length
+            assert sum(trajectory.rewards.tolist()) == reward
+            assert trajectory.complete
+            steps = trajectory.frame_steps.tolist()
+            assert steps == sorted({*steps, length})
+        if not was_interrupted:
+            break
+    assert number > 4
 
 
 @pytest.mark.parametrize("way", ["done", "closed", "reset", "error"])

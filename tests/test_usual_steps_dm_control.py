@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -215,6 +215,44 @@ def test_other_data_is_recorded_from_its_first_step_on(tmp_path: Path) -> None:
     [trajectory] = trajectories(tmp_path)
     np.testing.assert_array_equal(trajectory.states, states)
     assert len(trajectory.snapshots["geom_xpos"]) == 9
+
+
+def test_data_that_come_back_are_looked_at_closely(tmp_path: Path) -> None:
+    """A camera that is moved meanwhile, and back again, is moved twice."""
+    camera = mujoco.MjvCamera()
+    env = load()
+    first, second = env.physics.data, env.physics.copy(share_model=True).data
+
+    def swap(number: int, monitor: Any) -> None:
+        if number in (3, 5):
+            monitor.physics._data = second if number == 3 else first
+        if number in (4, 6):
+            camera.azimuth += 40 if number == 4 else -40
+
+    recorded(env, tmp_path, camera=camera, before=swap)
+    assert changes_in(tmp_path) == {k: {"camera.azimuth"} for k in (4, 6)}
+
+
+def test_time_steps_need_no_more_than_dm_envs_ends(tmp_path: Path) -> None:
+    """Of one's own kind they may have `first` and `last` and nothing else."""
+
+    class Bare(NamedTuple):
+        step_type: Any
+        reward: Any
+        discount: Any
+        observation: Any
+
+        def first(self) -> bool:
+            return bool(self.step_type == 0)
+
+        def last(self) -> bool:
+            return bool(self.step_type == 2)
+
+    env = load()
+    for name in ("reset", "step"):
+        method = getattr(env, name)
+        setattr(env, name, lambda *args, method=method: Bare(*method(*args)))
+    assert len(recorded(env, tmp_path)) == 8
 
 
 def test_a_monitor_may_be_closed_within_a_step(tmp_path: Path) -> None:

@@ -162,6 +162,9 @@ class TrajectoryLogWriter:
         path: of the log.
         is_there: the file was made.
         rows: what they are like.
+        steps: the number of the last step; 0 before.
+        frame_count: how many frames there are.
+        last_frame: the step of the last one; -1 before.
 
     Raises:
         InvalidArgument: rows cannot look like that.
@@ -175,10 +178,14 @@ class TrajectoryLogWriter:
         self.path = path
         self.rows = rows
         self._step, self._frame = rows.step, rows.frame
+        self._step_size, self._frame_size = rows.step.size, rows.frame.size
         self._process_id = os.getpid()
         self.renew_locks()
         self._descriptor: int | None = None
         self.is_there = False
+        self.steps = 0
+        self.frame_count = 0
+        self.last_frame = -1
         self._tail = _Tail(0)
         self._tail.records = [_beginning(header.facts, rows.layout_text)]
         flush_in_time(self)
@@ -211,7 +218,15 @@ class TrajectoryLogWriter:
             ClosedError: after `close` or `discard`.
         """
         prefix = STEP_PREFIX.pack(step, reward, terminated, truncated)
-        self._add(self._step.record(prefix, row))
+        records = self._step.record(prefix, row)
+        self._make_room()
+        with self._adding:
+            # No call in here: a signal's handler that raises does so after one, and
+            # what is counted has to be what is there.
+            tail = self._tail
+            tail.records += records
+            tail.size += self._step_size
+            self.steps = step
 
     def add_frame(self, step: int, snapshot: Iterable[_Bytes]) -> None:
         """Add the row of a video frame.
@@ -226,7 +241,15 @@ class TrajectoryLogWriter:
             ClosedError: after `close` or `discard`.
         """
         prefix = FRAME_PREFIX.pack(step)
-        self._add(self._frame.record(prefix, snapshot))
+        records = self._frame.record(prefix, snapshot)
+        self._make_room()
+        with self._adding:
+            # No call, as in `add_step`.
+            tail = self._tail
+            tail.records += records
+            tail.size += self._frame_size
+            self.last_frame = step
+            self.frame_count += 1
 
     def steps_of(self, row: Sequence[memoryview]) -> Callable[[int, float], None]:
         """Return what adds a step from the same memory, as `moments_of` does.
@@ -284,21 +307,20 @@ class TrajectoryLogWriter:
             if self._tail.size >= _FLUSH_BYTES:
                 self.flush()
             with self._adding:
+                # No call, as in `add_step`.
                 tail = self._tail
                 tail.records += records
                 tail.size += size
+                self.steps = self.last_frame = step
+                self.frame_count += 1
 
         return add_moment
 
-    def _add(self, records: tuple[bytes, ...]) -> None:
+    def _make_room(self) -> None:
         # Beside `_adding`, never inside it: who flushes may have to wait for the other
         # thread, which asks for it while it writes.
         if self._tail.size >= _FLUSH_BYTES:
             self.flush()
-        with self._adding:
-            tail = self._tail
-            tail.records += records
-            tail.size += sum(map(len, records))
 
     def add_facts(self, facts: Mapping[str, Any]) -> None:
         """Add to the facts of the header; of a key that is there, the newest counts.

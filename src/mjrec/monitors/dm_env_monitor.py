@@ -115,7 +115,8 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
         if usual is not recorder.usual:
             # Within the step this monitor was closed, or its process forked.
             usual = None
-        if usual is None or not timestep.mid() or not usual.step(timestep.reward):
+        is_mid = not (timestep.first() or timestep.last())
+        if usual is None or not is_mid or not usual.step(timestep.reward):
             self._record(timestep)
         return timestep
 

@@ -536,10 +536,8 @@ class Recorder:
             return None
         if self._trajectory is None:
             return CountedSteps(self.stats_recorder)
-        recorder = self._trajectory.recorder
-        if recorder.copier is None:
-            return None
-        return UsualSteps(recorder, recorder.copier, self.stats_recorder)
+        copier = self._trajectory.recorder.copier
+        return None if copier is None else UsualSteps(copier, self.stats_recorder)
 
     def _refuse_step(self) -> None:
         if self._is_forked:

@@ -54,6 +54,7 @@ class MomentCopier:
         copy_step: copies a step; called with its number and its reward.
         copy_moment: copies a step and its frame; likewise.
         stride: only steps of which this is a factor have a frame.
+        log: has them then, and counts them.
     """
 
     set_action: Callable[[Any], bool]
@@ -61,6 +62,7 @@ class MomentCopier:
     copy_step: Callable[[int, float], None]
     copy_moment: Callable[[int, float], None]
     stride: int
+    log: TrajectoryLogWriter
 
 
 class TrajectoryRecorder:
@@ -83,9 +85,6 @@ class TrajectoryRecorder:
 
     Attributes:
         path: of the log, which is there after the first step.
-        steps: how many steps were recorded.
-        frame_count: how many snapshots were taken.
-        last_frame: the step of the last one; -1 before.
         copier: for the usual steps; None where each needs a closer look.
         is_stopped: nothing more of the episode is recorded, after an error.
         rows: what they are like, once there is a log.
@@ -104,9 +103,6 @@ class TrajectoryRecorder:
     ) -> None:
         self.path = path
         self.rows = rows
-        self.steps = 0
-        self.frame_count = 0
-        self.last_frame = -1
         self.copier: MomentCopier | None = None
         self._facts = facts
         self._states = states
@@ -137,6 +133,21 @@ class TrajectoryRecorder:
     def is_there(self) -> bool:
         """Whether there is a file, with as much as could be written."""
         return self._log is not None and self._log.is_there
+
+    @property
+    def steps(self) -> int:
+        """How many steps were recorded."""
+        return 0 if self._log is None else self._log.steps
+
+    @property
+    def frame_count(self) -> int:
+        """How many snapshots were taken."""
+        return 0 if self._log is None else self._log.frame_count
+
+    @property
+    def last_frame(self) -> int:
+        """The step of the last one; -1 before."""
+        return -1 if self._log is None else self._log.last_frame
 
     def before_step(self, action: Any) -> None:
         """Note the action of the coming step, which the environment may overwrite."""
@@ -213,7 +224,6 @@ class TrajectoryRecorder:
             # Whatever was raised: a step that is missing would be the end of the log.
             row = (state, *self._behind_state)
             log.add_step(number, reward, terminated, truncated, row)
-            self.steps = number
         if number == 1:
             self._settle_pace(log)
         if has_picture and (is_last or number % self._stride == 0):
@@ -239,8 +249,6 @@ class TrajectoryRecorder:
             log.add_model_change(ModelChange(step=number, fields=changed))
         if self._takes_frames:
             log.add_frame(number, (self._snapshot.data,))
-            self.frame_count += 1
-        self.last_frame = number
 
     def end(self, facts: Mapping[str, Any]) -> None:
         """Write what is known of the episode's end, and close the log. Idempotent.
@@ -306,8 +314,6 @@ class TrajectoryRecorder:
         log.add_step(0, 0.0, False, False, first)
         if self._takes_frames:
             log.add_frame(0, (self._snapshot.data,))
-            self.last_frame = 0
-            self.frame_count = 1
 
     def _parts(self) -> dict[str, Any]:
         """Return what dictionaries were made into one vector from."""
@@ -345,6 +351,7 @@ class TrajectoryRecorder:
             copy_step=log.steps_of(row),
             copy_moment=log.moments_of(row, memory.snapshot),
             stride=self._stride,
+            log=log,
         )
 
     def _settle_pace(self, log: TrajectoryLogWriter) -> None:

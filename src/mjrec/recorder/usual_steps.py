@@ -19,12 +19,12 @@ from typing import Any
 
 from ..errors import FileNotWritten
 from .stats_recorder import StatsRecorder
-from .trajectory_recorder import MomentCopier, TrajectoryRecorder
+from .trajectory_recorder import MomentCopier
 
 __all__ = ["CountedSteps", "UsualSteps"]
 
-# Of rewards, which are NumPy's float64 as a rule: `+` would make one of the sum too,
-# and converting each takes ten times as long.
+# Of a reward, which is NumPy's float64 as a rule, and those before: `+` would make one
+# of the sum too, and converting each takes ten times as long.
 _sum = float.__add__
 
 
@@ -55,7 +55,9 @@ class CountedSteps:
             return False
         stats = self._stats
         # Numbers, because an episode has begun.
-        stats.rewards = _sum(stats.rewards, reward)  # type: ignore[arg-type]
+        total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
+        # No call from here on, behind which a signal's handler could raise.
+        stats.rewards = total
         stats.steps += 1  # type: ignore[operator]
         stats.total_steps += 1
         return True
@@ -65,7 +67,6 @@ class UsualSteps:
     """The usual steps of an episode whose states are recorded, from its second one on.
 
     Args:
-        trajectory: of the episode.
         copier: of the trajectory.
         stats: counts the steps.
     """
@@ -74,16 +75,14 @@ class UsualSteps:
         "_can_copy",
         "_copy_moment",
         "_copy_step",
+        "_log",
         "_set_action",
         "_stats",
         "_stride",
-        "_trajectory",
     )
 
-    def __init__(
-        self, trajectory: TrajectoryRecorder, copier: MomentCopier, stats: StatsRecorder
-    ) -> None:
-        self._trajectory = trajectory
+    def __init__(self, copier: MomentCopier, stats: StatsRecorder) -> None:
+        self._log = copier.log
         self._stats = stats
         self._set_action = copier.set_action
         self._can_copy = copier.can_copy
@@ -106,24 +105,23 @@ class UsualSteps:
 
         Then nothing of it was recorded.
         """
-        trajectory, stats = self._trajectory, self._stats
-        can_copy = self._can_copy
+        log, stats, can_copy = self._log, self._stats, self._can_copy
         if not isinstance(reward, float) or not can_copy():
             return False
-        number = trajectory.steps + 1
-        has_frame = number % self._stride == 0
-        copy = self._copy_moment if has_frame else self._copy_step
+        number = log.steps + 1
+        copy = self._copy_step if number % self._stride else self._copy_moment
+        # A number, because an episode has begun.
+        total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
         try:
             copy(number, reward)
         except FileNotWritten:
             # The recorder will meet it too, and knows what is to be done.
             return False
-        trajectory.steps = number
-        if has_frame:
-            trajectory.last_frame = number
-            trajectory.frame_count += 1
-        # A number, because an episode has begun.
-        stats.rewards = _sum(stats.rewards, reward)  # type: ignore[arg-type]
-        stats.steps = number
-        stats.total_steps += 1
+        finally:
+            # Also where a signal's handler has raised behind the copying; in here there
+            # is no call behind which one could.
+            if log.steps == number:
+                stats.rewards = total
+                stats.steps += 1  # type: ignore[operator]
+                stats.total_steps += 1
         return True

@@ -26,7 +26,7 @@ from .picture_states import (
     PictureStates,
     moves_cameras,
 )
-from .scene_view import SceneView
+from .scene_view import SceneView, ViewMemory
 from .state_memory import has_state_memory, state_memory
 from .state_source import EpisodeStart, MomentMemory
 
@@ -180,9 +180,7 @@ class EpisodeStates:
     def model_changed(self) -> None:
         """Note that anything in the model may be another; the next capture looks."""
         self._look_at_everything = True
-        if self._quick is not None:
-            self._quick.end()
-            self._quick = None
+        self._end_quick_capture()
 
     def forget_pictures(self) -> None:
         """Let the next episode's first picture be the first of all."""
@@ -264,6 +262,12 @@ class EpisodeStates:
             _check_settable(changed)
         return changed
 
+    def _end_quick_capture(self) -> None:
+        """Look closely from here on, whoever has been told of the memory."""
+        if self._quick is not None:
+            self._quick.end()
+            self._quick = None
+
     def _go_over_to(self, model: Any, data: Any) -> None:
         """Take note of other objects in mid-episode."""
         stored, pictures = self._stored, self._pictures
@@ -272,8 +276,8 @@ class EpisodeStates:
         if not stored.memory.is_of(raw_model(model)):
             raise _differs("the environment has gone over to another model")
         stored.follow(raw_data(data))
-        self._quick = None
-        self._pictures = stored.pictures(pictures.view)
+        self._end_quick_capture()
+        self._pictures = stored.pictures(pictures.view, watched=pictures.watched)
         self._seen = (model, data)
 
 
@@ -319,9 +323,19 @@ class _StoredModel:
         return self._state_bytes
 
     def pictures(
-        self, view: SceneView, changed_fields: Iterable[str] = ()
+        self,
+        view: SceneView,
+        changed_fields: Iterable[str] = (),
+        *,
+        watched: ViewMemory | None = None,
     ) -> PictureStates:
-        """Return what takes snapshots of the data."""
+        """Return what takes snapshots of the data.
+
+        Args:
+            view: how the scene is shown.
+            changed_fields: of the model, other than in the stored one.
+            watched: the view as it was at the snapshot before, if there was one.
+        """
         return PictureStates(
             self._model,
             self.data,
@@ -329,6 +343,7 @@ class _StoredModel:
             changed_fields,
             kept=self._kept_cameras(view),
             checked=self._checked,
+            watched=watched,
         )
 
     def forget_pictures(self) -> None:

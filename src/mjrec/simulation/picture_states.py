@@ -95,6 +95,7 @@ class PictureStates:
         changed_fields: of the model, other than in the stored one.
         kept: told of every picture, where one has an influence on the next.
         checked: what is known to be sound.
+        watched: the view as it was at the snapshot before; None where there was none.
 
     Attributes:
         layout: of the snapshots.
@@ -113,6 +114,7 @@ class PictureStates:
         *,
         kept: KeptCameras | None,
         checked: CheckedPictures,
+        watched: ViewMemory | None = None,
     ) -> None:
         self.layout = snapshot_layout(model, view.option)
         self.view = view
@@ -122,7 +124,7 @@ class PictureStates:
         self.stand_alone = kept is None
         self._checked = checked
         self.source = SnapshotSource(model, data, self.layout)
-        self.watched = ViewMemory(view)
+        self.watched = watched or ViewMemory(view)
         self._facts = view.facts()
         # Moved as pictures move it; the environment's own stays where it is.
         self._camera = copy.copy(view.camera)
