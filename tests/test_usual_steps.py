@@ -17,12 +17,12 @@ import mujoco
 import numpy as np
 import pytest
 from full_disk import file_size_limit
+from recorded_states import assert_same, changes_in, is_usual, trajectories
 from recordings import manifest_of, stats_of
 from waiting import wait_until
 
 import mjrec
 from mjrec import FileNotWritten, Monitor, ResetNeeded
-from mjrec.formats.trajectory_file import open_trajectory
 
 CHEETAH, HOPPER, PENDULUM = "HalfCheetah-v5", "Hopper-v5", "InvertedPendulum-v5"
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -61,11 +61,6 @@ def monitored(env: Any, directory: Path, **options: Any) -> Any:
     return Monitor(env, directory, lambda _: True, workers=0, **options)
 
 
-def is_usual(monitor: Any) -> bool:
-    """Tell whether the coming step may be recorded the usual way."""
-    return monitor._recorder.usual is not None
-
-
 def go(
     monitor: Any, count: int, *, usual: bool = True, before: Before | None = None
 ) -> list[Any]:
@@ -85,10 +80,6 @@ def begin(monitor: Any) -> None:
     monitor.action_space.seed(0)
 
 
-def trajectories(directory: Path) -> list[mjrec.Trajectory]:
-    return [mjrec.load_trajectory(path) for path in sorted(directory.glob("*.h5"))]
-
-
 def recorded(
     env: Any, directory: Path, count: int = 8, *, camera: Any = None, **steps: Any
 ) -> mjrec.Trajectory:
@@ -100,28 +91,11 @@ def recorded(
     return trajectory
 
 
-def changes_in(directory: Path) -> dict[int, set[str]]:
-    """Return which fields of model and view changed in an episode, by the step."""
-    [path] = directory.glob("*.h5")
-    with open_trajectory(path) as reader:
-        return {change.step: set(change.fields) for change in reader.model_changes}
-
-
 def state_of(env: Any) -> Any:
     model, data = env.unwrapped.model, env.unwrapped.data
     state = np.empty(mujoco.mj_stateSize(model, INTEGRATION))
     mujoco.mj_getState(model, data, state, INTEGRATION)
     return state
-
-
-def assert_same(found: mjrec.Trajectory, expected: mjrec.Trajectory) -> None:
-    """All that was recorded of two episodes is the same, bit for bit."""
-    for name in ("states", "actions", "rewards", "terminated", "truncated"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    np.testing.assert_array_equal(found.frame_steps, expected.frame_steps)
-    assert found.snapshots.keys() == expected.snapshots.keys()
-    for name, values in expected.snapshots.items():
-        np.testing.assert_array_equal(found.snapshots[name], values)
 
 
 @pytest.fixture

@@ -13,11 +13,15 @@ import pytest
 suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
 
 import mujoco  # noqa: E402  after importorskip
+from recorded_states import (  # noqa: E402  after importorskip
+    assert_same,
+    changes_in,
+    is_usual,
+    trajectories,
+)
 from recordings import stats_of  # noqa: E402  after importorskip
 
-import mjrec  # noqa: E402  after importorskip
 from mjrec import Monitor  # noqa: E402  after importorskip
-from mjrec.formats.trajectory_file import open_trajectory  # noqa: E402
 
 pytestmark = pytest.mark.dm_control
 
@@ -37,10 +41,6 @@ def monitored(env: Any, directory: Path, **options: Any) -> Any:
     size = {"height": 32, "width": 48}
     options = {"env_id": "dm_control/some-task", "workers": 0, **size, **options}
     return Monitor(env, directory, lambda _: True, **options)
-
-
-def is_usual(monitor: Any) -> bool:
-    return monitor._recorder.usual is not None
 
 
 def go(
@@ -65,27 +65,6 @@ def recorded(env: Any, directory: Path, *, camera: Any = None, **steps: Any) -> 
         go(monitor, 8, **steps)
     [trajectory] = trajectories(directory)
     return trajectory
-
-
-def trajectories(directory: Path) -> list[mjrec.Trajectory]:
-    return [mjrec.load_trajectory(path) for path in sorted(directory.glob("*.h5"))]
-
-
-def changes_in(directory: Path) -> dict[int, set[str]]:
-    """Return which fields of model and view changed in an episode, by the step."""
-    [path] = directory.glob("*.h5")
-    with open_trajectory(path) as reader:
-        return {change.step: set(change.fields) for change in reader.model_changes}
-
-
-def assert_same(found: mjrec.Trajectory, expected: mjrec.Trajectory) -> None:
-    """All that was recorded of two episodes is the same, bit for bit."""
-    for name in ("states", "actions", "rewards", "terminated", "truncated"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    np.testing.assert_array_equal(found.frame_steps, expected.frame_steps)
-    assert found.snapshots.keys() == expected.snapshots.keys()
-    for name, values in expected.snapshots.items():
-        np.testing.assert_array_equal(found.snapshots[name], values)
 
 
 @pytest.mark.parametrize(
