@@ -94,7 +94,9 @@ class GivenStates:
     def bring_to(self, index: int) -> bool:
         """Put a row into the data; return False: the model never changes."""
         mujoco.mj_resetData(self.model, self.data)
-        mujoco.mj_setState(self.model, self.data, self._states[index], self._spec)
+        # A copy: mujoco 3.3 takes none that it could not write to.
+        state = np.array(self._states[index])
+        mujoco.mj_setState(self.model, self.data, state, self._spec)
         mujoco.mj_forward(self.model, self.data)
         return False
 
