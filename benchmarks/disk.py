@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
 import tempfile
 import time
 from collections.abc import Iterator
@@ -12,21 +11,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import mjrec
 from mjrec.formats.trajectory_file import finish_trajectory
 
 from .children import call
 from .results import Result
 from .rounds import Say, take_turns
-from .setups import MONITOR, UNENDING, Setup, random_actions
+from .setups import (
+    MONITOR,
+    SUITE,
+    UNENDING,
+    Setup,
+    is_there,
+    random_actions,
+    suite_environment,
+)
 
 __all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure", "record_and_finish"]
 
 TITLE = "Disk: bytes of an episode, every step captured"
-
-_DM_CONTROL = "dm_control/"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +63,7 @@ def measure(settings: Settings, say: Say) -> list[Result]:
                 call, record_and_finish, name=name, steps=settings.steps
             )
             for name in settings.environments
-            if _is_there(name)
+            if is_there(name)
         },
         rounds=settings.rounds,
         say=say,
@@ -82,7 +85,7 @@ def record_and_finish(name: str, steps: int) -> dict[str, float]:
         seconds that finishing took.
     """
     with tempfile.TemporaryDirectory() as directory:
-        if name.startswith(_DM_CONTROL):
+        if name.startswith(SUITE):
             env = _recorded_dm_control(name, steps, directory)
         else:
             env = _recorded_gymnasium(name, steps, directory)
@@ -118,26 +121,14 @@ def _recorded_gymnasium(env_id: str, steps: int, directory: str) -> Any:
 
 def _recorded_dm_control(env_id: str, steps: int, directory: str) -> Any:
     """Return a monitor whose episode is over."""
-    # Here, because it may not be installed.
-    from dm_control import suite
-
-    domain, _, task = env_id.removeprefix(_DM_CONTROL).partition("-")
-    env = suite.load(domain, task, task_kwargs={"random": 0})
-    low, high = env.action_spec().minimum, env.action_spec().maximum
-    random = np.random.default_rng(0)
+    env = suite_environment(env_id)
     monitor = mjrec.Monitor(env, directory, workers=0, env_id=env_id)
     monitor.reset()
-    for _ in range(steps):
-        monitor.step(random.uniform(low, high))
+    for action in random_actions(env, steps):
+        monitor.step(action)
     # Whether it was over or not.
     monitor.reset()
     return monitor
-
-
-def _is_there(name: str) -> bool:
-    return not name.startswith(_DM_CONTROL) or bool(
-        importlib.util.find_spec("dm_control")
-    )
 
 
 def _results(

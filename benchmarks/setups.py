@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import time
 from collections.abc import Callable, Iterable
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 
 import mjrec
 
@@ -18,14 +20,20 @@ __all__ = [
     "BARE",
     "MONITOR",
     "RECORD_VIDEO",
+    "SUITE",
     "UNENDING",
     "Setup",
     "has_moviepy",
+    "is_there",
     "random_actions",
     "seconds_to_step",
+    "suite_environment",
 ]
 
 BARE, MONITOR, RECORD_VIDEO = "bare", "mjrec.Monitor", "RecordVideo"
+
+# The names of dm_control's tasks begin with it.
+SUITE = "dm_control/"
 
 # What keeps episodes of random actions going until their time is over.
 UNENDING: dict[str, dict[str, Any]] = {
@@ -92,14 +100,41 @@ def has_moviepy() -> bool:
     return importlib.util.find_spec("moviepy") is not None
 
 
+def is_there(env_id: str) -> bool:
+    """Return whether an environment's framework is installed."""
+    return not env_id.startswith(SUITE) or bool(importlib.util.find_spec("dm_control"))
+
+
+def suite_environment(env_id: str) -> Any:
+    """Return a task of dm_control's suite, where `is_there`."""
+    # Here, because it may not be installed.
+    from dm_control import suite
+
+    domain, _, task = env_id.removeprefix(SUITE).partition("-")
+    return suite.load(domain, task, task_kwargs={"random": 0})
+
+
 def random_actions(env: Any, count: int) -> list[Any]:
     """Return the same actions at every call, made beforehand: drawing them takes time.
 
     After half a thousand they come again.
+
+    Args:
+        env: an environment of Gymnasium's or of dm_control's.
+        count: how many.
     """
-    env.action_space.seed(0)
-    some = [env.action_space.sample() for _ in range(min(count, 500))]
+    draw = _drawing(env)
+    some = [draw() for _ in range(min(count, 500))]
     return [some[index % len(some)] for index in range(count)]
+
+
+def _drawing(env: Any) -> Callable[[], Any]:
+    if hasattr(env, "action_space"):
+        env.action_space.seed(0)
+        sample: Callable[[], Any] = env.action_space.sample
+        return sample
+    spec, generator = env.action_spec(), np.random.default_rng(0)
+    return functools.partial(generator.uniform, spec.minimum, spec.maximum)
 
 
 def seconds_to_step(env: Any, actions: Iterable[Any]) -> float:

@@ -15,31 +15,21 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from dm_control import suite
 
 import mjrec
 
-_SUITE = "dm_control/"
-STEPS = {"HalfCheetah-v5": 6000, "Humanoid-v5": 3000, f"{_SUITE}cheetah-run": 6000}
+from .setups import SUITE, is_there, random_actions, suite_environment
+
+STEPS = {"HalfCheetah-v5": 6000, "Humanoid-v5": 3000, f"{SUITE}cheetah-run": 6000}
 ROUNDS = 5
 QUANTILES = (5, 25, 50)
 
 
 def make(env_id: str) -> Any:
     """Return an environment of Gymnasium's or of dm_control's suite."""
-    if not env_id.startswith(_SUITE):
-        return gymnasium.make(env_id)
-    domain, task = env_id.removeprefix(_SUITE).split("-", 1)
-    return suite.load(domain, task, task_kwargs={"random": 0})
-
-
-def random_actions(env: Any, count: int) -> list[Any]:
-    """Return so many actions, the same ones at every call."""
-    if hasattr(env, "action_space"):
-        env.action_space.seed(0)
-        return [env.action_space.sample() for _ in range(count)]
-    spec, generator = env.action_spec(), np.random.default_rng(0)
-    return [generator.uniform(spec.minimum, spec.maximum) for _ in range(count)]
+    if env_id.startswith(SUITE):
+        return suite_environment(env_id)
+    return gymnasium.make(env_id)
 
 
 def reset(env: Any, seed: int) -> None:
@@ -115,7 +105,10 @@ def main() -> None:
     """Measure every environment."""
     print(f"{'':37} {'bare':>12} {'counted':>12} {'captured':>12}")
     for env_id, count in STEPS.items():
-        measure(env_id, count)
+        if is_there(env_id):
+            measure(env_id, count)
+        else:
+            print(f"{env_id}: dm_control is not installed")
 
 
 if __name__ == "__main__":

@@ -115,8 +115,12 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
         if usual is not recorder.usual:
             # Within the step this monitor was closed, or its process forked.
             usual = None
-        is_mid = not (timestep.first() or timestep.last())
-        if usual is None or not is_mid or not usual.step(timestep.reward):
+        if (
+            usual is None
+            or timestep.first()
+            or timestep.last()
+            or not usual.step(timestep.reward)
+        ):
             self._record(timestep)
         return timestep
 

@@ -172,7 +172,7 @@ class Recorder:
             infix=self._place.infix,
             subject=subject,
             options=options,
-            selection=selection or None,
+            selection=selection,
         )
         self._facts = RecordingFacts(
             infix=str(self._place.infix), subject=subject, selection=selection
@@ -480,7 +480,7 @@ class Recorder:
             trigger=self._options.step_trigger,
             make=lambda steps: maker.make(
                 steps,
-                episode_id=self._next_episode_id - 1,
+                episode_id=self._running.episode_id,
                 total_steps=self.stats_recorder.total_steps,
             ),
         )
@@ -615,7 +615,7 @@ class Recorder:
         stats = self.stats_recorder
         began, now = self._reset_clock, self._subject.clock()
         return Caption(
-            episode_id=self._next_episode_id - 1,
+            episode_id=self._running.episode_id,
             step=stats.steps or 0,
             time=None if began is None or now is None else now - began,
             reward=stats.rewards or 0.0,
@@ -730,7 +730,7 @@ class Recorder:
             # What the schedule has said is final.
             return Standing.CHOSEN
         return self._kept.judge(
-            self._next_episode_id - 1,
+            self._running.episode_id,
             self._finished_episode() if is_complete else None,
         )
 
@@ -784,7 +784,7 @@ class Recorder:
 
     def _hand_on(self, trajectory: EpisodeTrajectory, standing: Standing) -> None:
         """Let others keep, render or finish a trajectory that is whole."""
-        episode_id, deferred = self._next_episode_id - 1, trajectory.deferred
+        episode_id, deferred = self._running.episode_id, trajectory.deferred
         if deferred is not None:
             deferred.close()
         if self._kept is not None and standing is Standing.CANDIDATE:
@@ -814,7 +814,7 @@ class Recorder:
 
         def list_one(recorder: VideoRecorder) -> None:
             if kept is not None and standing is Standing.CANDIDATE:
-                kept.hold_live(self._next_episode_id - 1, recorder)
+                kept.hold_live(self._running.episode_id, recorder)
             else:
                 self._videos.add_live(recorder)
 

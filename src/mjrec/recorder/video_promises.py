@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ class VideoPromises:
         infix: the monitor's.
         subject: what is recorded.
         options: what was asked for.
-        selection: by which rule episodes are chosen after their end; None where they
+        selection: by which rule episodes are chosen after their end; empty where they
             are chosen before.
     """
 
@@ -32,7 +32,7 @@ class VideoPromises:
     infix: Infix
     subject: Subject
     options: RecorderOptions
-    selection: Mapping[str, Any] | None = None
+    selection: Mapping[str, Any] = field(default_factory=dict)
 
     def path(self, episode_id: int) -> Path:
         """Return where an episode's video will be, without the ending."""
@@ -81,7 +81,7 @@ class VideoPromises:
             promise["tiled"] = options.tiled
         if options.annotate:
             promise["annotate"] = True
-        if self.selection is not None:
+        if self.selection:
             promise["selection"] = self.selection
         return promise
 
