@@ -25,6 +25,8 @@ from mjrec import (  # noqa: E402  after importorskip
     UnknownName,
 )
 
+pytestmark = pytest.mark.dm_control
+
 
 class Countdown(dm_env.Environment):  # type: ignore[misc]  # dm_env is untyped
     """Counts `length` steps down; a discount of 0 ends the task."""
