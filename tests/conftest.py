@@ -19,11 +19,19 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from packed_runs import record_pendulum
 from processes import children
 
 from mjrec.formats.ffmpeg import ffmpeg_executable
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
+
+# It is in an environment of its own.
+collect_ignore = (
+    []
+    if importlib.util.find_spec("stable_baselines3")
+    else ["test_stable_baselines3.py"]
+)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -32,6 +40,23 @@ def own_state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
+
+
+@pytest.fixture
+def default_signals() -> Iterator[None]:
+    """Have child processes start with SIGINT and SIGHUP as in a terminal.
+
+    Under `nohup` and in a background job they are ignored, in every child too. So a
+    test that sends one asks for this.
+    """
+    earlier = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGHUP)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if earlier[signal.SIGHUP] is signal.SIG_IGN:
+        # A child starts without it; this process lives on, as `nohup` asks for.
+        signal.signal(signal.SIGHUP, lambda *_: None)
+    yield
+    for signum, handler in earlier.items():
+        signal.signal(signum, handler)
 
 
 def pytest_report_header() -> list[str]:
@@ -99,6 +124,22 @@ def free_dm_control_contexts(request: pytest.FixtureRequest) -> Iterator[None]:
     yield
     if request.node.get_closest_marker("dm_control"):
         gc.collect()
+
+
+@pytest.fixture(scope="session")
+def pendulums(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Return what records once in a session, for tests that change nothing."""
+    made: dict[str, Path] = {}
+
+    def recorded(episodes: int, **options: Any) -> Path:
+        key = f"{episodes} {sorted(options.items())}"
+        if key not in made:
+            directory = tmp_path_factory.mktemp("pendulum") / "recorded"
+            record_pendulum(directory, episodes, **options)
+            made[key] = directory
+        return made[key]
+
+    return recorded
 
 
 @pytest.fixture

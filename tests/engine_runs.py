@@ -8,8 +8,6 @@ from typing import Any
 
 from mjrec.engines.work import Job, JobOutcome, Run
 
-__all__ = ["lines", "outcomes", "submit", "values", "wait_for"]
-
 
 def submit(run: Run, *jobs: str, **arguments: Any) -> None:
     """Hand out jobs that differ in nothing but their keys."""

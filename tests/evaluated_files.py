@@ -12,8 +12,6 @@ import h5py
 from mjrec.evaluation.evaluation import Evaluation
 from mjrec.formats.trajectory_file import open_trajectory
 
-__all__ = ["datasets_in", "hashes_of", "recorded_in"]
-
 
 def recorded_in(evaluation: Evaluation) -> dict[tuple[Any, ...], Any]:
     """Return what was recorded of each episode: every dataset, and videos as bytes.

@@ -13,8 +13,6 @@ from mjrec.evaluation.results_files import write_results
 from mjrec.evaluation.summaries import Bootstrap
 from mjrec.evaluation.summarizing import default_score_range, summarize_results
 
-__all__ = ["write_evaluation"]
-
 
 def write_evaluation(
     directory: Path,

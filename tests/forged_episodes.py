@@ -27,21 +27,6 @@ from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
 from mjrec.formats.trajectory_reader import TrajectoryReader
 
-__all__ = [
-    "copied",
-    "episode",
-    "fact",
-    "failed",
-    "forge",
-    "physics_of",
-    "record_gymnasium",
-    "record_mjcf",
-    "record_suite",
-    "swap_model",
-    "unchecked",
-    "verdicts",
-]
-
 _OPTIONS: dict[str, Any] = {
     "video_callable": False,
     "trajectory_callable": lambda _: True,

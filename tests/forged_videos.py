@@ -10,8 +10,6 @@ from typing import Any
 import mjrec
 from mjrec.formats.video_writer import VideoWriter
 
-__all__ = ["drawn", "forge", "metadata", "say", "swap", "video"]
-
 _ENDINGS = (".mp4", ".framehash", ".meta.json")
 
 

@@ -7,8 +7,6 @@ import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["file_size_limit"]
-
 
 @contextmanager
 def file_size_limit(size: int) -> Iterator[None]:

@@ -19,17 +19,6 @@ import mjrec
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
 
-__all__ = [
-    "edit_json",
-    "edit_trajectory",
-    "make_bag_fit",
-    "make_manifests_fit",
-    "record_pendulum",
-    "the",
-    "unpacked",
-    "zipped",
-]
-
 
 def record_pendulum(
     directory: Path, episodes: int = 3, *, longest: int = 8, **options: Any

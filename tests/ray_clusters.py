@@ -15,15 +15,6 @@ import ray
 from ray.cluster_utils import Cluster
 from waiting import wait_until
 
-__all__ = [
-    "MARK",
-    "SMALL_STORE",
-    "cluster_of",
-    "home_for_ray",
-    "is_gone",
-    "ray_processes",
-]
-
 MARK = "MJREC_TEST_OF_RAY"
 AGENT = re.compile(r"ray::\w+Agent")
 SMALL_STORE = 80 << 20

@@ -11,8 +11,6 @@ import numpy as np
 import mjrec
 from mjrec.formats.trajectory_file import open_trajectory
 
-__all__ = ["assert_same", "changes_in", "is_usual", "trajectories"]
-
 
 def is_usual(monitor: Any) -> bool:
     """Tell whether the coming step may be recorded the usual way."""

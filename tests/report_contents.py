@@ -18,8 +18,6 @@ from mjrec.reporting.contents import (
     ReportVideo,
 )
 
-__all__ = ["HOSTILE", "columns", "contents", "task", "video"]
-
 _FEW = Bootstrap(resamples=50)
 
 # Markup, quotes, what ends a script, a comment and a template, a mark that turns the

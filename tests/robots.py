@@ -13,8 +13,6 @@ from unittest import mock
 import gymnasium
 import mujoco
 
-__all__ = ["has_robotics", "robotics_ids", "robots_that_reset"]
-
 has_robotics = importlib.util.find_spec("gymnasium_robotics") is not None
 
 

@@ -7,8 +7,6 @@ import numpy as np
 
 from mjrec.evaluation.statistics import Samples
 
-__all__ = ["TENTHS", "X", "Y", "samples"]
-
 # Ten runs of six tasks; the figures below are what rliable 1.2.0 says of them.
 X = {
     "a": [0.43, 0.65, 0.13, 0.56, 0.11, 0.05, 0.35, 0.49, 0.39, 0.22],

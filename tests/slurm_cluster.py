@@ -6,15 +6,12 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-import shutil
 import signal
 import socket
 import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
-
-COMMANDS = ("munged", "slurmctld", "slurmd", "sbatch", "squeue", "scancel", "srun")
 
 # `low` gives way to `high`: SIGTERM, 20 seconds, SIGKILL.
 CONFIGURATION = """
@@ -45,14 +42,6 @@ NodeName={host} NodeAddr=127.0.0.1 CPUs=4 RealMemory=4000 State=UNKNOWN
 PartitionName=low Nodes={host} Default=YES PriorityTier=1 GraceTime=20
 PartitionName=high Nodes={host} PriorityTier=2 PreemptMode=OFF
 """
-
-
-def lack_of_slurm() -> str:
-    """Return what is missing for a cluster to run here; nothing if it can."""
-    missing = [command for command in COMMANDS if shutil.which(command) is None]
-    if missing:
-        return f"no {', '.join(missing)} on PATH"
-    return "" if os.geteuid() == 0 else "its daemons run as root only"
 
 
 @contextlib.contextmanager

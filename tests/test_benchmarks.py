@@ -139,6 +139,7 @@ def shown(results: list[Result]) -> str:
 # --- the measurements ----------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_stepping_compares_all_with_the_bare_environment() -> None:
     """The promises are those of counted and of captured episodes."""
     settings = stepping.Settings(
@@ -155,6 +156,7 @@ def test_stepping_compares_all_with_the_bare_environment() -> None:
     assert set(promised(results).values()) == {"≥ 0.95", "≥ 0.8"}
 
 
+@pytest.mark.thorough
 def test_time_to_video_compares_with_record_video() -> None:
     """Each variant of a case has its promise."""
     settings = time_to_video.Settings(
@@ -169,6 +171,7 @@ def test_time_to_video_compares_with_record_video() -> None:
     assert promised(results) == {"max_fps=30, full quality": "≤ 0.3"}
 
 
+@pytest.mark.thorough
 def test_memory_compares_processes_of_equal_episodes() -> None:
     """And the longer episode with the shorter one."""
     settings = memory.Settings(
@@ -180,6 +183,7 @@ def test_memory_compares_processes_of_equal_episodes() -> None:
     assert set(promised(results).values()) == {"≤ 64", "≤ 4"}
 
 
+@pytest.mark.thorough
 def test_rendering_draws_the_same_states_in_three_ways() -> None:
     """`mjrec.render` is what was promised."""
     settings = rendering.Settings(
@@ -192,6 +196,7 @@ def test_rendering_draws_the_same_states_in_three_ways() -> None:
     assert promised(results) == {"mjrec.render(workers=1)": "≥ 0.9"}
 
 
+@pytest.mark.thorough
 def test_verifying_is_compared_with_stepping() -> None:
     """Its steps alone, and with the environment; and the memory of many episodes."""
     settings = verifying.Settings(rounds=1, episodes=2, few=1, steps=20)
@@ -201,6 +206,7 @@ def test_verifying_is_compared_with_stepping() -> None:
     assert kept["steps and environment"] == "≤ 2.5"
 
 
+@pytest.mark.thorough
 @pytest.mark.dm_control
 def test_evaluating_compares_two_workers_with_one() -> None:
     """The promise is a part of the time of one."""
@@ -213,6 +219,7 @@ def test_evaluating_compares_two_workers_with_one() -> None:
     assert promised(results) == {"2 workers": "≤ 0.588235"}
 
 
+@pytest.mark.thorough
 def test_reporting_is_compared_with_loading() -> None:
     """And the memory of many episodes has a limit."""
     settings = reporting.Settings(rounds=1, episodes=20, videos=2, many_episodes=100)
@@ -223,6 +230,7 @@ def test_reporting_is_compared_with_loading() -> None:
     assert all(r.median > 0 for r in results if r.samples)
 
 
+@pytest.mark.thorough
 def test_scaling_compares_many_monitors_with_fewer() -> None:
     """Reading is to grow as their number does, and its memory has a limit."""
     settings = scaling.Settings(
@@ -247,6 +255,7 @@ def test_engines_gives_what_an_engine_adds() -> None:
     assert all(r.median > 0 for r in results)
 
 
+@pytest.mark.thorough
 def test_disk_gives_the_size_of_every_file() -> None:
     """Log, finished file, and both of the model."""
     settings = disk.Settings(environments=("HalfCheetah-v5",), rounds=1, steps=10)
@@ -258,6 +267,7 @@ def test_disk_gives_the_size_of_every_file() -> None:
     assert all(size > 0 for size in sizes.values())
 
 
+@pytest.mark.thorough
 def test_encoding_gives_the_rate_of_each_codec() -> None:
     """Lossless ones too."""
     settings = encoding.Settings(rounds=1, frames=2, size=TINY)

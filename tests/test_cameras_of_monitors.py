@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from parts import parametrize
 from recordings import frames_of, manifest_of
 
 import mjrec
@@ -37,7 +38,8 @@ def _hashes(path: Path) -> str:
     return "\n".join(line for line in lines if not line.startswith("#"))
 
 
-@pytest.mark.parametrize("render", ["live", "deferred"])
+# Takes more than five seconds: a monitor with renderers of its own for each camera.
+@parametrize("render", ["deferred", "live"])
 def test_each_camera_has_a_video_as_if_it_were_the_only_one(
     tmp_path: Path, render: str
 ) -> None:
@@ -48,7 +50,7 @@ def test_each_camera_has_a_video_as_if_it_were_the_only_one(
     assert both == {"": track[""], ".-1": free[""]}
 
 
-@pytest.mark.parametrize("render", ["live", "deferred"])
+@parametrize("render", ["live", "deferred"])
 def test_manifest_and_metadata_name_all_videos(tmp_path: Path, render: str) -> None:
     """Each video has its metadata, with its camera, and is in the index."""
     record(tmp_path, camera=["track", -1], render=render)
@@ -65,7 +67,7 @@ def test_manifest_and_metadata_name_all_videos(tmp_path: Path, render: str) -> N
     assert cameras[1] != "track"
 
 
-@pytest.mark.parametrize("render", ["live", "deferred"])
+@parametrize("render", ["live", "deferred"])
 def test_further_videos_name_the_first_and_their_second_name(
     tmp_path: Path, render: str
 ) -> None:
@@ -81,7 +83,7 @@ def test_further_videos_name_the_first_and_their_second_name(
     assert about["further_videos"] == [further.name]
 
 
-@pytest.mark.parametrize("render", ["live", "deferred"])
+@parametrize("render", ["live", "deferred"])
 def test_cameras_side_by_side_are_one_video(tmp_path: Path, render: str) -> None:
     """The grid has the very frames of both."""
     record(tmp_path / "tiled", camera=["track", -1], tiled=True, render=render)
@@ -96,6 +98,7 @@ def test_cameras_side_by_side_are_one_video(tmp_path: Path, render: str) -> None
     assert about["tiled"] is True
 
 
+@pytest.mark.thorough
 def test_live_and_deferred_captions_are_the_same(tmp_path: Path) -> None:
     """They say the same of each frame, in the same letters."""
     live = record(tmp_path / "live", camera="track", annotate=True, render="live")
@@ -105,7 +108,7 @@ def test_live_and_deferred_captions_are_the_same(tmp_path: Path) -> None:
     assert live != plain
 
 
-@pytest.mark.parametrize("render", ["live", "deferred"])
+@parametrize("render", ["live", "deferred"])
 def test_videos_have_gymnasiums_names_besides(tmp_path: Path, render: str) -> None:
     """The same files, so nothing is stored twice."""
     record(tmp_path, camera="track", name_prefix="rl-video", render=render)
@@ -113,6 +116,7 @@ def test_videos_have_gymnasiums_names_besides(tmp_path: Path, render: str) -> No
     assert (tmp_path / "rl-video-episode-0.mp4").samefile(own)
 
 
+@pytest.mark.thorough
 def test_clips_have_gymnasiums_names_besides(tmp_path: Path) -> None:
     """By the number of the step that they begin before."""
     record(

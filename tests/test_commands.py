@@ -14,6 +14,7 @@ from typing import Any
 
 import gymnasium
 import pytest
+from parts import parametrize
 from recordings import frames_in, metadata_of, videos_in
 
 from mjrec import Monitor, load_results
@@ -74,6 +75,7 @@ def results_of(directory: Path) -> dict[str, Any]:
 CHEETAH = ("record", "HalfCheetah-v5", "--size", "64x48", "--max-steps", 3)
 
 
+# Takes more than five seconds: three videos, each by renderers that start for it.
 def test_record_gymnasium(mjrec: Any, tmp_path: Path) -> None:
     """Ten short episodes: videos of 0, 1 and 8, statistics of all, a line for each."""
     status, out, _ = mjrec(*CHEETAH, "--out", tmp_path, "--episodes", 10, "--seed", 0)
@@ -138,6 +140,7 @@ def test_text_environment(mjrec: Any, tmp_path: Path) -> None:
     assert json.loads(Path(cast).read_text())["version"] == 1
 
 
+@pytest.mark.thorough
 def test_same_seed_gives_the_same_pictures(mjrec: Any, tmp_path: Path) -> None:
     """Two runs with one seed agree frame by frame, and another seed does not."""
     hashes = []
@@ -150,6 +153,7 @@ def test_same_seed_gives_the_same_pictures(mjrec: Any, tmp_path: Path) -> None:
     assert hashes[0][0] != hashes[0][1]
 
 
+@pytest.mark.thorough
 def test_resume_goes_on_where_it_stopped(mjrec: Any, tmp_path: Path) -> None:
     """Episode 1 of a resumed run is episode 1 of an uninterrupted one."""
     for out, runs in (("whole", [2]), ("parts", [1, 1])):
@@ -163,6 +167,7 @@ def test_resume_goes_on_where_it_stopped(mjrec: Any, tmp_path: Path) -> None:
     assert metadata_of(tmp_path / "parts", 1)["episode_id"] == 1
 
 
+@pytest.mark.thorough
 def test_fps_and_schedule(mjrec: Any, tmp_path: Path) -> None:
     """The rate is written as asked, and the schedule is the one named."""
     mjrec(
@@ -206,6 +211,7 @@ def test_policies(
     ]
 
 
+@pytest.mark.thorough
 def test_json_is_the_only_output(mjrec: Any, tmp_path: Path) -> None:
     """One object with what a script wants to know."""
     _, out, _ = mjrec(*CHEETAH, "--out", tmp_path, "--seed", 5, "--json")
@@ -217,6 +223,7 @@ def test_json_is_the_only_output(mjrec: Any, tmp_path: Path) -> None:
     assert (tmp_path / episode["video"]).exists()
 
 
+@pytest.mark.thorough
 def test_seed_that_was_drawn_is_said(mjrec: Any, tmp_path: Path) -> None:
     """So that the run can be repeated."""
     _, out, _ = mjrec(*CHEETAH, "--out", tmp_path / "a", "--json")
@@ -266,6 +273,7 @@ def test_bad_input_is_one_clear_error(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.thorough
 @pytest.mark.dm_control
 @pytest.mark.parametrize(
     ("name", "said"),
@@ -314,6 +322,7 @@ def test_wrong_usage_is_status_2(mjrec: Any) -> None:
     assert left.value.code == 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("env", ["HalfCheetah-v5", "model.xml"])
 def test_cameras_given_more_than_once_are_a_video_each(
     mjrec: Any, tmp_path: Path, env: str
@@ -334,6 +343,7 @@ def test_cameras_given_more_than_once_are_a_video_each(
     assert metadata_of(tmp_path / "out", 0)["camera"] == first
 
 
+@pytest.mark.thorough
 def test_cameras_side_by_side_with_captions_and_a_second_name(
     mjrec: Any, tmp_path: Path
 ) -> None:
@@ -351,6 +361,7 @@ def test_cameras_side_by_side_with_captions_and_a_second_name(
     assert (tmp_path / "rl-video-episode-0.mp4").exists()
 
 
+@pytest.mark.thorough
 def test_list_shows_every_episode(mjrec: Any, tmp_path: Path) -> None:
     """A row each, with the video's name whole."""
     mjrec(
@@ -362,6 +373,7 @@ def test_list_shows_every_episode(mjrec: Any, tmp_path: Path) -> None:
     assert next(tmp_path.glob("*.mp4")).name in out
 
 
+@pytest.mark.thorough
 def test_list_names_videos_of_more_or_less_than_an_episode(
     mjrec: Any, tmp_path: Path
 ) -> None:
@@ -381,6 +393,7 @@ def test_list_names_videos_of_more_or_less_than_an_episode(
     assert out.splitlines()[-2:] == ["Other videos:", f"  {video.name}"]
 
 
+@pytest.mark.thorough
 def test_list_json_is_a_line_for_each_episode(mjrec: Any, tmp_path: Path) -> None:
     """For scripts: numbers, seeds, file names."""
     mjrec(*CHEETAH, "--out", tmp_path, "--seed", 0, "--episodes", 2)
@@ -422,6 +435,7 @@ def test_list_says_which_videos_are_pending(mjrec: Any, tmp_path: Path) -> None:
     assert second["video"] is None
 
 
+@pytest.mark.thorough
 def test_list_shows_the_directories_in_one(mjrec: Any, tmp_path: Path) -> None:
     """As of an evaluation, which has one for each task; others are passed over."""
     for name, episodes in (("b", 1), ("a", 2)):
@@ -453,6 +467,7 @@ def test_list_of_nothing_is_an_error(mjrec: Any, tmp_path: Path) -> None:
     assert "nothing" in err
 
 
+@pytest.mark.thorough
 def test_reader_may_leave_early(mjrec: Any, tmp_path: Path) -> None:
     """Whoever reads the list may have left: nothing is said on stderr."""
     mjrec(*CHEETAH, "--out", tmp_path, "--seed", 0, "--schedule", "none")
@@ -492,6 +507,8 @@ def _start(tmp_path: Path, **streams: Any) -> subprocess.Popen[bytes]:
     )
 
 
+# Takes more than five seconds: a command is interrupted, and what it left is drawn.
+@pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_keeps_everything_so_far(tmp_path: Path) -> None:
     """Status 130; episodes and manifest are whole, and videos can be made of them."""
     process = _start(tmp_path, stdout=subprocess.PIPE)
@@ -511,9 +528,8 @@ def test_ctrl_c_keeps_everything_so_far(tmp_path: Path) -> None:
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
-@pytest.mark.parametrize(
-    ("signum", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)]
-)
+@pytest.mark.usefixtures("default_signals")
+@parametrize(("signum", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_being_told_to_end_keeps_everything_so_far(
     signum: signal.Signals, status: int, tmp_path: Path
 ) -> None:
@@ -531,6 +547,7 @@ def test_being_told_to_end_keeps_everything_so_far(
         assert f"pending: mjrec render {tmp_path}".encode() in errors
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_terminal_shows_a_bar(tmp_path: Path) -> None:
     """On a terminal there is a progress bar with episodes and steps."""
     reader, terminal = pty.openpty()

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from parts import parametrize
 
 from mjrec import commands
 from mjrec.commands.evaluate import evaluate
@@ -74,7 +75,7 @@ def test_json_is_one_object_and_nothing_else(run: Run) -> None:
     assert (said["episodes"], said["failed"]) == (2, 0)
 
 
-@pytest.mark.parametrize(("least", "status"), [("5", 0), ("5.5", 1)])
+@parametrize(("least", "status"), [("5", 0), ("5.5", 1)])
 def test_fail_under_fails_below_a_mean(run: Run, least: str, status: int) -> None:
     """The mean itself is enough."""
     found, out, _ = run(

@@ -5,21 +5,20 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from packed_runs import record_pendulum, the, unpacked
+from packed_runs import the, unpacked
 from recordings import videos_in
 
 from mjrec.commands import main
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(pendulums: Callable[..., Path]) -> Path:
     """Return a directory with two episodes, each with a video."""
-    directory = tmp_path_factory.mktemp("recorded")
-    record_pendulum(directory, 2, longest=3)
-    return directory
+    return pendulums(2, longest=3)
 
 
 def test_it_says_what_it_made(

@@ -414,6 +414,7 @@ def test_an_engine_says_what_this_process_would(tmp_path: Path, mjrec: Run) -> N
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.thorough
 def test_a_terminal_shows_a_bar_and_a_recording_becomes_a_video(tmp_path: Path) -> None:
     """With workers and OpenGL; two commands at once share the work."""
     env = gymnasium.make(

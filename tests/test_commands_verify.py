@@ -3,21 +3,22 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from packed_runs import record_pendulum, the
+from packed_runs import the
 
 import mjrec
 from mjrec.commands import main
 
 
 @pytest.fixture(scope="module")
-def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def packed(
+    pendulums: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A packed run of one episode."""
-    folder = tmp_path_factory.mktemp("packed")
-    record_pendulum(folder / "recorded", 1)
-    return mjrec.pack(folder / "recorded", folder / "run.zip")
+    return mjrec.pack(pendulums(1), tmp_path_factory.mktemp("packed") / "run.zip")
 
 
 def test_honest_run_is_verified(
@@ -31,6 +32,7 @@ def test_honest_run_is_verified(
     assert said.splitlines()[-1].startswith("Verified: ")
 
 
+@pytest.mark.thorough
 def test_everything_is_verified_by_default(
     packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,14 +2,12 @@
 """However a recording process ends, at whatever moment: what was complete is there.
 
 Each case ends a child process in one way at a random moment (seeded), and then loads,
-recovers and renders what it left. A sample of them is tried here; `MJREC_TEST_ALL=1`
-tries all.
+recovers and renders what it left. The default run tries one moment of a few of them.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import random
 import signal
 import subprocess
@@ -20,14 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from parts import parametrize
 from recordings import frames_of
 
 import mjrec
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.pending import recorded_episodes
 
-ALL = bool(os.environ.get("MJREC_TEST_ALL"))
-MOMENTS = 20 if ALL else 1
+MOMENTS = 20
 # From the moment in which the child has begun to record.
 LONGEST = 0.8
 
@@ -186,9 +184,18 @@ def _metadata(directory: Path, episode: int) -> dict[str, Any]:
     return dict(json.loads(path.read_text()))
 
 
-@pytest.mark.parametrize("moment", range(MOMENTS))
-@pytest.mark.parametrize("render", ["live", "deferred"])
-@pytest.mark.parametrize("way", WAYS)
+# Takes more than five seconds: a process is killed, and all of its videos are drawn.
+@pytest.mark.usefixtures("default_signals")
+@parametrize(
+    ("way", "render", "moment"),
+    [(w, r, m) for w in WAYS for r in ("live", "deferred") for m in range(MOMENTS)],
+    default=[
+        ("SIGKILL", "live", 0),
+        ("SIGKILL", "deferred", 0),
+        ("exception", "live", 0),
+    ],
+    part=pytest.mark.crashes,
+)
 def test_what_was_complete_is_there(
     way: str, render: str, moment: int, tmp_path: Path
 ) -> None:

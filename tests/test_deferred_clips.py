@@ -16,6 +16,7 @@ import gymnasium
 import numpy as np
 import pytest
 from full_disk import file_size_limit
+from parts import parametrize
 from recordings import manifest_of
 
 import mjrec
@@ -131,9 +132,8 @@ def check_same(live: Path, deferred: Path) -> None:
         }
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"camera": "track", "annotate": True, "max_fps": 50}]
-)
+# Takes more than five seconds: the same run live and deferred.
+@parametrize("options", [{"camera": "track", "annotate": True, "max_fps": 50}, {}])
 def test_pictures_are_those_that_were_drawn_live(
     options: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -150,7 +150,7 @@ def test_pictures_are_those_that_were_drawn_live(
 
 
 @pytest.mark.dm_control
-@pytest.mark.parametrize("annotate", [False, True])
+@parametrize("annotate", [False, True])
 def test_resets_that_change_the_model_are_seen(annotate: bool, tmp_path: Path) -> None:
     """Of a task whose target lies elsewhere in each episode."""
     options: dict[str, Any] = {
@@ -166,6 +166,7 @@ def test_resets_that_change_the_model_are_seen(annotate: bool, tmp_path: Path) -
     check_same(tmp_path / "live", tmp_path / "deferred")
 
 
+@pytest.mark.thorough
 def test_trajectories_and_clips_run_beside_each_other(tmp_path: Path) -> None:
     """Each sees all that changes in the model, whoever looks first."""
     clips: dict[str, Any] = {
@@ -187,6 +188,7 @@ def test_trajectories_and_clips_run_beside_each_other(tmp_path: Path) -> None:
             assert len(first.model_changes) == len(second.model_changes) > 0
 
 
+@pytest.mark.thorough
 def test_clips_wait_for_who_renders_them(tmp_path: Path) -> None:
     """Pending, with a log for each episode; afterwards there is the video alone."""
     record(
@@ -214,6 +216,7 @@ def test_clips_wait_for_who_renders_them(tmp_path: Path) -> None:
     assert not finish(tmp_path)
 
 
+@pytest.mark.thorough
 def test_clip_that_begins_with_an_episode_has_its_name(tmp_path: Path) -> None:
     """`video_length` with a schedule; so do Gymnasium's names."""
     record(
@@ -233,6 +236,7 @@ def test_clip_that_begins_with_an_episode_has_its_name(tmp_path: Path) -> None:
     assert (tmp_path / "rl-video-episode-1.mp4").exists()
 
 
+@pytest.mark.thorough
 def test_clip_that_runs_at_close_is_as_long_as_it_is(tmp_path: Path) -> None:
     """It says that it is shorter than asked for, and why."""
     record(tmp_path, hopper(), 7, step_trigger=lambda step: step == 4, video_length=99)
@@ -255,6 +259,7 @@ def test_running_clip_is_its_monitors_business(tmp_path: Path) -> None:
     assert look_at(tmp_path, key) is not None
 
 
+# Takes more than five seconds: a process is killed, and its clips are drawn.
 def test_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> None:
     """With all that was there a second before; and it is in the manifest then."""
     script = (
@@ -288,6 +293,7 @@ def test_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> No
     assert not mjrec.recover(tmp_path)
 
 
+@pytest.mark.thorough
 def test_clip_ends_where_its_pictures_would_lie(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

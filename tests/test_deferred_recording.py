@@ -20,6 +20,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.mujoco import MujocoEnv
+from parts import parametrize
 from processes import children
 from recordings import frames_in, manifest_of, metadata_of, videos_in
 from touch_grid import TOUCH_GRID
@@ -223,6 +224,7 @@ def test_end_of_the_interpreter_renders_nothing(tmp_path: Path) -> None:
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_while_waiting_leaves_the_rest_pending(
     tmp_path: Path, stuck_encoder: Path
 ) -> None:
@@ -397,7 +399,7 @@ def trajectories(directory: Path) -> list[str]:
     return sorted(path.name.split(".")[-2] for path in directory.glob("*.h5"))
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("options", "kept"),
     [
         ({}, [0, 1]),
@@ -446,6 +448,7 @@ def test_max_fps_takes_every_nth_step_and_the_last(
     assert len(frames_in(tmp_path, 0)) == 3
 
 
+# Takes more than five seconds: the same video by several numbers of workers.
 def test_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
     """One worker or three."""
     hashes = set()
@@ -459,6 +462,7 @@ def test_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
     assert len(hashes) == 1
 
 
+# Takes more than five seconds: frames enough for all workers.
 def test_one_episode_uses_all_workers(tmp_path: Path) -> None:
     """Its frames come in order, drawn by as many processes as were asked for."""
     with mjrec.Monitor(make("Hopper-v5"), tmp_path, workers=0) as env:
@@ -553,10 +557,27 @@ def test_video_recorder_tells_of_the_promise(pendulum: Any, tmp_path: Path) -> N
 # --- the simulation is left alone ----------------------------------------------------
 
 
+# What Gymnasium itself has loaded (glfw) is there before.
+OPENGL = """
+import pathlib
+def opengl():
+    maps = pathlib.Path("/proc/self/maps").read_text()
+    libraries = "libEGL", "libOSMesa", "libGL.", "libGLX", "libOpenGL", "libglfw"
+    loaded = {name.partition(".")[0] for name in sys.modules} & {"OpenGL", "glfw"}
+    return loaded | {name for name in libraries if name in maps}
+"""
+
+
 def test_no_opengl_in_the_simulation(tmp_path: Path) -> None:
-    """A process in which MuJoCo has none records all the same."""
-    done = run_script(SCRIPT + "env.close()\n", tmp_path, MUJOCO_GL="disable")
+    """A process in which MuJoCo has none records all the same, and loads none."""
+    bare, recorded = SCRIPT.split("env = mjrec")
+    code = (
+        f"{bare}{OPENGL}before = opengl()\nenv = mjrec{recorded}env.close()\n"
+        "print(sorted(opengl() - before))"
+    )
+    done = run_script(code, tmp_path, MUJOCO_GL="disable")
     assert done.returncode == 0, done.stderr
+    assert done.stdout == "[]\n"
     assert len(frames_in(tmp_path, 0)) == 2
 
 
@@ -577,6 +598,7 @@ def test_recording_does_not_disturb(env_id: str, tmp_path: Path) -> None:
     assert run(make(env_id)) == run(monitored(make(env_id), tmp_path, workers=0))
 
 
+@pytest.mark.thorough
 def test_global_random_state_is_left_alone(tmp_path: Path) -> None:
     """Python's and NumPy's, also where a library is loaded for the first time."""
     code = (
@@ -607,6 +629,7 @@ def test_same_pixels_as_the_environment_shows(tmp_path: Path) -> None:
 # --- where monitors live -------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_works_in_a_daemonic_process(tmp_path: Path) -> None:
     """Such as those of gymnasium's AsyncVectorEnv, which may have no children."""
     code = (

@@ -213,6 +213,7 @@ def test_pictures_are_those_of_physics_render(cheetah: Any, tmp_path: Path) -> N
     assert path.read_text().splitlines()[-1].endswith(expected)
 
 
+@pytest.mark.thorough
 def test_camera_by_name(cheetah: Any, tmp_path: Path) -> None:
     """A named camera is used and named; an unknown one lists the names there are."""
     with pytest.raises(UnknownName, match="side"):
@@ -223,6 +224,7 @@ def test_camera_by_name(cheetah: Any, tmp_path: Path) -> None:
     assert metadata_of(tmp_path, 0)["camera"] == "side"
 
 
+@pytest.mark.thorough
 def test_frame_larger_than_the_offscreen_buffer(cheetah: Any, tmp_path: Path) -> None:
     """It is drawn by a renderer of our own; the user's model stays as it was."""
     buffer = cheetah.physics.model.vis.global_.offwidth

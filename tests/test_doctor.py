@@ -56,6 +56,7 @@ def facts(healthy: subprocess.CompletedProcess[str]) -> dict[str, Any]:
     return parsed
 
 
+# Takes more than five seconds: each backend draws in a process of its own.
 def test_status_0_where_something_renders(
     healthy: subprocess.CompletedProcess[str], facts: dict[str, Any]
 ) -> None:
@@ -130,6 +131,7 @@ def test_an_unset_variable_is_a_note(facts: dict[str, Any]) -> None:
     assert "export MUJOCO_GL=egl" in note["fix"]
 
 
+@pytest.mark.thorough
 def test_status_1_where_nothing_may_render() -> None:
     """MUJOCO_GL=off: people read why, and what would render."""
     done = run_doctor(MUJOCO_GL="off")

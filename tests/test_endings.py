@@ -181,15 +181,18 @@ for seed in range(2):
 """
 
 
-def run(code: str, directory: Path) -> subprocess.CompletedProcess[str]:
+def run(
+    code: str, directory: Path, *, under: tuple[str, ...] = ()
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", PROGRAM + code, str(directory)],
+        [*under, sys.executable, "-c", PROGRAM + code, str(directory)],
         capture_output=True,
         text=True,
         check=False,
     )
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(
     ("code", "status", "reason"),
     [
@@ -218,6 +221,20 @@ def test_ways_of_ending_a_program(
         assert trajectory.facts["exception"]["message"] == "too far"
 
 
+def test_a_hangup_that_is_ignored_stays_ignored(tmp_path: Path) -> None:
+    """`nohup` asks for it; a SIGTERM closes the files all the same."""
+    done = run(
+        "os.kill(os.getpid(), signal.SIGHUP)\n"
+        "print('still here', flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n",
+        tmp_path,
+        under=("env", "--ignore-signal=HUP"),
+    )
+    assert done.stdout == "still here\n"
+    assert done.returncode == 143, done.stderr
+    assert done.stderr.count("2 videos pending: mjrec render") == 1
+
+
 def test_a_signal_whose_exception_is_lost_comes_again(tmp_path: Path) -> None:
     """Python ignores what finalisers raise, and there is no second SIGTERM."""
     done = run(
@@ -232,6 +249,7 @@ def test_a_signal_whose_exception_is_lost_comes_again(tmp_path: Path) -> None:
     assert "2 videos pending" in done.stderr
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_the_end_of_an_episode_that_is_interrupted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

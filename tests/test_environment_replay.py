@@ -23,6 +23,7 @@ from forged_episodes import (
 )
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from mujoco import rollout
+from parts import parametrize
 
 import mjrec
 from mjrec.environments.made_again import make_again, recorded_environment
@@ -131,7 +132,7 @@ def test_actions_with_names_are_put_together_again(tmp_path: Path) -> None:
     assert verdicts(checks)["pass"] == 8
 
 
-@pytest.mark.parametrize("parts", ["push", [["push"]], [["push", [7]]], [[1, [1]]]])
+@parametrize("parts", ["push", [["push"]], [["push", [7]]], [[1, [1]]]])
 def test_parts_that_do_not_fit_are_no_error(parts: Any, tmp_path: Path) -> None:
     """What a file says of its actions' parts is looked at."""
     directory = recorded(tmp_path, NAMED)

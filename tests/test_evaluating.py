@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluated_files import recorded_in
+from parts import parametrize
 from waiting import wait_until
 
 import mjrec
@@ -97,6 +98,7 @@ def test_results_do_not_depend_on_the_workers(reference: Path, tmp_path: Path) -
     assert contents(tmp_path / "two") == contents(reference)
 
 
+@pytest.mark.thorough
 def test_policies_that_draw_for_themselves_are_seeded(tmp_path: Path) -> None:
     """Also from generators that nobody has given them, whatever ran before."""
 
@@ -116,6 +118,7 @@ def test_what_takes_long_begins_first(reference: Path) -> None:
     assert begun_at[DOUBLE] < begun_at[PENDULUM]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("engine", [None, "local"])
 def test_workers_are_given_an_opengl_backend_that_works(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str | None
@@ -165,6 +168,7 @@ def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
         assert columns.video_prefix(index) == path.stem
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("engine", ["local", mjrec.LocalEngine(2)])
 def test_an_engine_changes_nothing(tmp_path: Path, engine: Any) -> None:
     """Results, trajectories and videos are those of a call without one."""
@@ -187,6 +191,7 @@ def manifest_videos(folder: Path) -> list[list[str]]:
     return [pair for manifest in manifests for pair in manifest["videos"]]
 
 
+@pytest.mark.thorough
 def test_videos_do_not_depend_on_what_was_run_before(tmp_path: Path) -> None:
     """The camera is placed anew in each episode, not once for an environment."""
     options: dict[str, Any] = {
@@ -223,6 +228,7 @@ def test_what_is_drawn_live_has_an_environment_for_each_episode() -> None:
     assert sizes == [("live", 1)] * 16 + [("later", 4)] * 4
 
 
+@pytest.mark.thorough
 def test_an_engine_draws_while_other_tasks_run(tmp_path: Path) -> None:
     """A task's videos come as soon as its episodes are over."""
     told: list[EvaluationProgress] = []
@@ -244,6 +250,7 @@ def test_an_engine_draws_while_other_tasks_run(tmp_path: Path) -> None:
     assert any(0 < each.videos < 12 for each in told)
 
 
+@pytest.mark.thorough
 def test_results_are_there_before_an_engine_has_drawn(tmp_path: Path) -> None:
     """What is killed or cancelled then has only videos left."""
 
@@ -266,6 +273,7 @@ def test_results_are_there_before_an_engine_has_drawn(tmp_path: Path) -> None:
     assert begun(tmp_path / "e") == 4
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [".mjrec.work", ".mjrec.evaluation.lock"])
 def test_what_an_engine_keeps_in_a_directory_is_nobodys(
     tmp_path: Path, name: str
@@ -284,6 +292,7 @@ def test_what_an_engine_keeps_in_a_directory_is_nobodys(
     assert len(run(tmp_path / "e", keep="best", resume=True).results) == 4
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("engine", [None, "local"])
 def test_without_opengl_videos_stay_pending(
     tmp_path: Path,
@@ -307,6 +316,7 @@ def test_without_opengl_videos_stay_pending(
     assert again.videos == [path]
 
 
+@pytest.mark.thorough
 def test_progress_is_told(tmp_path: Path) -> None:
     """Up to the end, and never backwards."""
     told: list[EvaluationProgress] = []
@@ -344,7 +354,7 @@ def local(kind: Any) -> Any:
     return kind
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("policy", "reason"),
     [(Faulty, "nan"), (Misshapen, "must give an action of box(-3.0")],
 )
@@ -365,6 +375,7 @@ def test_a_faulty_policy_fails_its_episodes_only(
     assert all(reason in str(each.failure).lower() for each in failed)
 
 
+@pytest.mark.thorough
 def test_a_policy_that_always_raises_leaves_results(tmp_path: Path) -> None:
     """They say so; there is no mean."""
     evaluation = run(tmp_path / "e", policy=local(raising), keep="best,failures:1")
@@ -401,6 +412,7 @@ class DiesAlways(DiesOnce):
         return np.zeros(self.shape)
 
 
+@pytest.mark.thorough
 def test_a_worker_that_dies_once_costs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -479,11 +491,12 @@ def kill_with_workers(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-@pytest.mark.parametrize(
+# Takes more than five seconds: three evaluations, one of them killed.
+@parametrize(
     ("moment", "engine"),
     [
-        ("running", ()),
         ("drawing", ()),
+        ("running", ()),
         ("running", ("engine",)),
         ("drawing", ("engine",)),
     ],
@@ -508,6 +521,7 @@ def test_a_killed_evaluation_goes_on_where_it_was(
     assert len(list(killed.glob("*/*.mp4"))) == 2
 
 
+@pytest.mark.thorough
 def test_what_is_interrupted_stays_to_be_resumed(tmp_path: Path) -> None:
     """Ctrl-C, or what else is raised, ends the workers and comes out."""
 
@@ -523,6 +537,7 @@ def test_what_is_interrupted_stays_to_be_resumed(tmp_path: Path) -> None:
     assert ended(tmp_path / "e") == 60
 
 
+@pytest.mark.thorough
 def test_more_may_be_asked_for(reference: Path, tmp_path: Path) -> None:
     """More tasks, seeds and episodes; what was done is not done again."""
     run(tmp_path / "e", episodes=1)
@@ -531,6 +546,7 @@ def test_more_may_be_asked_for(reference: Path, tmp_path: Path) -> None:
     assert contents(tmp_path / "e") == contents(reference)
 
 
+@pytest.mark.thorough
 def test_nothing_is_run_when_all_is_done(reference: Path, tmp_path: Path) -> None:
     """The results are written again, the same."""
     run(tmp_path / "e", tasks=[PENDULUM, DOUBLE], resume=True)
@@ -648,6 +664,7 @@ gymnasium.register("FlatWorld-v0", FlatWorld)
 """
 
 
+@pytest.mark.thorough
 def test_pictures_that_are_live_cannot_be_chosen_by_returns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -669,6 +686,7 @@ def test_pictures_that_are_live_cannot_be_chosen_by_returns(
     assert evaluation.plan.tasks[0].folder == "flat_world%3AFlatWorld-v0"
 
 
+@pytest.mark.thorough
 @pytest.mark.dm_control
 def test_the_suite_has_a_scale_and_its_own_protocol(tmp_path: Path) -> None:
     """One stream for each task and seed; returns over steps are scores."""
@@ -687,6 +705,7 @@ def test_the_suite_has_a_scale_and_its_own_protocol(tmp_path: Path) -> None:
         run(tmp_path / "e", **options, episodes=3, resume=True)
 
 
+@pytest.mark.thorough
 def test_the_process_that_hands_out_loads_no_simulator(tmp_path: Path) -> None:
     """It needs no OpenGL, and a policy's memory is the workers'."""
     code = (

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors of every environment there is: a few here, all with MJREC_TEST_ALL=1."""
+"""Monitors of every environment there is."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
-import os
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import av
 import gymnasium
 import pytest
+from parts import parametrize
 
 from mjrec.sessions import Session, record_session
 
@@ -21,7 +21,6 @@ GYMNASIUM = sorted(
     for env_id, spec in gymnasium.registry.items()
     if "gymnasium.envs.mujoco" in str(spec.entry_point) and env_id.endswith("-v5")
 )
-FEW = {"HalfCheetah-v5", "Humanoid-v5", "dm_control/cheetah-run", "dm_control/dog-run"}
 
 
 def suite_tasks() -> list[str]:
@@ -30,12 +29,6 @@ def suite_tasks() -> list[str]:
     from dm_control import suite
 
     return [f"dm_control/{domain}-{task}" for domain, task in suite.ALL_TASKS]
-
-
-def chosen(names: list[str]) -> list[str]:
-    if os.environ.get("MJREC_TEST_ALL") == "1":
-        return names
-    return [name for name in names if name in FEW]
 
 
 def record(name: str, directory: Path, *, steps: int = 3) -> dict[str, Any]:
@@ -69,7 +62,9 @@ def test_all_of_gymnasiums_are_known() -> None:
     assert len(GYMNASIUM) == 11
 
 
-@pytest.mark.parametrize("env_id", chosen(GYMNASIUM))
+@parametrize(
+    "env_id", GYMNASIUM, default=("HalfCheetah-v5",), part=pytest.mark.environments
+)
 def test_gymnasium(env_id: str, tmp_path: Path) -> None:
     """Recorded in real time, with something to see."""
     metadata = record(env_id, tmp_path)
@@ -83,7 +78,12 @@ def test_gymnasium(env_id: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.dm_control
-@pytest.mark.parametrize("name", chosen(suite_tasks()))
+@parametrize(
+    "name",
+    suite_tasks(),
+    default=("dm_control/cheetah-run",),
+    part=pytest.mark.environments,
+)
 def test_dm_control(name: str, tmp_path: Path) -> None:
     """Recorded in real time, with something to see."""
     from dm_control import suite

@@ -81,6 +81,7 @@ def labels(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return written
 
 
+@pytest.mark.thorough
 def test_pictures_of_a_trajectory_are_those_rendered(
     trajectory: Path, labels: list[str]
 ) -> None:
@@ -136,6 +137,7 @@ def test_metadata_that_do_not_fit_are_ignored(
     assert labels == ["0.00 s", "0.50 s"]
 
 
+@pytest.mark.thorough
 def test_a_trajectory_is_drawn_again_at_any_size(trajectory: Path) -> None:
     """From another camera, too: sharper than a video can be."""
     strip = film_strip(

@@ -370,6 +370,7 @@ def test_any_damaged_log(tmp_path: Path, sound_log: bytes, damage: Any) -> None:
         assert (found.rewards == 0.5).all()
 
 
+@pytest.mark.thorough
 @FEWER
 @given(data=st.data())
 def test_any_log_that_is_read_is_finished(

@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from parts import parametrize
 
 import mjrec
 from mjrec.commands import main
@@ -60,6 +61,7 @@ def columns(*rewards: float, failed: tuple[int, ...] = ()) -> EpisodeColumns:
     )
 
 
+# Takes more than five seconds: its fixture records what all tests of the file read.
 def test_a_monitor_directory_is_one_task(recorded: Path) -> None:
     """Its episodes stand in the order of time, its videos know theirs."""
     contents = gather(recorded)
@@ -86,7 +88,7 @@ def test_videos_say_what_their_metadata_say(recorded: Path) -> None:
     assert {*gather(recorded).videos[0].roles} <= {"best", "median", "worst"}
 
 
-@pytest.mark.parametrize("number", [0, 1])
+@parametrize("number", [0, 1])
 def test_the_command_renders_a_video_again(
     recorded: Path, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,7 +112,7 @@ def test_live_videos_have_no_command(corridor: Any, tmp_path: Path) -> None:
     assert any("live" in note for note in video.notes)
 
 
-@pytest.mark.parametrize("version", sorted(p.name for p in GYM.iterdir()))
+@pytest.mark.parametrize("version", sorted(p.name for p in GYM.iterdir() if p.is_dir()))
 def test_recordings_of_every_gym_are_gathered(version: str) -> None:
     """Each of its directories is found one level below, with all of its episodes."""
     contents = gather(GYM / version)
@@ -525,6 +527,7 @@ def test_gathering_needs_no_simulator_no_opengl_and_no_ffmpeg(recorded: Path) ->
     assert done.stdout.split() == ["2", "4"]
 
 
+@pytest.mark.thorough
 def test_many_episodes_take_little_memory(tmp_path: Path) -> None:
     """A hundred bytes each: a million take a fifth of what is promised."""
     count = 10_000

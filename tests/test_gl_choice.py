@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from parts import parametrize
 
 from mjrec.gl import probe
 
@@ -70,7 +71,7 @@ def test_egl_is_tried_first() -> None:
     assert answer_of("answer = mjrec.use_gl()") == "egl egl egl"
 
 
-@pytest.mark.parametrize("text", ["egl", " EGL "])
+@parametrize("text", ["egl", " EGL "])
 def test_the_argument_in_any_spelling(text: str) -> None:
     """What is set is the spelling that every program understands."""
     assert answer_of(f"answer = mjrec.use_gl({text!r})") == "egl egl egl"
@@ -87,7 +88,7 @@ def test_the_argument_before_the_variable() -> None:
     assert answer_of(code, MUJOCO_GL="nonsense") == "egl egl egl"
 
 
-@pytest.mark.parametrize("text", ["", "on"])
+@parametrize("text", ["", "on"])
 def test_a_variable_that_names_no_backend(text: str) -> None:
     """Rendering is on, by which backend is left open."""
     assert answer_of("answer = mjrec.use_gl()", MUJOCO_GL=text) == "egl egl egl"

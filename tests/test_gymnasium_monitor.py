@@ -19,6 +19,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from parts import parametrize
 from recordings import (
     frames_in,
     journal_of,
@@ -100,6 +101,7 @@ def test_metadata_says_what_is_in_the_video(
     assert metadata["versions"].keys() >= {"mjrec", "mujoco", "gymnasium", "python"}
 
 
+@pytest.mark.thorough
 def test_metadata_names_renderer_and_camera(
     halfcheetah: Any, tmp_path: Path, play: Any
 ) -> None:
@@ -548,7 +550,7 @@ for _ in range(3):
 """
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("how", "status"),
     [("", 0), ("sys.exit(3)", 3), ("raise RuntimeError('on purpose')", 1)],
     ids=["end", "exit", "exception"],
@@ -790,6 +792,7 @@ def test_frame_larger_than_the_offscreen_buffer(
     assert (model.vis.global_.offheight, model.vis.global_.offwidth) == buffer
 
 
+@pytest.mark.thorough
 def test_another_size_shows_the_same_scene(halfcheetah: Any, tmp_path: Path) -> None:
     """With no camera asked for it is the environment's own."""
     with mjrec.Monitor(halfcheetah, tmp_path / "own") as env:
@@ -837,6 +840,7 @@ def record_steps(env: Any, steps: int = 3) -> None:
         env.step(env.action_space.sample())
 
 
+@pytest.mark.thorough
 def test_environments_that_take_turns_are_drawn_each_in_its_own_context(
     tmp_path: Path,
 ) -> None:
@@ -861,6 +865,7 @@ def test_environments_that_take_turns_are_drawn_each_in_its_own_context(
         assert first_hashes(tmp_path / f"{name}2") == first_hashes(tmp_path / name)
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(
     os.environ["MUJOCO_GL"] != "egl",
     reason="only EGL can make a context current again that somebody else made",

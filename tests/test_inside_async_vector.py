@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from gymnasium.vector import AsyncVectorEnv
+from parts import parametrize
 from vector_environments import DISABLED, NEXT_STEP, SAME_STEP, hashes_at, play
 from waiting import wait_until
 
@@ -60,7 +61,7 @@ def monitored_hopper(directory: Path) -> Callable[[], Any]:
     return make
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("context", "mode"),
     [("spawn", NEXT_STEP), ("forkserver", SAME_STEP), ("fork", DISABLED)],
 )
@@ -94,6 +95,7 @@ def test_many_begin_at_the_same_time(make_corridor: Any, tmp_path: Path) -> None
     assert list(lengths) == [3] * 12
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("context", "ending"), [("fork", "kill"), ("spawn", "kill"), ("fork", "raise")]
 )

@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium
 import pytest
 from full_disk import file_size_limit
+from parts import parametrize
 from recordings import frames_in, journal_of, manifest_of, metadata_of, videos_in
 
 import mjrec
@@ -342,7 +343,7 @@ class Listener(Tracker):
         self.lengths.append(video.episode.length)
 
 
-@pytest.mark.parametrize("kind", ["live", "deferred"])
+@parametrize("kind", ["live", "deferred"])
 def test_trackers_are_told_of_the_chosen_only(tmp_path: Path, kind: str) -> None:
     """Which is when they are chosen."""
     listener = Listener()
@@ -398,7 +399,7 @@ def confused(episodes: Sequence[Any]) -> list[int]:
     return [len(episodes)]
 
 
-@pytest.mark.parametrize("workers", [0, 1])
+@parametrize("workers", [0, 1])
 def test_function_that_cannot_choose_loses_nothing(
     tmp_path: Path, workers: int
 ) -> None:
@@ -486,7 +487,7 @@ def test_interrupted_choice_is_taken_up_again(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*"))
 
 
-@pytest.mark.parametrize("on_error", ["warn", "raise"])
+@parametrize("on_error", ["warn", "raise"])
 def test_full_disk_at_the_end_loses_no_chosen_video(
     tmp_path: Path, on_error: str
 ) -> None:
@@ -542,7 +543,7 @@ def killed_in_mid_run(directory: Path, kind: str) -> None:
         process.send_signal(signal.SIGKILL)
 
 
-@pytest.mark.parametrize("recovers", [True, False])
+@parametrize("recovers", [True, False])
 def test_killed_run_leaves_its_candidates_pending(
     tmp_path: Path, recovers: bool
 ) -> None:
@@ -578,6 +579,7 @@ def test_killed_run_leaves_its_live_candidates(tmp_path: Path) -> None:
     assert metadata_of(tmp_path, 3)["selection"]["decided"] is False
 
 
+@pytest.mark.thorough
 def test_renderer_beside_an_open_monitor_leaves_candidates_alone(
     tmp_path: Path,
 ) -> None:

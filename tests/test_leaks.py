@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import pytest
+from parts import parametrize
 from processes import children
 
 from mjrec import Monitor, load_results
@@ -70,7 +70,8 @@ def run(monitor: Any, episodes: int) -> None:
             monitor.step(monitor.action_space.sample() * 0)
 
 
-@pytest.mark.parametrize("workers", [0, 1])
+# Takes more than five seconds: a thousand episodes, so that what grows is seen.
+@parametrize("workers", [1, 0])
 def test_recorded_episodes_leave_nothing(workers: int, tmp_path: Path) -> None:
     """Memory, files, threads and processes; each episode with its trajectory."""
     env = gymnasium.make(
@@ -104,11 +105,12 @@ def test_recorded_episodes_leave_nothing(workers: int, tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("*.mp4"))) == (EPISODES // 200 if workers else 0)
 
 
+# Takes more than five seconds: an encoder for each episode.
+@parametrize("count", [60, EPISODES])
 def test_live_episodes_leave_nothing(
-    tmp_path: Path, make_corridor: Callable[..., Any]
+    count: int, tmp_path: Path, make_corridor: Callable[..., Any]
 ) -> None:
-    """Each has an encoder of its own; all 1000 of them with MJREC_TEST_ALL=1."""
-    count = EPISODES if os.environ.get("MJREC_TEST_ALL") else 60
+    """Each has an encoder of its own."""
     before = held()
     monitor = Monitor(make_corridor(3, size=(16, 16)), tmp_path, lambda _: True)
     run(monitor, count // 3)

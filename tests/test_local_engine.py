@@ -169,6 +169,7 @@ def test_workers_are_one_for_each_cpu() -> None:
 # GPUs
 
 
+@pytest.mark.thorough
 def test_workers_share_the_gpus_that_there_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -187,6 +188,7 @@ def test_workers_share_the_gpus_that_there_are(
     assert repr(engine) == "LocalEngine(workers=2, gpus=0.5)"
 
 
+@pytest.mark.thorough
 def test_rendering_in_software_on_a_given_gpu_is_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -200,6 +202,7 @@ def test_rendering_in_software_on_a_given_gpu_is_a_warning(
     assert len([text for text in caplog.messages if "GPU 3" in text]) == 1
 
 
+@pytest.mark.thorough
 def test_a_gpu_that_is_required_and_is_not_there_is_an_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -409,6 +412,14 @@ def test_an_entry_that_there_is_not(entry: str) -> None:
             outcomes(run)
 
 
+def test_a_worker_that_is_told_to_end_while_it_begins() -> None:
+    """It ends as any other does, and reports no fault."""
+    with begun(make="make_and_be_told_to_end") as run:
+        submit(run, "a", do="echo")
+        with pytest.raises(Error, match=r"No worker can begin.* ended with status 143"):
+            outcomes(run)
+
+
 def test_workers_that_end_as_soon_as_they_begin(tmp_path: Path) -> None:
     """Two of them are enough."""
     with begun(make="make_and_die", begun=str(tmp_path / "begun")) as run:
@@ -566,6 +577,7 @@ def test_forgotten_runs_end(tmp_path: Path) -> None:
     wait_for_end(pid)
 
 
+@pytest.mark.thorough
 def test_fifty_runs_leave_nothing_open() -> None:
     """No descriptor, and no process."""
 
@@ -668,6 +680,7 @@ print(next(run.results()).value["pid"])
     wait_for_end(int(done.stdout))
 
 
+@pytest.mark.thorough
 def test_a_killed_parent_leaves_no_workers(tmp_path: Path) -> None:
     """They close what they are at, although the parent's child has its files too.
 

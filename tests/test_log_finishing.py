@@ -100,6 +100,7 @@ def test_a_process_that_dies_is_told(
     assert log.exists()
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
 def test_a_process_that_hangs_is_ended(
     tmp_path: Path,

@@ -50,6 +50,7 @@ def check(directory: Path) -> None:
     assert not list(directory.glob("*.part*"))
 
 
+@pytest.mark.thorough
 def test_eight_processes_with_the_same_number(tmp_path: Path) -> None:
     """As in eight containers: no file is overwritten, and all results are merged."""
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]

@@ -19,6 +19,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from parts import parametrize
 from PIL import Image
 
 from mjrec.errors import FileNotWritten, UnreadableFile
@@ -322,7 +323,7 @@ def test_a_plain_foreign_zip_is_compiled(directory: Path) -> None:
 SECRET = "<mujoco><include file='{}'/></mujoco>"
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("members", "said"),
     [
         ({"source/main.xml": SECRET.format("/secret.xml")}, "plain relative"),
@@ -348,6 +349,7 @@ SECRET = "<mujoco><include file='{}'/></mujoco>"
         ({"contents.json": "[]", "source/main.xml": SPHERE}, "format"),
         ({"contents.json": '{"format": 2}'}, "format"),
     ],
+    default=4,
 )
 def test_a_hostile_zip_reads_and_writes_nothing_elsewhere(
     directory: Path, members: dict[str, str | bytes], said: str

@@ -447,6 +447,7 @@ def test_pictures_of_a_strangers_recording_need_a_word(theirs: Ride) -> None:
     np.testing.assert_array_equal(frames, theirs.frames)
 
 
+@pytest.mark.thorough
 def test_the_command_takes_the_word(
     theirs: Ride, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -490,6 +491,7 @@ def test_sources_show_what_the_environment_showed(
     np.testing.assert_array_equal(again.geom_size, model.geom_size)
 
 
+@pytest.mark.thorough
 @pytest.mark.dm_control
 def test_composers_sources_show_what_the_task_showed(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

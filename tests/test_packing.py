@@ -36,11 +36,9 @@ STATED = {
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(pendulums: Callable[..., Path]) -> Path:
     """Return a directory with three episodes, of which two have a video."""
-    directory = tmp_path_factory.mktemp("recorded")
-    record_pendulum(directory, 3)
-    return directory
+    return pendulums(3)
 
 
 @pytest.fixture(scope="module")
@@ -353,6 +351,7 @@ def test_some_episodes_can_be_chosen(
     assert videos_in(recorded) == [0, 1]
 
 
+@pytest.mark.thorough
 def test_models_of_other_episodes_are_left_out(tmp_path: Path) -> None:
     """What nothing in the archive refers to would be called an extra file."""
     directory = tmp_path / "runs"
@@ -407,6 +406,7 @@ def _largest_video(archive: Path) -> int:
         return max(i.file_size for i in packed.infolist() if i.filename[-4:] == ".mp4")
 
 
+@pytest.mark.thorough
 def test_videos_are_drawn_smaller_for_a_limit(tmp_path: Path) -> None:
     """All frames of them, with hashes of their own; the recording stays as it was."""
     directory = tmp_path / "runs"

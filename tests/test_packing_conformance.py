@@ -3,12 +3,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,27 +13,13 @@ from packed_runs import record_pendulum, unpacked
 
 import mjrec
 
-# 0.13 needs no network but for the context.
-PACKAGES = ("roc-validator==0.13.0", "rocrate==0.16.0")
 
-
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def validator() -> Path:
     """Return the Python of an environment that holds the validator."""
-    tag = f"cp{sys.version_info.major}{sys.version_info.minor}"
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    home = cache / "mjrec-tests" / f"roc-validator-0.13.0-{tag}"
-    home.parent.mkdir(parents=True, exist_ok=True)
-    with home.with_suffix(".lock").open("w") as lock:
-        # Several test processes make it once.
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (home / "complete").exists():
-            shutil.rmtree(home, ignore_errors=True)
-            subprocess.run([sys.executable, "-m", "venv", home], check=True)
-            pip = [home / "bin/python", "-m", "pip", "install", "--quiet"]
-            subprocess.run([*pip, *PACKAGES], check=True, timeout=280)
-            (home / "complete").touch()
-    return home / "bin/python"
+    if "MJREC_TEST_CRATE" not in os.environ:
+        pytest.skip("no environment with roc-validator: scripts/test --all makes one")
+    return Path(os.environ["MJREC_TEST_CRATE"])
 
 
 def issues(validator: Path, crate: Path) -> list[str]:
@@ -56,7 +39,7 @@ def issues(validator: Path, crate: Path) -> list[str]:
     return lines
 
 
-@pytest.mark.legacy  # an environment of its own, too
+@pytest.mark.crate_validator
 @pytest.mark.parametrize("stated", [True, False])
 def test_the_validator_takes_the_crate(
     stated: bool, validator: Path, tmp_path: Path

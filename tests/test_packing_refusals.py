@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 from full_disk import file_size_limit
-from packed_runs import record_pendulum, the, unpacked
+from packed_runs import the, unpacked
+from parts import parametrize
 from processes import children
 from trajectories_by_hand import write_finished, write_log, write_pending_manifest
 
@@ -24,11 +25,9 @@ from mjrec.rendering.progress import Progress
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(pendulums: Callable[..., Path]) -> Path:
     """Return a directory with two episodes, each with a video."""
-    directory = tmp_path_factory.mktemp("recorded")
-    record_pendulum(directory, 2, longest=3)
-    return directory
+    return pendulums(2, longest=3)
 
 
 @pytest.fixture
@@ -300,7 +299,7 @@ def test_live_videos_are_never_encoded_again(
     assert the(runs, "*.mp4").read_bytes() == video
 
 
-@pytest.mark.parametrize("case", ["0.7.4/plain", "0.21.0/two_monitors", "0.12.1/text"])
+@parametrize("case", ["0.7.4/plain", "0.21.0/two_monitors", "0.12.1/text"])
 def test_what_gym_wrote_can_be_packed(case: str, tmp_path: Path) -> None:
     """It has less to say, and nothing of it is wrong; episodes cannot be chosen."""
     directory = Path(__file__).parent / "data/gym" / case

@@ -25,6 +25,7 @@ from forged_episodes import (
     unchecked,
     verdicts,
 )
+from parts import parametrize
 
 from mjrec.evidence.verification import Verdict
 from mjrec.formats.trajectory import ModelChange
@@ -67,7 +68,7 @@ def forged(pendulum: Path, tmp_path: Path) -> Path:
     return copied(pendulum, tmp_path / "run")
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("env_id", "kind"),
     [
         ("InvertedPendulum-v5", np.float32),
@@ -75,6 +76,7 @@ def forged(pendulum: Path, tmp_path: Path) -> Path:
         ("HalfCheetah-v5", np.float64),
         ("Ant-v5", np.float32),
     ],
+    default=2,
 )
 def test_an_honest_recording_passes(env_id: str, kind: type, tmp_path: Path) -> None:
     """All of a Gymnasium environment passes, whatever float the actions were."""
@@ -101,7 +103,7 @@ def test_episodes_that_were_not_seeded_pass(tmp_path: Path) -> None:
     assert verdicts(physics_of(directory)) == {"pass": 9}
 
 
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Reacher-v5", "Humanoid-v5"])
+@parametrize("env_id", ["HalfCheetah-v5", "Reacher-v5", "Humanoid-v5"])
 def test_an_episode_that_was_never_seeded_goes_on_from_its_first_state(
     env_id: str, tmp_path: Path
 ) -> None:
@@ -117,6 +119,7 @@ def test_an_episode_that_was_never_seeded_goes_on_from_its_first_state(
     assert "give reset(seed=...)" in start.reason
 
 
+@pytest.mark.thorough
 def test_a_seed_that_is_taken_out_hides_no_reward(forged: Path) -> None:
     """Nor does one elsewhere, where each step begins at a recorded state."""
     forge(episode(forged), rewards=lambda r: r.__setitem__(3, 1e3), facts=NO_SEED)
@@ -125,6 +128,7 @@ def test_a_seed_that_is_taken_out_hides_no_reward(forged: Path) -> None:
     assert failed(physics_of(forged)) == ["rewards"]
 
 
+@pytest.mark.thorough
 @needs_dm_control
 def test_a_random_state_that_is_taken_out_hides_no_reward(tmp_path: Path) -> None:
     """Of the suite's tasks whose resets draw nothing that is not in the state."""
@@ -135,6 +139,7 @@ def test_a_random_state_that_is_taken_out_hides_no_reward(tmp_path: Path) -> Non
     assert failed(physics_of(directory)) == ["rewards"]
 
 
+@pytest.mark.thorough
 @needs_dm_control
 def test_a_target_that_was_drawn_is_not_guessed(tmp_path: Path) -> None:
     """Where it stands in the model alone, nobody is accused."""
@@ -146,7 +151,7 @@ def test_a_target_that_was_drawn_is_not_guessed(tmp_path: Path) -> None:
     assert "neither a seed nor" in unchecked(checks)[-1].reason
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("name", "verdict"),
     [
         ("Humanoid-v5", Verdict.FAIL),
@@ -181,7 +186,7 @@ def test_what_an_environment_was_made_with_is_said(tmp_path: Path) -> None:
 
 
 @needs_dm_control
-@pytest.mark.parametrize(
+@parametrize(
     ("domain", "task"),
     [
         ("cartpole", "swingup"),
@@ -385,6 +390,7 @@ def test_a_tolerance_is_kept_step_by_step(
         assert "another machine" in steps.reason
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("env_id", ["Ant-v5", "HalfCheetah-v5"])
 def test_steps_begin_at_recorded_states_on_another_machine(
     env_id: str, tmp_path: Path
@@ -402,6 +408,7 @@ def test_steps_begin_at_recorded_states_on_another_machine(
     assert any("begins at the recorded state" in check.reason for check in checks)
 
 
+@pytest.mark.thorough
 @needs_dm_control
 def test_the_suite_goes_on_from_recorded_states(tmp_path: Path) -> None:
     """What dm_control computes before a step is there when it is put into a state."""
@@ -414,7 +421,7 @@ def test_the_suite_goes_on_from_recorded_states(tmp_path: Path) -> None:
     assert failed(physics_of(directory)) == []
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("error", "verdict"),
     [
         (1e-12, Verdict.PASS),
@@ -435,6 +442,7 @@ def test_another_mujoco_is_named(error: float, verdict: Verdict, forged: Path) -
     assert "recorded with mujoco 2.9" in steps.reason
 
 
+@pytest.mark.thorough
 def test_contacts_that_may_jump_are_no_accusation(tmp_path: Path) -> None:
     """On another machine a box may touch at another corner."""
     boxes = BALL.replace('size=".1"/>', 'type="box" size=".1 .1 .1"/>', 1)
@@ -481,6 +489,7 @@ def test_without_sources_and_environment_nothing_is_proved(forged: Path) -> None
     assert verdicts(checks) == {"not checkable": 4}
 
 
+@pytest.mark.thorough
 def test_a_forged_state_fails_without_its_environment(forged: Path) -> None:
     """That an environment cannot be made again is no excuse."""
     said = {"framework": "gymnasium", "id": "Nobody-v0", "kwargs": {}, "wrappers": []}

@@ -18,6 +18,7 @@ import gymnasium
 import numpy as np
 import pytest
 from forged_videos import drawn, forge, metadata, say, video
+from parts import parametrize
 
 import mjrec
 from conftest import Corridor, run_episodes
@@ -114,6 +115,7 @@ def test_an_honest_run_passes(honest: Path) -> None:
     assert checks[1, ALIKE].figures["psnr"] > 36
 
 
+@pytest.mark.thorough
 def test_progress_is_told(honest: Path) -> None:
     """Frame by frame, to the end."""
     told: list[tuple[int, int]] = []
@@ -123,6 +125,7 @@ def test_progress_is_told(honest: Path) -> None:
     assert told[-1] == (14, 14)
 
 
+@pytest.mark.thorough
 def test_nothing_is_written_into_the_recordings(honest: Path, tmp_path: Path) -> None:
     """Whatever is made again is made elsewhere."""
 
@@ -143,6 +146,7 @@ def one_pixel(frames: list[Any]) -> list[Any]:
     return changed
 
 
+# Takes more than five seconds: all videos are drawn again.
 def test_one_pixel_changed_with_every_hash_made_to_fit(run: Path) -> None:
     """The drawn picture has another hash, and is encoded to another file."""
     forge(video(run), one_pixel(drawn(run)))
@@ -152,13 +156,14 @@ def test_one_pixel_changed_with_every_hash_made_to_fit(run: Path) -> None:
     assert verdicts(run, 1) == [PASS] * 5
 
 
+@pytest.mark.thorough
 def test_one_pixel_changed_in_the_video_alone(alone: Path) -> None:
     """The frames' hashes are true, and the file is not what they are encoded to."""
     forge(video(alone), one_pixel(drawn(alone)), hashes=False)
     assert verdicts(alone)[:4] == [PASS, PASS, PASS, FAIL]
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "change",
     [lambda f: f[:2] + f[3:], lambda f: [*f[:2], f[2], *f[2:]], lambda f: f[:-1]],
     ids=["dropped", "doubled", "last dropped"],
@@ -172,6 +177,7 @@ def test_a_frame_dropped_or_doubled(alone: Path, change: Callable[..., Any]) -> 
     assert "its trajectory has 7 pictures" in checks[0, DRAWN].reason
 
 
+@pytest.mark.thorough
 def test_a_frame_in_the_place_of_another(alone: Path) -> None:
     """One is dropped and another doubled, so that their number stays."""
     frames = drawn(alone)
@@ -181,6 +187,7 @@ def test_a_frame_in_the_place_of_another(alone: Path) -> None:
     assert checks[0, ENCODED].verdict is FAIL
 
 
+@pytest.mark.thorough
 def test_videos_swapped_between_episodes(run: Path) -> None:
     """Both show another episode than their names say."""
     for ending in (".mp4", ".framehash", ".meta.json"):
@@ -192,6 +199,7 @@ def test_videos_swapped_between_episodes(run: Path) -> None:
         assert verdicts(run, episode) == [PASS, PASS, FAIL, FAIL, FAIL]
 
 
+@pytest.mark.thorough
 def test_a_video_relabelled_as_another_episodes(run: Path) -> None:
     """The best episode's video as that of the first, its own metadata kept."""
     for ending in (".mp4", ".framehash"):
@@ -203,6 +211,7 @@ def test_a_video_relabelled_as_another_episodes(run: Path) -> None:
     assert verdicts(run, 1) == [PASS] * 5
 
 
+@pytest.mark.thorough
 def test_who_names_another_driver_is_left_with_little_room(alone: Path) -> None:
     """What the driver is said to have been changes no verdict about a sprite."""
     frames = [frame.copy() for frame in drawn(alone)]
@@ -217,6 +226,7 @@ def test_who_names_another_driver_is_left_with_little_room(alone: Path) -> None:
     assert checks[0, ALIKE].figures["worst_frame"] == 4
 
 
+@pytest.mark.thorough
 @needs_mesa
 def test_the_same_software_on_another_cpu_may_differ_by_roundings(alone: Path) -> None:
     """What a CPU of another maker draws has other bits, and is no forgery."""
@@ -231,6 +241,7 @@ def test_the_same_software_on_another_cpu_may_differ_by_roundings(alone: Path) -
     assert verdicts(alone) == [PASS, PASS, OPEN, OPEN, FAIL]
 
 
+@pytest.mark.thorough
 @needs_mesa
 def test_an_honest_video_that_another_driver_drew(
     alone: Path, monkeypatch: pytest.MonkeyPatch
@@ -248,6 +259,7 @@ def test_an_honest_video_that_another_driver_drew(
     assert checks[0, ALIKE].figures["unnoticed_square"] < 4
 
 
+@pytest.mark.thorough
 def test_a_shadow_of_another_driver_is_no_forgery(alone: Path) -> None:
     """Where only the light differs nobody can tell, in a small part of a picture."""
     for side, verdict in ((10, OPEN), (16, FAIL)):
@@ -261,6 +273,7 @@ def test_a_shadow_of_another_driver_is_no_forgery(alone: Path) -> None:
         assert ("in shadow" in checks[0, ALIKE].reason) is (verdict is OPEN)
 
 
+@pytest.mark.thorough
 def test_a_shadow_of_the_same_driver_is_a_forgery(alone: Path) -> None:
     """What drew the pictures draws the same shadows again."""
     frames = [frame.copy() for frame in drawn(alone)]
@@ -269,6 +282,7 @@ def test_a_shadow_of_the_same_driver_is_a_forgery(alone: Path) -> None:
     assert verdicts(alone)[ALIKE] is FAIL
 
 
+@pytest.mark.thorough
 @needs_mesa
 def test_another_pose_is_noticed_with_another_driver(
     run: Path, monkeypatch: pytest.MonkeyPatch
@@ -279,6 +293,7 @@ def test_another_pose_is_noticed_with_another_driver(
     assert verdicts(run) == [PASS, PASS, OPEN, OPEN, FAIL]
 
 
+@pytest.mark.thorough
 def test_an_honest_video_of_another_encoder(run: Path) -> None:
     """Other bytes of the same pictures pass by their likeness, with the reason."""
     arguments = metadata(video(run))["encoder_version"]
@@ -308,6 +323,7 @@ def test_a_command_line_of_the_archive_is_not_run(alone: Path, tmp_path: Path) -
     assert not marker.exists()
 
 
+@pytest.mark.thorough
 def test_a_sample_is_drawn_from_its_seed(alone: Path) -> None:
     """So many frames of each video, the same each time; the rest is said."""
     checks = found(alone, sample=2, seed=5)
@@ -322,11 +338,13 @@ def test_a_sample_is_drawn_from_its_seed(alone: Path) -> None:
     assert found(alone, sample=2, seed=6) != checks
 
 
+@pytest.mark.thorough
 def test_a_sample_of_all_frames_is_no_sample(alone: Path) -> None:
     """Also where more are asked for than there are."""
     assert verdicts(alone, sample=100) == [PASS] * 5
 
 
+@pytest.mark.thorough
 def test_the_frame_that_differs_most_is_shown(alone: Path, tmp_path: Path) -> None:
     """As drawn, as shipped, and how they differ."""
     frames = [frame.copy() for frame in drawn(alone)]
@@ -338,6 +356,7 @@ def test_the_frame_that_differs_most_is_shown(alone: Path, tmp_path: Path) -> No
     assert checks[0, ALIKE].figures["worst_frame"] == 4
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("options", "videos"),
     [
@@ -358,6 +377,7 @@ def test_every_kind_of_video_is_drawn_again(
     assert {check.verdict for check in checks} == {PASS}
 
 
+@pytest.mark.thorough
 def test_a_video_rendered_again_beside_the_original(alone: Path) -> None:
     """It shows what its metadata says, of the recorded pictures."""
     from mjrec.rendering.again import Variant, render_again
@@ -369,6 +389,7 @@ def test_a_video_rendered_again_beside_the_original(alone: Path) -> None:
     assert [check.verdict for check in checks] == [PASS] * 5
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "options",
     [{}, {"camera": [None, "track"], "tiled": True}, {"annotate": True}],
@@ -393,6 +414,7 @@ class Bar(gymnasium.Wrapper[Any, Any, Any, Any]):
         return frame
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("render", [None, "live"])
 def test_a_live_video_may_show_what_wrappers_draw(
     tmp_path: Path, render: str | None
@@ -414,6 +436,7 @@ def test_a_live_video_may_show_what_wrappers_draw(
     assert "Bar" in checks[0, DRAWN].reason
 
 
+@pytest.mark.thorough
 def test_a_video_that_plays_at_another_speed(alone: Path) -> None:
     """The frames are the same, and the time of each is another."""
     forge(video(alone), drawn(alone), fps=30)
@@ -423,6 +446,7 @@ def test_a_video_that_plays_at_another_speed(alone: Path) -> None:
     assert "30 frames a second" in checks[0, PACED].reason
 
 
+@pytest.mark.thorough
 def test_a_video_whose_rate_an_older_version_rounded(alone: Path) -> None:
     """It plays at the usual rate next to the recorded one, and nobody is to blame."""
     forge(video(alone), drawn(alone), fps=Fraction(201, 10), hashes=False)
@@ -432,6 +456,7 @@ def test_a_video_whose_rate_an_older_version_rounded(alone: Path) -> None:
     assert verdicts(alone) == [PASS, OPEN, PASS, OPEN, PASS]
 
 
+@pytest.mark.thorough
 def test_a_video_of_an_older_version_is_encoded_again(alone: Path) -> None:
     """What it told ffmpeg of the rate has given the same file."""
     encoder = metadata(video(alone))["encoder_version"]
@@ -472,6 +497,7 @@ def test_metadata_without_a_video(alone: Path, said: dict[str, Any]) -> None:
     assert check.verdict is (OPEN if said else FAIL)
 
 
+@pytest.mark.thorough
 def test_a_model_that_is_missing_or_a_strangers(
     alone: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -524,6 +550,7 @@ def _link(path: Path) -> None:
     path.symlink_to(outside)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("damage", [_cut, _garbage, _list_of_files, _empty, _link])
 def test_what_is_no_video_is_a_failure(
     run: Path, damage: Callable[[Path], None]
@@ -562,7 +589,7 @@ def test_metadata_that_says_something_else_is_a_failure(
     assert FAIL in verdicts(alone)
 
 
-@pytest.mark.parametrize("change", ["missing", "short", "foreign", "long"])
+@parametrize("change", ["missing", "short", "foreign", "long"])
 def test_frame_hashes_that_are_none(alone: Path, change: str) -> None:
     """A file that lacks lines, has more, or is something else."""
     path = video(alone).with_suffix(".framehash")

@@ -21,7 +21,10 @@ from mjrec.engines.ray import RayEngine
 from mjrec.errors import Error
 
 # Ray's own connections and pipes, of which it says so when they are collected.
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
+pytestmark = [
+    pytest.mark.ray_nodes,
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+]
 
 
 @pytest.fixture(scope="module", autouse=True)

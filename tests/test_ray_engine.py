@@ -60,6 +60,7 @@ def parent_of(pid: int) -> int:
 # Jobs and their outcomes
 
 
+@pytest.mark.thorough
 def test_it_is_an_engine(own_ray: None) -> None:
     """Of the interface, as a type checker sees it too."""
     engine: Engine = RayEngine(1)
@@ -69,6 +70,7 @@ def test_it_is_an_engine(own_ray: None) -> None:
         assert list(run.results()) == []
 
 
+@pytest.mark.thorough
 def test_jobs_get_settings_and_arguments(own_ray: None) -> None:
     """The outcome is what the handler returns."""
     with begun(seeds=[1, 2]) as run:
@@ -80,6 +82,7 @@ def test_jobs_get_settings_and_arguments(own_ray: None) -> None:
     }
 
 
+@pytest.mark.thorough
 def test_jobs_can_be_submitted_while_results_come(own_ray: None) -> None:
     """The iterator goes on to their outcomes, and a second one too."""
     with begun(2) as run:
@@ -95,6 +98,7 @@ def test_jobs_can_be_submitted_while_results_come(own_ray: None) -> None:
         assert list(outcomes(run)) == ["later"]
 
 
+@pytest.mark.thorough
 def test_jobs_run_beside_each_other(own_ray: None, tmp_path: Path) -> None:
     """Two that wait for each other both come to their end."""
     os.mkfifo(tmp_path / "pipe")
@@ -104,6 +108,7 @@ def test_jobs_run_beside_each_other(own_ray: None, tmp_path: Path) -> None:
         assert len({value["pid"] for value in values(run)}) == 2
 
 
+@pytest.mark.thorough
 def test_workers_stay_for_later_jobs(own_ray: None, tmp_path: Path) -> None:
     """In the driver's directory."""
     with begun(2) as run:
@@ -115,6 +120,7 @@ def test_workers_stay_for_later_jobs(own_ray: None, tmp_path: Path) -> None:
     assert first["directory"] == str(Path.cwd())
 
 
+@pytest.mark.thorough
 def test_patience_is_told_of(own_ray: None) -> None:
     """None is no outcome: the caller may look at the clock."""
     with begun(1) as run:
@@ -124,6 +130,7 @@ def test_patience_is_told_of(own_ray: None) -> None:
         assert [o.key for o in run.results(patience_s=1e-6) if o is not None] == ["a"]
 
 
+@pytest.mark.thorough
 def test_workers_are_as_many_as_the_cluster_has_cpus(own_ray: None) -> None:
     """Unless their number is given."""
     with begun(None) as run:
@@ -131,6 +138,7 @@ def test_workers_are_as_many_as_the_cluster_has_cpus(own_ray: None) -> None:
     assert repr(RayEngine(3, gpus=0.5)) == "RayEngine(workers=3, gpus=0.5)"
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_handed_out(own_ray: None) -> None:
     """Errors name the job, and come before Ray is needed."""
     with pytest.raises(InvalidArgument, match="settings of the work cannot be written"):
@@ -143,6 +151,7 @@ def test_what_cannot_be_handed_out(own_ray: None) -> None:
             run.results(patience_s=0)
 
 
+@pytest.mark.thorough
 def test_a_large_payload_is_fetched_once_per_worker(own_ray: None) -> None:
     """However many jobs there are, the object store has it once, and no job has it."""
     payload = os.urandom(1 << 20) * 20
@@ -160,6 +169,7 @@ def test_a_large_payload_is_fetched_once_per_worker(own_ray: None) -> None:
 # Jobs that fail, and workers that die
 
 
+@pytest.mark.thorough
 def test_what_a_handler_raises_is_the_outcome(
     own_ray: None, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -176,6 +186,7 @@ def test_what_a_handler_raises_is_the_outcome(
     assert "The job bad failed" in caplog.text
 
 
+@pytest.mark.thorough
 def test_a_job_whose_process_dies_is_begun_again(
     own_ray: None, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -192,6 +203,7 @@ def test_a_job_whose_process_dies_is_begun_again(
     assert "job once, which is begun again. It was killed by SIGKILL" in caplog.text
 
 
+@pytest.mark.thorough
 def test_a_killed_worker_of_ray_counts_as_a_death(
     own_ray: None, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -211,6 +223,7 @@ def test_a_killed_worker_of_ray_counts_as_a_death(
     assert "job a, which is begun again" in caplog.text
 
 
+@pytest.mark.thorough
 def test_a_terminated_worker_of_ray_is_nobodys_fault(
     own_ray: None, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -227,6 +240,7 @@ def test_a_terminated_worker_of_ray_is_nobodys_fault(
     assert "is told to end: the job a is begun again" in caplog.text
 
 
+@pytest.mark.thorough
 def test_a_handler_that_cannot_be_made(own_ray: None) -> None:
     """It is an error at once; one of ours keeps its class and facts."""
     with begun(entry="odd_jobs:make_no_name") as run:
@@ -236,6 +250,7 @@ def test_a_handler_that_cannot_be_made(own_ray: None) -> None:
     assert raised.value.available == ["back", "side"]
 
 
+@pytest.mark.thorough
 def test_what_jobs_print_is_passed_on(
     own_ray: None,
     capsys: pytest.CaptureFixture[str],
@@ -261,6 +276,7 @@ def test_what_jobs_print_is_passed_on(
 # The end
 
 
+@pytest.mark.thorough
 def test_cancelling_lets_jobs_close_their_files(own_ray: None, tmp_path: Path) -> None:
     """What is not done stays so; and nothing of the run is left on the cluster."""
     run = begun(2, closed=str(tmp_path / "closed"))
@@ -279,6 +295,7 @@ def test_cancelling_lets_jobs_close_their_files(own_ray: None, tmp_path: Path) -
         run.results()
 
 
+@pytest.mark.thorough
 def test_idle_workers_end_too(own_ray: None, tmp_path: Path) -> None:
     """Also where Ray goes on, because it is the caller's."""
     with begun(closed=str(tmp_path / "closed")) as run:
@@ -290,6 +307,7 @@ def test_idle_workers_end_too(own_ray: None, tmp_path: Path) -> None:
     assert ray.is_initialized()
 
 
+@pytest.mark.thorough
 def test_forgotten_runs_end(own_ray: None, tmp_path: Path) -> None:
     """In mid-job too."""
     run = begun()
@@ -302,6 +320,7 @@ def test_forgotten_runs_end(own_ray: None, tmp_path: Path) -> None:
 # Ray itself
 
 
+@pytest.mark.thorough
 def test_ray_is_left_as_the_caller_had_it(own_ray: None) -> None:
     """A driver that uses Ray for other things goes on doing so."""
     remembered = ray.put("of the caller")
@@ -311,6 +330,7 @@ def test_ray_is_left_as_the_caller_had_it(own_ray: None) -> None:
     assert ray.get(remembered) == "of the caller"
 
 
+@pytest.mark.thorough
 def test_a_ray_of_our_own_leaves_nothing_behind(tmp_path: Path) -> None:
     """No process, no token, no variable, no handler of a signal; twice in a row."""
     script = """
@@ -337,6 +357,7 @@ print(sorted(os.listdir(os.environ["HOME"])))
     wait_until(lambda: not ray_processes(mark), seconds=10)
 
 
+@pytest.mark.thorough
 def test_a_ray_of_our_own_without_a_gpu(tmp_path: Path) -> None:
     """One warning, and the jobs are done; nobody waits for what will never be there."""
     script = """
@@ -360,6 +381,7 @@ except GLError as error:
     wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=10)
 
 
+@pytest.mark.thorough
 def test_a_terminated_driver_says_so(tmp_path: Path) -> None:
     """By the exit status of SIGTERM, whatever Ray makes of signals."""
     script = """
@@ -385,6 +407,7 @@ with exiting_on_signals(), begun() as run:
     wait_until(lambda: not ray_processes(f"{MARK}={tmp_path}"), seconds=10)
 
 
+@pytest.mark.thorough
 def test_a_killed_driver_leaves_no_process(tmp_path: Path) -> None:
     """Neither of Ray nor of ours; the job that was running has closed its files."""
     script = """
@@ -434,6 +457,7 @@ def test_an_engine_is_made_without_loading_ray_before() -> None:
     assert run_python(script) == "False\n"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("address", "kind", "said"),
     [

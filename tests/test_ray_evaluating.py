@@ -64,6 +64,7 @@ class Huge:
         return np.sin(100 * observation[:1]) * self.weights[-1]
 
 
+# Takes more than five seconds: a real Ray, whose workers import MuJoCo.
 def test_the_files_are_those_of_this_machine(tmp_path: Path) -> None:
     """Results byte for byte, and all states and videos; with a policy of 200 MiB."""
     policy = Huge()
@@ -113,6 +114,7 @@ def noted(directory: Path, what: bytes) -> int:
     return sum(path.read_bytes().count(b'{"' + what) for path in ledgers)
 
 
+@pytest.mark.thorough
 def test_a_killed_driver_is_gone_on_with(tmp_path: Path) -> None:
     """With `resume`: what was finished is not repeated."""
     process = slow_run(tmp_path)

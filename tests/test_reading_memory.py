@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import pytest
+from parts import parametrize
 
 import mjrec
 from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
@@ -56,7 +56,7 @@ def peak_of(read: Callable[[Path], object], path: Path) -> int:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("read", [mjrec.load_results, list_episodes, gather])
+@parametrize("read", [mjrec.load_results, list_episodes, gather])
 def test_manifests_are_not_kept(tmp_path: Path, read: Callable[[Path], object]) -> None:
     """What all of them say takes no more than what a few do."""
     large = write_monitors(tmp_path / "large", PACKAGES)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from parts import parametrize
 
 ROOT = Path(__file__).parent.parent
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
@@ -42,8 +43,6 @@ def run(*command: str, cwd: Path) -> str:
 def needs_extras(text: str) -> None:
     if "dm_control" in text:
         pytest.importorskip("dm_control", reason="dm_control is not installed here")
-    if "stable_baselines3" in text:
-        pytest.importorskip("stable_baselines3", reason="it is not installed here")
 
 
 @pytest.fixture
@@ -56,7 +55,8 @@ def checkout(tmp_path: Path) -> Path:
 PYTHON = dict(zip(("gymnasium", "dm_control", "again"), blocks("python"), strict=True))
 
 
-@pytest.mark.parametrize("name", PYTHON)
+# Takes more than five seconds: the README's own size, 480x480, drawn in software.
+@parametrize("name", PYTHON)
 def test_python_block_runs(name: str, checkout: Path) -> None:
     """As it stands, after what it goes on from, and it leaves a video."""
     code = PYTHON[name]
@@ -79,6 +79,7 @@ def needed_by(line: str) -> list[str]:
     return [*needed_by(maker), maker]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("line", [x for x in shell_lines() if x.startswith("mjrec")])
 def test_command_runs(line: str, checkout: Path) -> None:
     """As it stands, with the recordings that the ones before it made."""
@@ -128,6 +129,7 @@ def test_links_lead_somewhere() -> None:
         assert (ROOT / target).exists(), target
 
 
+@pytest.mark.thorough
 @pytest.mark.dm_control
 def test_scripts_demo_runs(tmp_path: Path) -> None:
     """The first command: twenty episodes, six videos, two tables."""
@@ -137,26 +139,19 @@ def test_scripts_demo_runs(tmp_path: Path) -> None:
     assert out.count("truncated") == 20
 
 
-def test_scripts_test_runs(tmp_path: Path) -> None:
-    """The second command, here with one small test of the suite itself."""
-    assert "scripts/test" in shell_lines()
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTEST")}
-    done = subprocess.run(
-        [str(ROOT / "scripts" / "test"), "tests/test_asciicast.py"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    # pytest's own line, not ruff's, with as many tests as the file has functions.
-    counted = re.search(r"^=+ (\d+) passed in ", done.stdout, re.MULTILINE)
-    tests = (ROOT / "tests" / "test_asciicast.py").read_text().count("\ndef test_")
-    assert counted, done.stdout
-    assert int(counted[1]) >= tests > 0
-
-
-@pytest.mark.parametrize("example", EXAMPLES, ids=[path.stem for path in EXAMPLES])
+@pytest.mark.parametrize(
+    "example",
+    [
+        pytest.param(
+            path,
+            marks=pytest.mark.stable_baselines3
+            if path.stem == "stable_baselines3_training"
+            else pytest.mark.thorough,
+        )
+        for path in EXAMPLES
+    ],
+    ids=[path.stem for path in EXAMPLES],
+)
 def test_example_runs(example: Path, tmp_path: Path) -> None:
     """By itself, in an empty directory, and is listed on the examples' page."""
     needs_extras(example.read_text())
@@ -166,6 +161,7 @@ def test_example_runs(example: Path, tmp_path: Path) -> None:
     assert example.name in (ROOT / "examples" / "README.md").read_text()
 
 
+@pytest.mark.thorough
 def test_command_line_example_runs(tmp_path: Path) -> None:
     """It keeps as many videos as it says, and lists its episodes."""
     script = ROOT / "examples" / "command_line" / "evaluate.sh"
@@ -175,6 +171,7 @@ def test_command_line_example_runs(tmp_path: Path) -> None:
     assert "command_line/" in (ROOT / "examples" / "README.md").read_text()
 
 
+@pytest.mark.thorough
 @pytest.mark.dm_control
 def test_workflow_records_and_uploads(tmp_path: Path) -> None:
     """Its own commands leave what it uploads; the rest is what setup installs too."""

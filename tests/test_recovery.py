@@ -514,6 +514,7 @@ def test_a_note_that_was_being_rewritten_leaves_nothing(tmp_path: Path) -> None:
     assert not mjrec.recover(tmp_path)
 
 
+@pytest.mark.thorough
 def test_a_renderer_that_was_killed_leaves_its_video_pending(
     killed: Callable[[str], Path],
 ) -> None:

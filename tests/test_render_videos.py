@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium
 import pytest
+from parts import parametrize
 from recordings import frames_of
 from trajectories_by_hand import (
     INFIX,
@@ -82,7 +83,7 @@ def test_pending_videos_are_made_once(tmp_path: Path, painter: Painter) -> None:
     assert render_videos(tmp_path, episode=0) == RenderedVideos(directory=tmp_path)
 
 
-@pytest.mark.parametrize("engine", [None, "local", LocalEngine(1)])
+@parametrize("engine", [None, "local", LocalEngine(1)])
 def test_every_engine_makes_them(run: Path, engine: Any) -> None:
     """By its name, or as it is given; and another view beside the original."""
     rendered = render_videos(run, engine=engine)

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 import pytest
 from interruption import ctrl_c_soon
+from parts import parametrize
 
 from mjrec.errors import (
     ClosedError,
@@ -121,7 +122,7 @@ def gl_threads() -> list[threading.Thread]:
 # The pictures
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("name", "camera"),
     [
         ("showcase", "overview"),
@@ -131,6 +132,7 @@ def gl_threads() -> list[threading.Thread]:
         ("walker_on_plane", "chase"),
         ("pendulum", -1),
     ],
+    default=2,
 )
 def test_pictures_are_those_of_mujocos_own_renderer(
     name: str, camera: str | int
@@ -704,7 +706,7 @@ def test_without_gl_there_is_one_error_with_the_way_out(
     assert "`mjrec doctor`" in done.stdout
 
 
-@pytest.mark.parametrize("order", ["ours first", "theirs first"])
+@parametrize("order", ["ours first", "theirs first"])
 def test_leaving_without_closing_is_silent(order: str) -> None:
     """Both mujoco and dm_control shut EGL down at exit, each when it likes."""
     script = f"""
@@ -897,6 +899,7 @@ def test_a_driver_that_hangs_is_not_waited_for(
     driver.set()
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_what_ctrl_c_interrupted_is_waited_for(thread: GLThread) -> None:
     """The thread may be reading a scene that the caller is about to change."""
     driver = threading.Event()

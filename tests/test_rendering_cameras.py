@@ -440,6 +440,7 @@ def test_a_grid_is_what_each_camera_shows(tmp_path: Path) -> None:
         drawing.close()
 
 
+@pytest.mark.thorough
 def test_a_camera_that_follows_does_not_depend_on_the_order(tmp_path: Path) -> None:
     """Each picture moves it: those that another worker draws count too."""
     ride = record_ride(tmp_path)
@@ -545,6 +546,7 @@ def ant(directory: Path) -> Any:
     return gymnasium.make("Ant-v5", max_episode_steps=4, width=64, height=48)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("make", "cameras"), [(mjcf, ["side", "ride"]), (ant, [-1, "track"])]
 )
@@ -561,6 +563,7 @@ def test_a_further_video_is_that_of_a_run_with_its_camera(
     assert hashes_of(both[0]) != hashes_of(both[1])
 
 
+@pytest.mark.thorough
 @pytest.mark.dm_control
 def test_so_it_is_of_dm_control(tmp_path: Path) -> None:
     """Which draws every picture as if it were the first."""
@@ -595,6 +598,7 @@ os.kill(os.getpid(), 9)
 """
 
 
+@pytest.mark.thorough
 def test_a_killed_recording_has_all_its_videos(tmp_path: Path) -> None:
     """In the manifest, and under their second names."""
     subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)

@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from parts import parametrize
 from rides import FRAMES, HEIGHT, WIDTH, Ride, move, record, start
 
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
@@ -229,7 +230,7 @@ def test_facts_that_cannot_be(tmp_path: Path, facts: dict[str, Any]) -> None:
         TrajectoryDrawing(ride.path, View())
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "members",
     [
         {"type": 1, "trackbodyid": 10**6},

@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import pytest
 from full_disk import file_size_limit
+from parts import parametrize
 from recordings import frames_of, metadata_of
 from trajectories_by_hand import Painter, write_log, write_pending_manifest
 
@@ -155,7 +156,8 @@ def test_an_encoder_that_is_killed_again_leaves_the_video_pending(
     check_all_is_there_after_another_try(two)
 
 
-@pytest.mark.parametrize("instead", ["exec sleep 60", "cat >/dev/null; sleep 60"])
+# Takes more than five seconds: the encoder's timeout, twice.
+@parametrize("instead", ["exec sleep 60", "cat >/dev/null; sleep 60"])
 def test_an_encoder_that_hangs_leaves_the_video_pending(
     instead: str, two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -162,6 +162,7 @@ def copy_of(recorded: Path, place: Path) -> Path:
     return shutil.copytree(recorded, place)
 
 
+@pytest.mark.thorough
 def test_two_workers_make_the_files_that_this_process_makes(
     recorded: Path, tmp_path: Path
 ) -> None:
@@ -179,6 +180,7 @@ def test_two_workers_make_the_files_that_this_process_makes(
     assert finish(LocalEngine(2), there) == []
 
 
+@pytest.mark.thorough
 def test_another_view_is_the_same_file_too(recorded: Path, tmp_path: Path) -> None:
     """With all that can be other."""
     here, there = (copy_of(recorded, tmp_path / name) for name in ("here", "there"))

@@ -67,6 +67,7 @@ def test_a_recording_is_drawn_again(ride: Ride) -> None:
     assert children() == before
 
 
+@pytest.mark.thorough
 def test_a_recording_is_drawn_another_way(ride: Ride) -> None:
     """Camera, size, quality and rate."""
     camera = mujoco.MjvCamera()
@@ -93,6 +94,7 @@ def test_a_recording_is_drawn_another_way(ride: Ride) -> None:
     assert not np.array_equal(first, side)
 
 
+@pytest.mark.thorough
 def test_a_recording_that_is_left_early(ride: Ride) -> None:
     """Closing, or dropping what was returned, ends the workers."""
     before = children()
@@ -260,6 +262,7 @@ def test_no_states_are_no_pictures(temporary: Path) -> None:
     assert list(temporary.iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_states_that_are_left_early_leave_no_files(temporary: Path) -> None:
     """Nor do they at interpreter exit."""
     model, _ = start()

@@ -18,6 +18,7 @@ from typing import Any
 
 import gymnasium
 import pytest
+from parts import parametrize
 from processes import children
 from recordings import frames_of
 from trajectories_by_hand import write_log
@@ -260,7 +261,7 @@ def test_ctrl_c_in_the_terminal_does_not_reach_the_server(
     wait_until(lambda: os.getpriority(os.PRIO_PROCESS, server) == 10)
 
 
-@pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGSEGV])
+@parametrize("signum", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_second_server_goes_on_for_a_dead_one(
     others: set[int],
     signum: signal.Signals,
@@ -315,6 +316,7 @@ def test_servers_that_die_are_one_clear_failure(
     assert children() == others
 
 
+@pytest.mark.thorough
 def test_a_server_that_hangs_is_ended(
     others: set[int],
     tmp_path: Path,
@@ -350,6 +352,7 @@ def test_a_server_that_hangs_is_ended(
     assert children() == others
 
 
+@pytest.mark.thorough
 def test_a_server_at_work_does_not_hang(
     tmp_path: Path, start: Callable[..., RenderService], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -519,7 +522,7 @@ def test_the_server_ends_with_its_parent(tmp_path: Path) -> None:
         assert reader.step_count == 4
 
 
-@pytest.mark.parametrize("way", ["script", "stdin", "daemonic"])
+@parametrize("way", ["script", "stdin", "daemonic"])
 def test_any_program_can_have_a_service(way: str, tmp_path: Path) -> None:
     """A script without a guard, `python -`, a daemonic process; once each."""
     log = write_log(tmp_path, video=None)

@@ -100,6 +100,7 @@ def test_three_workers_give_the_same(ride: Ride, three: DrawingWorkers) -> None:
     assert np.array_equal(drawn, ride.frames)
 
 
+@pytest.mark.thorough
 def test_many_pictures_from_workers_that_do_not_divide_the_slots(
     ride: Ride, three: DrawingWorkers
 ) -> None:
@@ -134,6 +135,7 @@ def test_no_pictures_are_no_work() -> None:
     assert new == []
 
 
+@pytest.mark.thorough
 def test_workers_stay_and_go_over_to_other_views(
     ride: Ride, three: DrawingWorkers
 ) -> None:
@@ -289,6 +291,7 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
     assert "in wait_for_a_driver_that_hangs" in caplog.text
 
 
+@pytest.mark.thorough
 def test_a_worker_that_was_stopped_hangs(
     ride: Ride,
     be_impatient: Callable[[DrawingWorkers], None],
@@ -307,6 +310,7 @@ def test_a_worker_that_was_stopped_hangs(
     assert "in serve" in caplog.text
 
 
+@pytest.mark.thorough
 def test_a_slow_worker_does_not_hang(
     ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -413,6 +417,7 @@ def test_a_number_of_workers_that_cannot_be(count: Any) -> None:
 # Their life
 
 
+@pytest.mark.thorough
 def test_dropping_the_iterator_leaves_the_workers_usable(
     ride: Ride, three: DrawingWorkers
 ) -> None:
@@ -436,6 +441,7 @@ def test_a_later_call_takes_the_workers_over(ride: Ride, three: DrawingWorkers) 
     assert np.array_equal(list(second), ride.frames)
 
 
+@pytest.mark.thorough
 def test_closed_workers_say_so(ride: Ride) -> None:
     """Closing twice is allowed, and leaves no process."""
     with new_children() as new:
@@ -533,6 +539,7 @@ def said(ride: Ride) -> str:
     return f"{FRAMES} {sum(int(frame.sum()) for frame in ride.frames)}\n"
 
 
+@pytest.mark.thorough
 def test_from_standard_input(ride: Ride) -> None:
     """`python -` has no main module that could be imported."""
     done = run(["-"], ride, text=CALLER)
@@ -548,6 +555,7 @@ def test_from_a_script_without_a_guard(ride: Ride, tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, said(ride))
 
 
+@pytest.mark.thorough
 def test_from_a_daemonic_process(ride: Ride) -> None:
     """Which may have no children of multiprocessing's."""
     script = f"""
@@ -564,6 +572,7 @@ if __name__ == "__main__":
     assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
 
 
+@pytest.mark.thorough
 def test_from_a_thread(ride: Ride, one: DrawingWorkers) -> None:
     """Any thread, one at a time."""
     drawn: list[Any] = []
@@ -617,6 +626,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     process.stdout.close()
 
 
+@pytest.mark.thorough
 def test_leaving_in_mid_drawing_is_silent(ride: Ride) -> None:
     """At interpreter exit the workers end, and nothing waits for them."""
     script = """
@@ -635,6 +645,7 @@ print("end")
 # What draws
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("setting", ["disable", None])
 def test_a_backend_is_chosen_where_none_is_named(
     ride: Ride, setting: str | None, monkeypatch: pytest.MonkeyPatch
@@ -757,6 +768,7 @@ def test_workers_find_what_their_parent_finds(monkeypatch: pytest.MonkeyPatch) -
     assert found == {"A": "1", "PYTHONPATH": f"/b:{relative}:/scripts"}
 
 
+@pytest.mark.thorough
 def test_a_parent_that_found_mjrec_by_itself(ride: Ride, tmp_path: Path) -> None:
     """By a change of `sys.path`, in a Python that looks nowhere else."""
     package = Path(mjrec.__file__).parent

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import os
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +11,14 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from parts import parametrize
 
 import mjrec
 
-ALL = bool(os.environ.get("MJREC_TEST_ALL"))
 GYMNASIUM = ["HalfCheetah-v5", "Humanoid-v5", "Pusher-v5"]
-if ALL:
-    GYMNASIUM += ["Ant-v5", "Hopper-v5", "HumanoidStandup-v5", "Swimmer-v5"]
-    GYMNASIUM += ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Reacher-v5"]
-    GYMNASIUM += ["Walker2d-v5"]
+GYMNASIUM += ["Ant-v5", "Hopper-v5", "HumanoidStandup-v5", "Swimmer-v5"]
+GYMNASIUM += ["InvertedPendulum-v5", "InvertedDoublePendulum-v5", "Reacher-v5"]
+GYMNASIUM += ["Walker2d-v5"]
 # What begins far from rest, and what settles inside its reset, which only the warm
 # start of the solver remembers.
 SUITE = ("humanoid-run", "cheetah-run", "finger-spin")
@@ -41,7 +40,7 @@ def replayed(path: Path, substeps: int) -> tuple[Any, Any]:
     return trajectory.states[1:], followed
 
 
-@pytest.mark.parametrize("env_id", GYMNASIUM)
+@parametrize("env_id", GYMNASIUM, default=3, part=pytest.mark.environments)
 def test_gymnasium_states_follow_bit_for_bit(env_id: str, tmp_path: Path) -> None:
     """State k, the controls of step k + 1, and stepping give state k + 1."""
     env = gymnasium.make(env_id)
@@ -58,15 +57,16 @@ def test_gymnasium_states_follow_bit_for_bit(env_id: str, tmp_path: Path) -> Non
 
 
 def suite_tasks() -> list[str]:
-    """Return the names of the tasks to try, all of them where all is tried."""
-    if not ALL:
-        return list(SUITE)
-    suite = pytest.importorskip("dm_control.suite")
+    """Return the names of all tasks."""
+    if importlib.util.find_spec("dm_control") is None:
+        return []
+    from dm_control import suite
+
     return [f"{domain}-{task}" for domain, task in suite.ALL_TASKS]
 
 
 @pytest.mark.dm_control
-@pytest.mark.parametrize("name", suite_tasks())
+@parametrize("name", suite_tasks(), default=SUITE, part=pytest.mark.environments)
 def test_suite_states_follow_bit_for_bit(name: str, tmp_path: Path) -> None:
     """Also where a task changes its model at every reset."""
     suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Iterator
@@ -13,6 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from axe_playwright_python.sync_playwright import Axe
+from parts import parametrize
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 from report_contents import HOSTILE, columns, contents, task, video
 
 import mjrec
@@ -20,22 +22,14 @@ from mjrec.reporting.contents import ReportContents, Verdict
 from mjrec.reporting.page import page_of
 from mjrec.reporting.report_folder import write_report
 
-# Where it is installed to be tested, being unable to start it is no reason to skip.
-if "MJREC_TEST_BROWSER" not in os.environ:
-    pytest.importorskip("playwright", reason="Playwright is not installed here")
-    pytest.importorskip(
-        "axe_playwright_python", reason="axe-core is not installed here"
-    )
-
-from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page, expect, sync_playwright
-
 # No sandbox, which root and most containers cannot have: it opens our own pages only.
 _OPTIONS = (
     *("--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update"),
     *("--disable-sync", "--disable-default-apps"),
 )
+pytestmark = pytest.mark.browser
+
 _FPS = 25
 _FRAMES = 50
 
@@ -45,8 +39,6 @@ def browser() -> Iterator[Browser]:
     """Start the system's Chromium, or the one that Playwright has installed."""
     with sync_playwright() as playwright:
         found = shutil.which("chromium") or playwright.chromium.executable_path
-        if "MJREC_TEST_BROWSER" not in os.environ and not Path(found).exists():
-            pytest.skip("there is no chromium on PATH")
         started = playwright.chromium.launch(executable_path=found, args=_OPTIONS)
         yield started
         started.close()
@@ -186,6 +178,7 @@ def test_videos_play(usual: Page) -> None:
     assert usual.evaluate(playing) <= 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("key", ["Enter", "Space"])
 def test_a_video_is_played_by_keyboard(usual: Page, key: str) -> None:
     """Its player has the keyboard then, and the name of what it plays."""
@@ -200,7 +193,7 @@ def test_a_video_is_played_by_keyboard(usual: Page, key: str) -> None:
     expect(usual.locator("video")).to_have_count(1)
 
 
-@pytest.mark.parametrize("single_file", [False, True])
+@parametrize("single_file", [False, True])
 def test_a_recordings_report_plays(
     page: Page, tmp_path: Path, make_corridor: Any, play: Any, single_file: bool
 ) -> None:
@@ -231,6 +224,7 @@ def names_of(page: Page) -> list[str]:
     return page.locator("#summary-table tbody th").all_inner_texts()
 
 
+@pytest.mark.thorough
 def test_the_summary_sorts_by_mouse_and_by_keyboard(usual: Page) -> None:
     """Either way, and says which."""
     mean = usual.locator("#summary-table th", has_text="Mean")
@@ -248,6 +242,7 @@ def test_the_summary_sorts_by_mouse_and_by_keyboard(usual: Page) -> None:
     assert usual.locator("[aria-sort]").count() == 1
 
 
+@pytest.mark.thorough
 def test_what_is_not_known_comes_last(page: Page, tmp_path: Path) -> None:
     """Whichever way a table is sorted."""
     named = {"a": [3.0, 3.0], "b": [1.0, 1.0], "c": [2.0]}
@@ -279,6 +274,7 @@ def shown_cards(page: Page) -> list[str]:
     return [card.get_attribute("id") or "" for card in cards.all()]
 
 
+@pytest.mark.thorough
 def test_the_gallery_filters_by_mouse_and_by_keyboard(usual: Page) -> None:
     """By task, by best or worst, and by both; and says how many are left."""
     count = usual.locator("#gallery-count")
@@ -295,6 +291,7 @@ def test_the_gallery_filters_by_mouse_and_by_keyboard(usual: Page) -> None:
     assert shown_cards(usual) == ["video-0", "video-2"]
 
 
+@pytest.mark.thorough
 def test_a_command_is_copied_or_selected(usual: Page) -> None:
     """Whatever the browser allows to a page from the disk."""
     card = usual.locator("#video-0")
@@ -316,6 +313,7 @@ def test_a_command_is_copied_or_selected(usual: Page) -> None:
 # --- All episodes -----------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_the_table_of_episodes_filters_sorts_and_turns_pages(
     page: Page, tmp_path: Path
 ) -> None:
@@ -344,6 +342,7 @@ def test_the_table_of_episodes_filters_sorts_and_turns_pages(
     ]
 
 
+@pytest.mark.thorough
 def test_a_phone_shows_which_episodes_failed(browser: Browser, tmp_path: Path) -> None:
     """And why, beside the task's name, without scrolling to the right."""
     reason = "PolicyError: " + "it gave an action of the wrong shape " * 4
@@ -359,6 +358,7 @@ def test_a_phone_shows_which_episodes_failed(browser: Browser, tmp_path: Path) -
             assert box["x"] + box["width"] <= 360
 
 
+@pytest.mark.thorough
 def test_the_summary_fits_on_paper(browser: Browser, tmp_path: Path) -> None:
     """With all of its columns, on A4 with margins of a centimetre."""
     known = {"success_known": 50, "success_rate": 0.5, "warnings": {"BADQACC": 12}}
@@ -371,6 +371,7 @@ def test_the_summary_fits_on_paper(browser: Browser, tmp_path: Path) -> None:
             assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
 
 
+@pytest.mark.thorough
 def test_an_episodes_video_is_one_click_away(usual: Page) -> None:
     """Also where the gallery's filter has hidden it."""
     usual.get_by_role("radio", name="Worst").click()
@@ -384,6 +385,7 @@ def test_an_episodes_video_is_one_click_away(usual: Page) -> None:
 # --- For everybody ----------------------------------------------------------------
 
 
+@pytest.mark.axe
 @pytest.mark.parametrize("width", [360, 1280])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("report", [usual_report, hostile_report])
@@ -439,6 +441,7 @@ def test_the_policy_stops_what_is_not_the_pages_own(
         assert page.evaluate("window.hasRun") is None
 
 
+@pytest.mark.thorough
 def test_the_keyboard_reaches_the_content_first(usual: Page) -> None:
     """By a link that shows itself only then."""
     usual.keyboard.press("Tab")
@@ -449,6 +452,7 @@ def test_the_keyboard_reaches_the_content_first(usual: Page) -> None:
     expect(usual.locator("#content")).to_be_focused()
 
 
+@pytest.mark.thorough
 def test_without_scripts_everything_but_the_tools_is_there(
     browser: Browser, videos: Path
 ) -> None:
@@ -465,6 +469,7 @@ def test_without_scripts_everything_but_the_tools_is_there(
         expect(page.locator("#episodes-tools")).to_be_hidden()
 
 
+@pytest.mark.thorough
 def test_paper_has_pictures_and_no_buttons(usual: Page) -> None:
     """The gallery is printed, the tools are not."""
     usual.emulate_media(media="print")
@@ -477,6 +482,7 @@ def test_paper_has_pictures_and_no_buttons(usual: Page) -> None:
     assert shown == ["none", "none"]
 
 
+@pytest.mark.thorough
 def test_of_ten_thousand_episodes_a_hundred_are_laid_out(
     page: Page, tmp_path: Path
 ) -> None:

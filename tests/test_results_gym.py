@@ -2,18 +2,17 @@
 """Directories that real gyms wrote are read, and real gym 0.21 agrees with us.
 
 `data/gym/<version>/<case>/` was recorded by `legacy/record_gym.py` with that version.
-Gym itself runs in an environment of its own, made once and kept in the user's cache.
+`data/gym/answers.json` is what gym's own `load_results` made of them, and of what
+`write_ours` writes: `legacy/gym_load_results.py` says how it was made. Gym itself is
+asked under `scripts/test --all`.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import os
-import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ TESTS = Path(__file__).parent
 DATA = TESTS / "data" / "gym"
 VERSIONS = ["0.7.4", "0.9.6", "0.12.1", "0.17.3", "0.19.0", "0.21.0", "0.22.0"]
 CASES = sorted(path.name for path in (DATA / VERSIONS[0]).iterdir())
+RECORDED = [f"{version}/{case}" for version in sorted(VERSIONS) for case in CASES]
 NAN, INF = math.nan, math.inf
 
 # What was played in each case: lengths, rewards, types.
@@ -51,7 +51,7 @@ def load(directory: Path) -> dict[str, Any]:
 
 def test_every_version_and_case_is_recorded() -> None:
     """No directory went missing."""
-    assert {path.name for path in DATA.iterdir()} == set(VERSIONS)
+    assert {path.name for path in DATA.iterdir() if path.is_dir()} == set(VERSIONS)
     for version in VERSIONS:
         assert {path.name for path in (DATA / version).iterdir()} == set(PLAYED)
 
@@ -101,37 +101,115 @@ def test_text_recordings_of_a_gym_are_found(version: str) -> None:
     assert second.video is None
 
 
+def write_ours(directory: Path) -> None:
+    """Write two monitors with videos, a key of our own, and infinity."""
+    for monitor, (name, shift) in enumerate([("0.7", 0.0), ("1.7", 0.5)]):
+        stats = StatsFile(
+            initial_reset_timestamp=1790000000.0 + shift,
+            timestamps=(1790000001.0 + shift, 1790000002.0 + shift),
+            episode_lengths=(10, 20),
+            episode_rewards=(math.inf, 0.1 + monitor),
+            episode_types=("t", "e"),
+        )
+        stats_name = f"openaigym.episode_batch.{name}.stats.json"
+        video = f"openaigym.video.{name}.video000000"
+        write_stats_file(directory / stats_name, stats)
+        for suffix in (".mp4", ".meta.json"):
+            (directory / (video + suffix)).touch()
+        manifest = Manifest(
+            stats=stats_name,
+            videos=((f"{video}.mp4", f"{video}.meta.json"),),
+            env_info={"gym_version": "mjrec-1", "env_id": "Hopper-v5"},
+            mjrec={"format": 1, "schedule": ["cubic", [True, True]]},
+        )
+        write_manifest(directory / f"openaigym.manifest.{name}.manifest.json", manifest)
+
+
+def recorded_answer(name: str) -> dict[str, Any]:
+    """Return what gym made of a directory, by the recorded answers."""
+    return as_ours(json.loads((DATA / "answers.json").read_text())[name])
+
+
+def as_ours(answer: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no tuples."""
+    videos = answer.get("videos")
+    pairs = {} if videos is None else {"videos": [tuple(pair) for pair in videos]}
+    return {**answer, **pairs}
+
+
+def assert_same(ours: Any, gyms: Any, *, but: tuple[str, ...] = ()) -> None:
+    """Compare key by key; keys of `but` are compared elsewhere."""
+    assert list(ours) == list(gyms)
+    for key in [key for key in ours if key not in but]:
+        # NaN is equal to nothing; its text is.
+        assert repr(ours[key]) == repr(gyms[key]), key
+
+
+def test_every_answer_is_asked_for() -> None:
+    """Of the recorded ones."""
+    answers = json.loads((DATA / "answers.json").read_text())
+    assert sorted(answers) == sorted([*RECORDED, "ours"])
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_gym_agreed_on_what_gyms_wrote(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Key by key, except where gym is known to be wrong."""
+    monkeypatch.chdir(DATA)
+    ours, gyms = load(Path(name)), recorded_answer(name)
+    match name.partition("/")[2]:
+        case "no_spec":
+            assert "missing expected key env_id" in gyms["error"]
+        case "two_monitors":
+            # It lists no start for the idle monitor and shifts the types.
+            but = ("initial_reset_timestamps", "episode_types")
+            assert_same(ours, gyms, but=but)
+            starts = ours["initial_reset_timestamps"]
+            assert gyms["initial_reset_timestamps"] == [starts[0], starts[2]]
+            assert gyms["episode_types"] == ["t", "t", "t", "e"]
+        case "empty":
+            assert_same(ours, gyms, but=("initial_reset_timestamps",))
+            assert gyms["initial_reset_timestamps"] == []
+        case _:
+            assert_same(ours, gyms)
+
+
+def test_gym_agreed_on_what_we_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both our files and what we read in them are those that gym was asked about."""
+    monkeypatch.chdir(tmp_path)
+    Path("ours").mkdir()
+    write_ours(Path("ours"))
+    gyms = recorded_answer("ours")
+    assert gyms["episode_types"] == ["t", "t", "e", "e"]
+    assert_same(load(Path("ours")), gyms)
+
+
+def test_a_monitor_writes_the_keys_of_gym(
+    tmp_path: Path, corridor: Any, play: Any
+) -> None:
+    """All of gym 0.21's files, and `mjrec` beside them."""
+    with mjrec.Monitor(corridor, tmp_path) as env:
+        play(env, 1)
+    for kind, added in (("manifest", {"mjrec"}), ("stats", set())):
+        pattern = f"*.{kind}.json"
+        [gyms] = (DATA / "0.21.0" / "plain").glob(pattern)
+        [ours] = tmp_path.glob(pattern)
+        assert keys_of(ours) == keys_of(gyms) | added
+
+
+def keys_of(path: Path) -> set[str]:
+    return set(json.loads(path.read_text()))
+
+
 @pytest.fixture(scope="session")
 def gym_python() -> Path:
     """Return the Python of an environment that holds gym 0.21.0."""
-    tag = f"cp{sys.version_info.major}{sys.version_info.minor}"
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    home = cache / "mjrec-tests" / f"gym-0.21.0-{tag}"
-    home.parent.mkdir(parents=True, exist_ok=True)
-    with home.with_suffix(".lock").open("w") as lock:
-        # Several test processes make it once.
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (home / "complete").exists():
-            shutil.rmtree(home, ignore_errors=True)
-            make_gym_environment(home)
-            (home / "complete").touch()
-    return home / "bin" / "python"
-
-
-def make_gym_environment(home: Path) -> None:
-    """Install gym 0.21.0, which only tools of its own time can build."""
-    run(sys.executable, "-m", "venv", home)
-    python = home / "bin" / "python"
-    pip = (python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
-    run(*pip, "pip==24.0", "setuptools==65.5.1", "wheel==0.38.4")
-    # That setuptools wants a class which Python 3.12 took away, and never uses it.
-    (packages,) = home.glob("lib/python*/site-packages")
-    (packages / "old_setuptools.pth").write_text(
-        "import pkgutil; pkgutil.ImpImporter = "
-        "getattr(pkgutil, 'ImpImporter', type('ImpImporter', (), {}))\n"
-    )
-    numpy = "numpy<2" if sys.version_info < (3, 13) else "numpy<3"
-    run(*pip, "--only-binary=numpy", "--no-build-isolation", "gym==0.21.0", numpy)
+    if "MJREC_TEST_GYM" not in os.environ:
+        pytest.skip("no environment with gym 0.21.0: scripts/test --all makes one")
+    return Path(os.environ["MJREC_TEST_GYM"])
 
 
 def run(*command: str | Path) -> str:
@@ -150,80 +228,28 @@ def run(*command: str | Path) -> str:
     return done.stdout
 
 
-def gym_load_results(python: Path, *directories: Path) -> list[Any]:
+def ask_gym(python: Path, *directories: Path | str) -> dict[str, Any]:
     """Return what gym's own `load_results` returns for each directory."""
     script = TESTS / "legacy" / "gym_load_results.py"
-    results: list[Any] = json.loads(run(python, script, *directories))
-    for result in results:
-        if result is not None and "videos" in result:
-            result["videos"] = [tuple(pair) for pair in result["videos"]]
-    return results
+    answers: dict[str, Any] = json.loads(run(python, script, *directories))
+    return {k: v if v is None else as_ours(v) for k, v in answers.items()}
 
 
-def assert_same(ours: Any, gyms: Any, *, but: tuple[str, ...] = ()) -> None:
-    """Compare key by key; keys of `but` are compared elsewhere."""
-    assert list(ours) == list(gyms)
-    for key in [key for key in ours if key not in but]:
-        # NaN is equal to nothing; its text is.
-        assert repr(ours[key]) == repr(gyms[key]), key
+@pytest.mark.old_gym
+def test_gym_answers_as_recorded(
+    gym_python: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """About all the directories that the tests above compare."""
+    monkeypatch.chdir(tmp_path)
+    for version in VERSIONS:
+        Path(version).symlink_to(DATA / version)
+    Path("ours").mkdir()
+    write_ours(Path("ours"))
+    for name, answer in ask_gym(gym_python, *RECORDED, "ours").items():
+        assert repr(answer) == repr(recorded_answer(name)), name
 
 
-@pytest.mark.legacy
-def test_gym_agrees_on_what_gyms_wrote(gym_python: Path) -> None:
-    """Key by key, except where gym is known to be wrong."""
-    cases = [
-        path for version in VERSIONS for path in sorted((DATA / version).iterdir())
-    ]
-    for directory, gyms in zip(
-        cases, gym_load_results(gym_python, *cases), strict=True
-    ):
-        ours = load(directory)
-        match directory.name:
-            case "no_spec":
-                assert "missing expected key env_id" in gyms["error"]
-            case "two_monitors":
-                # It lists no start for the idle monitor and shifts the types.
-                but = ("initial_reset_timestamps", "episode_types")
-                assert_same(ours, gyms, but=but)
-                starts = ours["initial_reset_timestamps"]
-                assert gyms["initial_reset_timestamps"] == [starts[0], starts[2]]
-                assert gyms["episode_types"] == ["t", "t", "t", "e"]
-            case "empty":
-                assert_same(ours, gyms, but=("initial_reset_timestamps",))
-                assert gyms["initial_reset_timestamps"] == []
-            case _:
-                assert_same(ours, gyms)
-
-
-@pytest.mark.legacy
-def test_gym_agrees_on_what_we_write(gym_python: Path, tmp_path: Path) -> None:
-    """Two monitors of a directory with videos, a key of our own, and infinity."""
-    for monitor, (name, shift) in enumerate([("0.7", 0.0), ("1.7", 0.5)]):
-        stats = StatsFile(
-            initial_reset_timestamp=1790000000.0 + shift,
-            timestamps=(1790000001.0 + shift, 1790000002.0 + shift),
-            episode_lengths=(10, 20),
-            episode_rewards=(math.inf, 0.1 + monitor),
-            episode_types=("t", "e"),
-        )
-        stats_name = f"openaigym.episode_batch.{name}.stats.json"
-        video = f"openaigym.video.{name}.video000000"
-        write_stats_file(tmp_path / stats_name, stats)
-        for suffix in (".mp4", ".meta.json"):
-            (tmp_path / (video + suffix)).touch()
-        manifest = Manifest(
-            stats=stats_name,
-            videos=((f"{video}.mp4", f"{video}.meta.json"),),
-            env_info={"gym_version": "mjrec-1", "env_id": "Hopper-v5"},
-            mjrec={"format": 1, "schedule": ["cubic", [True, True]]},
-        )
-        write_manifest(tmp_path / f"openaigym.manifest.{name}.manifest.json", manifest)
-    (gyms,) = gym_load_results(gym_python, tmp_path)
-    assert gyms["episode_types"] == ["t", "t", "e", "e"]
-    assert_same(load(tmp_path), gyms)
-
-
-@pytest.mark.legacy
+@pytest.mark.old_gym
 def test_gym_agrees_on_what_a_monitor_writes(
     gym_python: Path, tmp_path: Path, corridor: Any, make_corridor: Any, play: Any
 ) -> None:
@@ -236,13 +262,13 @@ def test_gym_agrees_on_what_a_monitor_writes(
         make_corridor(length=2), tmp_path, resume=True, mode="evaluation"
     ) as env:
         play(env, 2)
-    (gyms,) = gym_load_results(gym_python, tmp_path)
+    [gyms] = ask_gym(gym_python, tmp_path).values()
     assert gyms["episode_lengths"] == [3, 3, 2, 2]
     assert gyms["episode_types"] == ["t", "t", "e", "e"]
     assert_same(load(tmp_path), gyms)
 
 
-@pytest.mark.legacy
+@pytest.mark.old_gym
 def test_gym_reads_null_where_we_wrote_nan(gym_python: Path, tmp_path: Path) -> None:
     """The file is JSON; the other episodes' rewards are unharmed."""
     name = "openaigym.episode_batch.0.7.stats.json"
@@ -251,14 +277,14 @@ def test_gym_reads_null_where_we_wrote_nan(gym_python: Path, tmp_path: Path) -> 
     env_info = {"gym_version": "mjrec-1", "env_id": "Hopper-v5"}
     path = tmp_path / "openaigym.manifest.0.7.manifest.json"
     write_manifest(path, Manifest(name, (), env_info, None))
-    (gyms,) = gym_load_results(gym_python, tmp_path)
+    [gyms] = ask_gym(gym_python, tmp_path).values()
     assert gyms["episode_rewards"] == [None, 2.5]
     assert_same(load(tmp_path), gyms, but=("episode_rewards",))
 
 
-@pytest.mark.legacy
+@pytest.mark.old_gym
 def test_gym_agrees_that_there_is_nothing(gym_python: Path, tmp_path: Path) -> None:
     """None for a missing directory and for one without manifests."""
     directories = [tmp_path / "missing", tmp_path]
-    assert gym_load_results(gym_python, *directories) == [None, None]
+    assert list(ask_gym(gym_python, *directories).values()) == [None, None]
     assert [mjrec.load_results(directory) for directory in directories] == [None, None]

@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is drawn from recorded states is what `render()` shows, byte for byte.
-
-A few environments here, all that are installed with MJREC_TEST_ALL=1.
-"""
+"""What is drawn from recorded states is what `render()` shows, byte for byte."""
 
 from __future__ import annotations
 
 import gc
 import importlib.util
 import json
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
+from parts import parametrize
 from recordings import frames_in, metadata_of
 from robots import robotics_ids, robots_that_reset
 
@@ -30,7 +27,6 @@ from mjrec.rendering.workers import DrawingWorkers
 from mjrec.simulation.cameras import raw_data, raw_model
 from mjrec.simulation.inside import simulation_in
 
-ALL = os.environ.get("MJREC_TEST_ALL") == "1"
 HEIGHT, WIDTH = 48, 64
 STEPS = 5
 SEEDS = (3, 4)
@@ -52,8 +48,9 @@ def suite_tasks() -> list[tuple[str, str]]:
     return list(suite.ALL_TASKS)
 
 
-def chosen(names: list[Any], *few: Any) -> list[Any]:
-    return names if ALL else [name for name in names if name in few]
+def every(names: str, cases: list[Any], *default: Any) -> pytest.MarkDecorator:
+    """Try all environments under `scripts/test --all`, and these by default."""
+    return parametrize(names, cases, default=default, part=pytest.mark.environments)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +142,7 @@ def test_quality_that_the_model_asks_for(one_worker: Any, tmp_path: Path) -> Non
     assert not differences(tmp_path, live, one_worker)
 
 
-@pytest.mark.parametrize("env_id", chosen(GYMNASIUM, "HalfCheetah-v5"))
+@every("env_id", GYMNASIUM, "HalfCheetah-v5")
 def test_gymnasium(
     env_id: str, one_worker: Any, three_workers: Any, tmp_path: Path
 ) -> None:
@@ -154,22 +151,17 @@ def test_gymnasium(
     assert not differences(tmp_path, live, one_worker, three_workers)
 
 
-def named_cameras() -> list[tuple[str, str]]:
-    models = [
-        (env_id, gymnasium.make(env_id).unwrapped.model)
-        for env_id in chosen(GYMNASIUM, "Ant-v5")
-    ]
-    return [(i, m.camera(0).name or 0) for i, m in models if m.ncam]
-
-
-@pytest.mark.parametrize(("env_id", "camera"), named_cameras())
-def test_gymnasium_camera_of_the_model(
-    env_id: str, camera: str | int, one_worker: Any, tmp_path: Path
+@every("env_id", GYMNASIUM, "Ant-v5")
+def test_gymnasium_cameras_of_the_model(
+    env_id: str, one_worker: Any, tmp_path: Path
 ) -> None:
-    """A camera that the environment was made with."""
-    argument = "camera_name" if isinstance(camera, str) else "camera_id"
-    live = record(make(env_id, **{argument: camera}), tmp_path)
-    assert not differences(tmp_path, live, one_worker)
+    """Cameras that the environment was made with, by their names or numbers."""
+    model = gymnasium.make(env_id).unwrapped.model
+    for number in range(model.ncam):
+        name = model.camera(number).name
+        camera = {"camera_name": name} if name else {"camera_id": number}
+        live = record(make(env_id, **camera), tmp_path / str(number))
+        assert not differences(tmp_path / str(number), live, one_worker)
 
 
 def test_camera_asked_of_the_monitor(one_worker: Any, tmp_path: Path) -> None:
@@ -210,14 +202,7 @@ def test_camera_and_options_that_the_user_gave(one_worker: Any, tmp_path: Path) 
     assert not differences(tmp_path, [live], one_worker)
 
 
-FEW_ROBOTS = (
-    *("AdroitHandDoor-v1", "PointMaze_UMaze-v3", "AntMaze_UMaze-v5"),
-    *("FetchPickAndPlace-v4", "HandReach-v3"),
-    "HandManipulateBlock_ContinuousTouchSensors-v1",
-)
-
-
-@pytest.mark.parametrize("env_id", chosen(robotics_ids(), *FEW_ROBOTS))
+@every("env_id", robotics_ids(), "FetchPickAndPlace-v4", "AntMaze_UMaze-v5")
 def test_robotics(env_id: str, one_worker: Any, tmp_path: Path) -> None:
     """Also where each `render` moves goals."""
     with robots_that_reset():
@@ -261,11 +246,16 @@ def record_dm(
 
 
 @pytest.mark.dm_control
-@pytest.mark.parametrize("visualize_reward", [False, True])
-@pytest.mark.parametrize("camera", [None, 0])
-@pytest.mark.parametrize(
-    ("domain", "task"),
-    chosen(suite_tasks(), ("quadruped", "escape"), ("finger", "turn_easy")),
+@every(
+    "domain, task, camera, visualize_reward",
+    [
+        (domain, task, camera, visualize_reward)
+        for domain, task in suite_tasks()
+        for camera in (None, 0)
+        for visualize_reward in (False, True)
+    ],
+    ("finger", "turn_easy", None, True),
+    ("quadruped", "escape", 0, False),
 )
 def test_suite(
     domain: str,
@@ -278,14 +268,30 @@ def test_suite(
     """Every task, from two cameras, and with colours that show the reward."""
     from dm_control import suite
 
-    if not ALL and (camera is None) != visualize_reward:
-        pytest.skip("one of each is enough here")
     env = suite.load(
         domain, task, task_kwargs={"random": 5}, visualize_reward=visualize_reward
     )
     draw_quickly(env.physics.model)
     live = record_dm(env, tmp_path, camera=camera)
     assert not differences(tmp_path, live, one_worker)
+
+
+@pytest.mark.dm_control
+@pytest.mark.environments
+@pytest.mark.parametrize(("domain", "task"), suite_tasks())
+def test_further_cameras_of_the_suite(
+    domain: str, task: str, one_worker: Any, tmp_path: Path
+) -> None:
+    """All but the two that are tried above."""
+    from dm_control import suite
+
+    env = suite.load(domain, task, task_kwargs={"random": 5})
+    draw_quickly(env.physics.model)
+    for camera in range(1, env.physics.model.ncam):
+        live = record_dm(env, tmp_path / str(camera), camera=camera)
+        assert not differences(
+            tmp_path / str(camera), live, one_worker, is_seen_to_move=False
+        )
 
 
 def composer_environments() -> dict[str, Callable[[], Any]]:
@@ -313,9 +319,10 @@ def composer_environments() -> dict[str, Callable[[], Any]]:
 
 
 @pytest.mark.dm_control
-@pytest.mark.parametrize("camera", [None, 0])
-@pytest.mark.parametrize(
-    "name", chosen(list(composer_environments()), "reach_site_features")
+@every(
+    "name, camera",
+    [(name, camera) for name in composer_environments() for camera in (None, 0)],
+    ("reach_site_features", None),
 )
 def test_composer(
     name: str, camera: int | None, one_worker: Any, tmp_path: Path
@@ -487,12 +494,10 @@ def monitored(env: Any, directory: Path, **options: Any) -> Any:
     )
 
 
-@pytest.mark.parametrize(
+@every(
     "env_id",
-    [
-        "HalfCheetah-v5",
-        *chosen(robotics_ids(), "FetchPickAndPlace-v4", "HandManipulateBlock-v1"),
-    ],
+    ["HalfCheetah-v5", *robotics_ids()],
+    *("HalfCheetah-v5", "FetchPickAndPlace-v4", "HandManipulateBlock-v1"),
 )
 def test_recording_disturbs_nothing(env_id: str, tmp_path: Path) -> None:
     """Everything is bit for bit as without, also where render() would change it."""

@@ -132,6 +132,7 @@ def test_record_says_which_videos_are_pending(
     assert episode["pending"] is True
 
 
+@pytest.mark.thorough
 def test_record_renders_what_it_promises(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -146,6 +147,7 @@ def test_record_renders_what_it_promises(
     assert metadata["quality"] == "draft"
 
 
+@pytest.mark.thorough
 def test_record_without_any_gl(tmp_path: Path) -> None:
     """On a machine, or in a process, that has none."""
     command = [*RECORD, "--seed", "0", "--workers", "0"]

@@ -287,6 +287,7 @@ def test_what_was_begun_again_is_never_chosen(tmp_path: Path) -> None:
     check_settled(folder, settle_best(folder))
 
 
+@pytest.mark.thorough
 def test_a_settled_folder_can_be_packed_and_verified(
     folder: Path, tmp_path: Path
 ) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from slurm_cluster import lack_of_slurm, slurm_cluster
+from slurm_cluster import slurm_cluster
 from waiting import wait_until
 
 from mjrec.engines.job_folder import Pace
@@ -25,9 +25,7 @@ pytest.importorskip("submitit")
 # Slurm looks at its queue once in a while.
 until = functools.partial(wait_until, seconds=60)
 
-lack = lack_of_slurm()
-if lack and os.environ.get("MJREC_TEST_SLURM") != "1":
-    pytest.skip(lack, allow_module_level=True)
+pytestmark = pytest.mark.slurm
 
 
 @pytest.fixture(scope="module")

@@ -127,6 +127,7 @@ def test_jobs_can_be_submitted_while_results_come(tmp_path: Path) -> None:
         assert list(outcomes(run)) == ["later"]
 
 
+@pytest.mark.thorough
 def test_hundreds_of_small_jobs(tmp_path: Path) -> None:
     """Each once, however many workers try for them."""
     keys = [str(number) for number in range(300)]
@@ -135,6 +136,7 @@ def test_hundreds_of_small_jobs(tmp_path: Path) -> None:
         assert sorted(o.key for o in run.results() if o) == sorted(keys)
 
 
+@pytest.mark.thorough
 def test_jobs_run_beside_each_other(tmp_path: Path) -> None:
     """In two Slurm jobs, or in one that holds two workers."""
     for per_job in (1, 2):
@@ -185,6 +187,7 @@ def test_workers_are_where_the_driver_is(
     assert value["threads"] == "3"
 
 
+@pytest.mark.thorough
 def test_a_large_payload_is_read_once_by_each_slurm_job(tmp_path: Path) -> None:
     """It is one file, which is of no use once the workers have begun."""
     payload = os.urandom(1 << 20) * 200
@@ -240,6 +243,7 @@ def test_what_a_handler_raises_is_the_outcome(
     assert "The job bad failed" in caplog.text
 
 
+@pytest.mark.thorough
 def test_jobs_that_kill_their_workers(tmp_path: Path) -> None:
     """Once is chance, and three times is the job; all others come through."""
     with begun(tmp_path) as run:
@@ -266,6 +270,7 @@ def test_a_handler_that_cannot_be_made(tmp_path: Path) -> None:
 # Slurm jobs that end
 
 
+@pytest.mark.thorough
 def test_a_host_that_is_killed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -284,6 +289,7 @@ def test_a_host_that_is_killed(
     assert str(folder_in(tmp_path).logs) in caplog.messages[-1]
 
 
+@pytest.mark.thorough
 def test_a_host_that_is_told_to_end(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -299,6 +305,7 @@ def test_a_host_that_is_told_to_end(
     assert not (tmp_path / "shared").exists()
 
 
+@pytest.mark.thorough
 def test_a_host_whose_time_will_be_over(tmp_path: Path) -> None:
     """It is at its job to the end, and another Slurm job does the next."""
     with begun(tmp_path) as run:
@@ -334,6 +341,7 @@ def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path: Path) -> None:
     assert str(folder_in(tmp_path).logs) in str(raised.value)
 
 
+@pytest.mark.thorough
 def test_hosts_that_have_nothing_to_do_end(tmp_path: Path) -> None:
     """And there are others when there is something again."""
     pace = Pace(poll_s=0.05, look_s=0.1, beat_s=0.1, idle_s=0.3)
@@ -386,6 +394,7 @@ def test_ctrl_c_while_results_come(tmp_path: Path) -> None:
     assert lines(tmp_path / "closed") == [str(pid)]
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_in_a_terminal(tmp_path: Path) -> None:
     """It reaches all processes there, of which only the driver takes it to heart."""
     script = DRIVER.replace("run = engine.begin(work)", "run = start(engine, work)")
@@ -460,6 +469,7 @@ def killed_driver(place: Path, silent_s: float) -> Iterator[None]:
     yield
 
 
+@pytest.mark.thorough
 def test_hosts_of_a_killed_driver_end(tmp_path: Path, mark: str) -> None:
     """They finish what they are at, and take no more."""
     with killed_driver(tmp_path, silent_s=1):
@@ -474,6 +484,7 @@ def test_hosts_of_a_killed_driver_end(tmp_path: Path, mark: str) -> None:
     assert pid in lines(tmp_path / "closed")
 
 
+@pytest.mark.thorough
 def test_the_next_driver_ends_what_a_killed_one_has_left(
     tmp_path: Path, mark: str
 ) -> None:
@@ -488,6 +499,7 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(
     assert list((tmp_path / "shared").iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_another_driver_that_is_alive_is_left_alone(tmp_path: Path) -> None:
     """Two runs in one directory do not know of each other."""
     with begun(tmp_path) as one, begun(tmp_path) as other:
@@ -607,6 +619,7 @@ assert "SUBMITIT_LOG_LEVEL" not in os.environ
 # Evaluations
 
 
+# Takes more than five seconds: the same evaluation here and through submitit.
 def test_an_evaluation_in_slurm_jobs_is_that_of_this_machine(tmp_path: Path) -> None:
     """Results, trajectories and videos, however their jobs were handed out."""
     there = run_small(tmp_path / "there", keep="best", engine=engine(2), workers=None)
@@ -633,6 +646,7 @@ mjrec.evaluate(
 """
 
 
+@pytest.mark.thorough
 def test_a_killed_evaluation_goes_on_where_it_was(tmp_path: Path, mark: str) -> None:
     """Of its driver; what is finished, by hosts that live on too, is not repeated."""
 

@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from forged_episodes import copied, episode, forge, physics_of
+from parts import parametrize
 
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment
@@ -108,7 +109,7 @@ def put(layout: RowLayout, packed: Any, name: str, values: Any) -> None:
     packed[:, field.offset : field.offset + field.array.size] = raw
 
 
-@pytest.mark.parametrize("name", ["HalfCheetah-v5", "Hopper-v5", "Ant-v5"])
+@parametrize("name", ["HalfCheetah-v5", "Hopper-v5", "Ant-v5"])
 def test_gymnasium_draws_what_steps_leave(name: str, tmp_path: Path) -> None:
     """Bodies are where they were before the last physics step."""
     check = of_pictures(record_gymnasium(tmp_path / "run", name))
@@ -116,6 +117,7 @@ def test_gymnasium_draws_what_steps_leave(name: str, tmp_path: Path) -> None:
     assert check.reason == "bit for bit, 9 pictures"
 
 
+@pytest.mark.thorough
 @needs_dm_control
 @pytest.mark.parametrize(
     "task", ["reacher-easy", "finger-turn_hard", "point_mass-hard", "ball_in_cup-catch"]
@@ -146,6 +148,7 @@ def test_mjcf_draws_tendons_and_rays(tmp_path: Path) -> None:
     assert check.reason == "bit for bit, 31 pictures"
 
 
+@pytest.mark.thorough
 def test_some_pictures_are_asked_of_where_there_is_no_video(tmp_path: Path) -> None:
     """What nobody is shown costs little: the first, the last, and some between."""
     env = gymnasium.make("Pusher-v5")
@@ -158,6 +161,7 @@ def test_some_pictures_are_asked_of_where_there_is_no_video(tmp_path: Path) -> N
     assert of_pictures(directory).verdict is Verdict.FAIL
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("field", ["geom_xpos", "geom_xmat", "light_xpos"])
 def test_last_place_of_anything_drawn_is_seen(
     field: str, pusher: Path, tmp_path: Path

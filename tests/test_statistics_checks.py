@@ -32,11 +32,9 @@ from mjrec.schedules import record_all
 
 
 @pytest.fixture(scope="module")
-def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def honest(pendulums: Callable[..., Path]) -> Path:
     """Recordings of three episodes, all with states, the first two with videos."""
-    folder = tmp_path_factory.mktemp("recorded") / "honest"
-    record_pendulum(folder, mode="evaluation")
-    return folder
+    return pendulums(3, mode="evaluation")
 
 
 @pytest.fixture
@@ -277,6 +275,7 @@ def test_function_of_the_users_is_not_checkable_but_its_answers_are(
     assert any("a function of the user's" in reason for reason in unknown(tmp_path))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rule", ["best:1", "worst:2", "median", "failures:1"])
 def test_rule_that_chose_after_the_end_is_asked_again(
     rule: str, tmp_path: Path
@@ -296,6 +295,7 @@ def test_rule_that_chose_after_the_end_is_asked_again(
     assert any(subject.startswith("recording") for subject in subjects)
 
 
+@pytest.mark.thorough
 def test_failures_of_older_journals_are_not_checkable(tmp_path: Path) -> None:
     """They do not say what the environment said of success."""
     record_pendulum(tmp_path, 4, longest=30, keep="failures:1", mode="evaluation")
@@ -335,6 +335,7 @@ def test_video_rendered_later_of_an_episode_nobody_chose_is_told(
     assert any("of episodes 2, which no schedule" in why for why in unknown(recordings))
 
 
+@pytest.mark.thorough
 def test_episode_that_was_begun_at_the_end_passes(tmp_path: Path) -> None:
     """Its number was decided about, and there was no step of it."""
     env = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array", width=32)
@@ -347,6 +348,7 @@ def test_episode_that_was_begun_at_the_end_passes(tmp_path: Path) -> None:
     assert failures(tmp_path) == []
 
 
+@pytest.mark.thorough
 def test_recovered_recordings_pass(tmp_path: Path) -> None:
     """What a killed process did not say is not checkable."""
     record_pendulum(tmp_path, 2)
@@ -369,6 +371,7 @@ def test_episodes_that_were_taken_out_are_told(recordings: Path) -> None:
     assert any("no line of the journal" in why for _, why in failures(recordings))
 
 
+@pytest.mark.thorough
 def test_episodes_without_states_are_counted(tmp_path: Path) -> None:
     """One line, with their number."""
     record_pendulum(tmp_path)
@@ -414,6 +417,7 @@ def test_damaged_trajectory_is_a_failure_and_no_error(recordings: Path) -> None:
     assert "cannot be read" in reason
 
 
+@pytest.mark.thorough
 def test_chosen_videos_of_a_packed_run_are_told_apart_from_lost_ones(
     honest: Path, tmp_path: Path
 ) -> None:

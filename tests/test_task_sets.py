@@ -29,6 +29,7 @@ def test_gymnasium_mujoco_is_the_newest_version_of_each() -> None:
     assert set(tasks) <= set(gymnasium.registry)
 
 
+@pytest.mark.thorough
 @pytest.mark.dm_control
 def test_sets_of_the_suite_are_the_suites_own() -> None:
     """Sorted, so that no version of dm_control gives them in another order."""

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from parts import parametrize
 from recordings import frames_of, manifest_of
 
 import mjrec
@@ -149,7 +150,7 @@ def test_tracker_given_twice_is_an_error(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("render", ["live", "deferred"])
+@parametrize("render", ["live", "deferred"])
 def test_videos_of_several_cameras_are_told_apart(tmp_path: Path, render: str) -> None:
     """By what their names say; the first camera's by nothing."""
     tracker = Listening()

@@ -695,6 +695,7 @@ def interrupt_in(monitor: Any, event_number: int) -> bool:
     return False
 
 
+# Takes more than five seconds: an episode for each place of an interruption.
 @pytest.mark.parametrize(
     ("max_fps", "schedule"),
     [(None, lambda _: True), (8, lambda _: True), (None, False)],

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from parts import parametrize
 
 suite = pytest.importorskip("dm_control.suite", reason="dm_control not installed")
 
@@ -67,7 +68,7 @@ def recorded(env: Any, directory: Path, *, camera: Any = None, **steps: Any) -> 
     return trajectory
 
 
-@pytest.mark.parametrize(
+@parametrize(
     ("domain", "task", "camera"),
     [
         ("cheetah", "run", None),

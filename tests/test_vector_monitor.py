@@ -108,6 +108,7 @@ def test_statistics_are_those_of_gymnasium(tmp_path: Path, mode: Any) -> None:
     assert env.get_total_steps() == sum(m.get_total_steps() for m in env.monitors)
 
 
+# Takes more than five seconds: each sub-environment is drawn alone, too.
 def test_terminal_frames_are_those_of_render(tmp_path: Path) -> None:
     """In SAME_STEP the deferred frames are byte for byte those of one environment."""
     with mjrec.Monitor(hoppers(SAME_STEP), tmp_path) as env:
@@ -213,6 +214,7 @@ def test_mode_is_that_of_all(corridors: Any, tmp_path: Path) -> None:
 # --- one rendering for all ---------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_one_process_renders_for_all(tmp_path: Path) -> None:
     """Several sub-environments with ended episodes start one server."""
     before = children()
@@ -223,6 +225,7 @@ def test_one_process_renders_for_all(tmp_path: Path) -> None:
     assert all(path_of(monitor, 0, "mp4").exists() for monitor in env.monitors)
 
 
+@pytest.mark.thorough
 def test_one_that_closes_leaves_the_others_their_rendering(tmp_path: Path) -> None:
     """The service stops with the last."""
     with mjrec.Monitor(hoppers(SAME_STEP), tmp_path, lambda n: n < 2) as env:

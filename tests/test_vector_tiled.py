@@ -172,6 +172,7 @@ def drawn_by(env: Any) -> Any:
     return env.render()
 
 
+# Takes more than five seconds: every environment alone, and all in one video.
 def test_pixels_are_those_of_each_environment(tmp_path: Path) -> None:
     """Each tile is what its own environment's `render()` gives."""
     view = {"render_mode": "rgb_array", "width": 64, "height": 64}

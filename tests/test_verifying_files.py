@@ -15,7 +15,6 @@ from packed_runs import (
     edit_json,
     make_bag_fit,
     make_manifests_fit,
-    record_pendulum,
     the,
     unpacked,
     zipped,
@@ -29,11 +28,12 @@ from mjrec.evidence.verifying.task import Task
 
 
 @pytest.fixture(scope="module")
-def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def packed(
+    pendulums: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A packed run of three episodes, two with videos."""
-    folder = tmp_path_factory.mktemp("packed")
-    record_pendulum(folder / "recorded", mode="evaluation")
-    return mjrec.pack(folder / "recorded", folder / "run.zip", title="Pendulum")
+    path = tmp_path_factory.mktemp("packed") / "run.zip"
+    return mjrec.pack(pendulums(3, mode="evaluation"), path, title="Pendulum")
 
 
 @pytest.fixture
@@ -57,6 +57,7 @@ def test_packed_run_passes(packed: Path) -> None:
     assert {check.level for check in verification.checks} == {Level.FILES, Level.STATS}
 
 
+@pytest.mark.thorough
 def test_unpacked_run_passes(bag: Path) -> None:
     """As `unzip` leaves it, by its own folder or by the one around it."""
     for path in (bag, bag.parent):
@@ -351,6 +352,7 @@ def test_options_are_checked_first(
         mjrec.verify(packed, **options)  # type: ignore[arg-type]  # that is the point
 
 
+@pytest.mark.thorough
 def test_others_files_beside_recordings_are_nobodys_business(
     packed: Path, tmp_path: Path
 ) -> None:
@@ -363,6 +365,7 @@ def test_others_files_beside_recordings_are_nobodys_business(
     assert failure.subject == "openaigym.evil.txt"
 
 
+@pytest.mark.thorough
 def test_facts_say_what_was_verified_with_what(packed: Path) -> None:
     """The archive's hash among them, for whoever keeps the verdict."""
     facts = mjrec.verify(packed, level="files", seed=3).facts

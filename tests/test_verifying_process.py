@@ -16,7 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from packed_runs import edit_trajectory, record_pendulum, the
+from packed_runs import edit_trajectory, the
+from parts import parametrize
 from processes import children
 
 import mjrec
@@ -27,11 +28,9 @@ from mjrec.formats.locks import Lock
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recordings(pendulums: Callable[..., Path]) -> Path:
     """One episode with a video."""
-    folder = tmp_path_factory.mktemp("recorded") / "recordings"
-    record_pendulum(folder, 1)
-    return folder
+    return pendulums(1)
 
 
 @pytest.fixture
@@ -123,6 +122,7 @@ def test_process_has_its_limits_and_no_trust(
     assert limits["Max core file size"].split()[0] == "0"
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_interruption_leaves_nothing(recordings: Path, temporary: Path) -> None:
     """Ctrl-C: no process, no temporary folder."""
     before = children()
@@ -136,6 +136,7 @@ def test_interruption_leaves_nothing(recordings: Path, temporary: Path) -> None:
     assert list(temporary.iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_nothing_is_left_after_a_verification(
     recordings: Path, temporary: Path
 ) -> None:
@@ -147,6 +148,7 @@ def test_nothing_is_left_after_a_verification(
     assert list(temporary.iterdir()) == []
 
 
+@pytest.mark.thorough
 def test_folders_that_killed_verifications_left_are_removed(
     recordings: Path, temporary: Path
 ) -> None:
@@ -190,7 +192,7 @@ def test_process_ends_with_its_parent(recordings: Path, tmp_path: Path) -> None:
     assert ended
 
 
-@pytest.mark.parametrize(
+@parametrize(
     "environment",
     [
         {"id": "Evil-v0", "entry_point": "subprocess:check_output"},
@@ -230,6 +232,7 @@ def test_code_that_an_archive_names_is_not_run(
     assert not any("come to an end" in check.claim for check in verification.checks)
 
 
+@pytest.mark.thorough
 def test_model_that_includes_files_from_outside_is_not_compiled(
     recordings: Path, tmp_path: Path
 ) -> None:

@@ -31,6 +31,7 @@ def record(directory: Path, domain: str, task: str) -> None:
     env.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("domain", "task", "has_sources"),
     [("cheetah", "run", True), ("swimmer", "swimmer6", False)],

@@ -617,6 +617,7 @@ HELD = {
 }
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.usefixtures("no_process_stays")
 @pytest.mark.parametrize("end", ["close", "abort"])
 @pytest.mark.parametrize("held", HELD)
@@ -658,6 +659,7 @@ def test_an_interrupted_close_can_be_called_again(
     assert sorted(one.name for one in out.iterdir()) == ["a.framehash", "a.mp4"]
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.usefixtures("no_process_stays")
 # What an interruption keeps the decoder's pipes from, garbage collection does.
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
@@ -707,6 +709,7 @@ def close_interrupted_at(video: VideoWriter, point: int) -> bool:
     return False
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.usefixtures("no_process_stays")
 def test_an_interrupted_abort_can_be_called_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -759,6 +762,7 @@ def test_a_video_is_written_in_an_exit_hook(tmp_path: Path) -> None:
     assert shown == list(range(20))
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.usefixtures("no_process_stays")
 def test_ctrl_c_within_a_frame_gives_the_video_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -831,6 +835,7 @@ def test_a_killed_parent_leaves_a_playable_temporary_file(tmp_path: Path) -> Non
     assert 30 < len(read(left)) <= 100
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_in_the_terminal_does_not_end_the_encoder(tmp_path: Path) -> None:
     """SIGINT to the whole process group: the frames so far become the video."""
     code = (

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints what gym's own `load_results` makes of directories, as a list of JSON.
+"""Prints what gym's own `load_results` makes of directories, as one JSON object.
 
-Run in an environment that holds gym 0.21.0::
+Run in an environment that holds gym 0.21.0, beside the directories, whose names are the
+object's keys. So `answers.json` was made::
 
-    python tests/legacy/gym_load_results.py DIRECTORY ...
+    cd tests/data/gym
+    python ../../legacy/gym_load_results.py [0-9]*/* ours > answers.json
 
-Where gym raises, the item is `{"error": ...}`.
+`ours` was written by `write_ours` of `test_results_gym.py`, and removed again.
+Where gym raises, the value is `{"error": ...}`.
 """
 
 import importlib.metadata
@@ -30,4 +33,5 @@ def load(directory):
         return {"error": repr(error)}
 
 
-print(json.dumps([load(directory) for directory in sys.argv[1:]]))  # noqa: T201  read by the test
+results = {directory: load(directory) for directory in sys.argv[1:]}
+print(json.dumps(results, indent=1))  # noqa: T201  read by the test
