@@ -154,3 +154,16 @@ def make_and_die(settings: Mapping[str, Any], payload: bytes | None) -> OddJobs:
         file.write("begun\n")
     print("a library is missing", flush=True)
     os._exit(3)
+
+
+def make_and_be_told_to_end(
+    settings: Mapping[str, Any], payload: bytes | None
+) -> OddJobs:
+    """As a SIGTERM may come while modules are imported: in a class's body."""
+
+    class Ends:
+        def __set_name__(self, owner: type, name: str) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    type("Imported", (), {"part": Ends()})
+    return OddJobs(settings, payload)

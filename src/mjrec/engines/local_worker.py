@@ -45,8 +45,6 @@ from ..gl.given_gpu import render_on_given_gpu
 from ..signals import Terminated, exiting_on_signals, received
 from .work import Handler
 
-__all__ = ["SECONDS_TO_CLOSE", "main"]
-
 # Not `__name__`, which is `__main__`.
 logger = logging.getLogger("mjrec.engines.local_worker")
 
@@ -161,6 +159,9 @@ def _handler(work: int, parent: _Parent) -> Handler:
         make = operator.attrgetter(name)(importlib.import_module(module))
         handler: Handler = make(facts["settings"], payload)
     except Exception as error:
+        # Python 3.11 turns what is raised inside a class's body into a RuntimeError.
+        if terminated := received():
+            raise terminated from error
         parent.say(error=carried(error))
         raise SystemExit(1) from error
     return handler
