@@ -60,7 +60,9 @@ def test_rate_of_any_timestep_fits_a_video_file(timestep: float) -> None:
     assert float(rate) * timestep == pytest.approx(1, rel=1e-6)
 
 
-@pytest.mark.parametrize("timestep", [0.0, -0.1, float("nan"), float("inf")])
+@pytest.mark.parametrize(
+    "timestep", [0.0, -0.1, float("nan"), float("inf"), 9e-7, 4e-7, 5e-324]
+)
 def test_impossible_timestep_is_an_error(timestep: float) -> None:
     """Time goes forward."""
     with pytest.raises(InvalidArgument, match="timestep"):

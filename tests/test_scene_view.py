@@ -57,6 +57,8 @@ def test_facts_are_json_and_come_back_as_the_same_view(view: SceneView) -> None:
         {"option": "all"},
         {"max_geom": 0},
         {"max_geom": True},
+        {"max_geom": 1 << 40},
+        {"height": 1 << 40},
         {"height": "48"},
         {"width": None},
     ],
@@ -75,6 +77,10 @@ def test_facts_that_cannot_be_are_refused(view: SceneView, change: Any) -> None:
         ("camera", "type", None),
         ("option", "flags", [True]),
         ("option", "label", [1]),
+        ("option", "label", 1 << 30),
+        ("option", "label", -1),
+        ("option", "frame", 0.5),
+        ("option", "frame", 1 << 30),
     ],
 )
 def test_members_that_cannot_be_are_refused(

@@ -10,8 +10,6 @@ from fractions import Fraction
 
 from .errors import InvalidArgument
 
-__all__ = ["MAX_DENOMINATOR", "rate_from_timestep", "stride_for", "to_rate"]
-
 # Floats are binary; this finds the fraction that was meant (0.05 is 1/20) and errs by
 # less than a millionth of a millionth of a second.
 MAX_DENOMINATOR = 10**6
@@ -59,11 +57,13 @@ def rate_from_timestep(timestep: float) -> Fraction:
     """Return the rate of one frame every `timestep` seconds.
 
     Raises:
-        InvalidArgument: `timestep` is not a positive, finite number.
+        InvalidArgument: `timestep` is not a finite number, or is less than a
+            microsecond, which no video file can say.
     """
-    if not math.isfinite(timestep) or timestep <= 0:
+    if not math.isfinite(timestep) or timestep < 1 / MAX_DENOMINATOR:
         raise InvalidArgument(
-            f"A timestep must be a positive number of seconds, got {timestep}."
+            "A timestep must be a number of seconds, at least "
+            f"{1 / MAX_DENOMINATOR:g}, got {timestep}."
         )
     rate = 1 / Fraction(timestep).limit_denominator(MAX_DENOMINATOR)
     # Steps of more than a second have numerators that no video file takes.

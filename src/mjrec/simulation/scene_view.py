@@ -25,7 +25,10 @@ from .struct_memory import (
     read_member,
 )
 
-__all__ = ["SceneView", "ViewMemory", "scene_view_from_facts"]
+# A scene's memory is a quarter of a kilobyte for each.
+_MOST_GEOMS = 1 << 20
+# OpenGL's own limits are below it.
+_LARGEST = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,7 +93,7 @@ def scene_view_from_facts(facts: Mapping[str, Any]) -> SceneView:
     return SceneView(
         camera=camera,
         option=option,
-        max_geom=_whole(facts, "max_geom"),
+        max_geom=_whole(facts, "max_geom", most=_MOST_GEOMS),
         fresh=facts.get("fresh") is True,
         height=_whole(facts, "height"),
         width=_whole(facts, "width"),
@@ -156,6 +159,13 @@ def _set_struct(struct: Any, values: object, what: str) -> None:
         _set_member(struct, name, values[name], what)
 
 
+# The visualiser looks these up in tables of its own, without a look at their bounds.
+_KINDS = {
+    "label": int(mujoco.mjtLabel.mjNLABEL),
+    "frame": int(mujoco.mjtFrame.mjNFRAME),
+}
+
+
 def _set_member(struct: object, name: str, value: Any, what: str) -> None:
     present = getattr(struct, name)
     given = np.asarray(value)
@@ -164,17 +174,23 @@ def _set_member(struct: object, name: str, value: Any, what: str) -> None:
             f"{name} of a {what} has to be numbers of the shape {np.shape(present)} in "
             f"MuJoCo {mujoco.__version__}, got {value!r:.200}."
         )
+    if name in _KINDS and given.item() not in range(_KINDS[name]):
+        raise InvalidArgument(
+            f"{name} of a {what} has to be from 0 to {_KINDS[name] - 1} in MuJoCo "
+            f"{mujoco.__version__}, got {value!r:.200}."
+        )
     if isinstance(present, np.ndarray):
         present[...] = given
     else:
         setattr(struct, name, type(present)(given.item()))
 
 
-def _whole(facts: Mapping[str, Any], name: str) -> int:
+def _whole(facts: Mapping[str, Any], name: str, *, most: int = _LARGEST) -> int:
     value = facts.get(name)
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+    if type(value) is not int or not 1 <= value <= most:
         raise InvalidArgument(
-            f"{name} of a scene has to be a whole number of at least 1, got {value!r}."
+            f"{name} of a scene has to be a whole number from 1 to {most}, got "
+            f"{value!r:.100}."
         )
     return value
 
