@@ -16,8 +16,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-__all__ = ["ChildFailed", "call"]
-
 Answer = TypeVar("Answer")
 
 _ROOT = Path(__file__).parents[1]

@@ -27,8 +27,6 @@ from .setups import (
     suite_environment,
 )
 
-__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure", "record_and_finish"]
-
 TITLE = "Disk: bytes of an episode, every step captured"
 
 

@@ -21,8 +21,6 @@ from .children import call
 from .results import Result
 from .rounds import Say, take_turns
 
-__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure", "write_video"]
-
 TITLE = "Encoding: frames per second that VideoWriter writes, close() included"
 
 _VARIANTS: Mapping[str, dict[str, Any]] = {

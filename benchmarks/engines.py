@@ -17,8 +17,6 @@ from .process_memory import peak_memory
 from .results import Result
 from .rounds import Say, take_turns
 
-__all__ = ["FULL", "QUICK", "TITLE", "Idle", "Settings", "measure"]
-
 TITLE = "Engines: jobs in which nothing is done, in processes of this machine"
 
 

@@ -16,8 +16,6 @@ from .children import call
 from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 
-__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure"]
-
 TITLE = "Evaluating: the random policy in the suite, without videos"
 
 # Of all sizes, in the order of the alphabet: what takes long does not come first.

@@ -14,8 +14,6 @@ from mjrec.formats.ffmpeg import ffmpeg_version
 from mjrec.gl import probe
 from mjrec.machine import usable_cpus
 
-__all__ = ["Machine", "examine"]
-
 _PACKAGES = (
     *("mjrec", "mujoco", "gymnasium", "dm-control", "numpy", "h5py"),
     *("imageio-ffmpeg", "moviepy"),

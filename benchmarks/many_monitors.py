@@ -37,8 +37,6 @@ from mjrec.formats.monitor_directory import (
 )
 from mjrec.formats.stats_file import StatsFile, write_stats_file
 
-__all__ = ["TASK", "results_of", "write_evaluation", "write_monitors"]
-
 TASK = "InvertedPendulum-v5"
 
 _START = 1.79e9

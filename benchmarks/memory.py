@@ -15,8 +15,6 @@ from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 from .setups import BARE, MONITOR, RECORD_VIDEO, Setup, has_moviepy, random_actions
 
-__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure", "record_episode"]
-
 TITLE = "Memory: peak of the simulation's process in one episode of HalfCheetah-v5"
 
 _BARE, _PENDING, _DRAWN = "bare", "workers=0", "workers=1"

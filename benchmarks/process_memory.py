@@ -6,8 +6,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-__all__ = ["peak_memory"]
-
 _PEAK = re.compile(r"^VmHWM:\s+(\d+) kB$", re.MULTILINE)
 
 

@@ -22,18 +22,6 @@ from .results import Reference, Result, at_least
 from .rounds import Say, take_turns
 from .setups import MONITOR, UNENDING, Setup, random_actions
 
-__all__ = [
-    "FULL",
-    "QUICK",
-    "TITLE",
-    "Settings",
-    "draw_as_worker",
-    "draw_bare",
-    "draw_through_render",
-    "measure",
-    "record_states",
-]
-
 TITLE = "Rendering: frames per second of one process, same model, size and states"
 
 

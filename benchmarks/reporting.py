@@ -27,8 +27,6 @@ from .process_memory import peak_memory
 from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 
-__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure"]
-
 TITLE = "Reporting: a training of many episodes on a page"
 
 _LOADED, _WRITTEN, _OPENED = "results loaded", "report written", "page opened"

@@ -9,8 +9,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Promise", "Reference", "Result", "at_least", "at_most"]
-
 
 @dataclass(frozen=True)
 class Promise:

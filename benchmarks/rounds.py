@@ -6,8 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping
 from typing import TypeVar
 
-__all__ = ["Say", "take_turns"]
-
 Key = TypeVar("Key", bound=Hashable)
 Sample = TypeVar("Sample")
 # Tells somebody who waits what is being done.

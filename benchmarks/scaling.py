@@ -35,8 +35,6 @@ from .process_memory import peak_memory
 from .results import Promise, Reference, Result, at_most
 from .rounds import Say, take_turns
 
-__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure"]
-
 TITLE = "Scaling: a directory into which many monitors have recorded"
 
 # What a reader keeps of a monitor with ten episodes, and what any reader needs.

@@ -16,20 +16,6 @@ import numpy as np
 
 import mjrec
 
-__all__ = [
-    "BARE",
-    "MONITOR",
-    "RECORD_VIDEO",
-    "SUITE",
-    "UNENDING",
-    "Setup",
-    "has_moviepy",
-    "is_there",
-    "random_actions",
-    "seconds_to_step",
-    "suite_environment",
-]
-
 BARE, MONITOR, RECORD_VIDEO = "bare", "mjrec.Monitor", "RecordVideo"
 
 # The names of dm_control's tasks begin with it.

@@ -24,8 +24,6 @@ from .setups import (
     seconds_to_step,
 )
 
-__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure", "run_episodes"]
-
 TITLE = "Stepping: steps per second, resets included"
 
 _BARE = "bare"

@@ -9,8 +9,6 @@ from rich.table import Table
 
 from .results import Result
 
-__all__ = ["table_of"]
-
 _COLUMNS = ("", "median", "half within", "compared", "half within", "promise", "kept")
 
 

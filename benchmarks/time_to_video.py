@@ -24,17 +24,6 @@ from .setups import (
     random_actions,
 )
 
-__all__ = [
-    "CASES",
-    "FULL",
-    "QUICK",
-    "TITLE",
-    "Case",
-    "Settings",
-    "make_video",
-    "measure",
-]
-
 TITLE = "Time to video: seconds from reset to the finished mp4 of one episode"
 
 

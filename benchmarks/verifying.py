@@ -30,8 +30,6 @@ from .results import Reference, Result, at_most
 from .rounds import Say, take_turns
 from .setups import random_actions, seconds_to_step
 
-__all__ = ["FULL", "QUICK", "TITLE", "Settings", "measure"]
-
 TITLE = "Verifying: physics of recorded episodes of HalfCheetah-v5"
 
 _ENV_ID = "HalfCheetah-v5"

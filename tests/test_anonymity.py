@@ -23,8 +23,9 @@ from identity_search import find
 from PIL import Image, PngImagePlugin
 
 import mjrec
-from mjrec.evidence.packing.anonymity import make_anonymous, remaining_identity
+from mjrec.evidence.packing.anonymity import make_anonymous
 from mjrec.evidence.packing.identity import Identity
+from mjrec.evidence.packing.identity_traces import remaining_identity
 from mjrec.evidence.verification import Verdict
 from mjrec.json_text import loads
 
@@ -42,7 +43,8 @@ WORDS = (
 # What is run as that person, with the directory and the authors.
 _ANONYMOUS = """
 import sys, pathlib
-from mjrec.evidence.packing.anonymity import make_anonymous, remaining_identity
+from mjrec.evidence.packing.anonymity import make_anonymous
+from mjrec.evidence.packing.identity_traces import remaining_identity
 from mjrec.evidence.packing.identity import identity_of_user
 from mjrec.formats.manifest import read_manifest
 for directory in map(pathlib.Path, sys.argv[1:]):
@@ -184,6 +186,7 @@ def test_nothing_of_the_identity_is_left(somebody: Somebody, anonymous: Path) ->
     assert find(anonymous, [*WORDS, somebody.commit]) == []
 
 
+@pytest.mark.thorough
 def test_nothing_of_the_identity_is_packed(
     somebody: Somebody, packed: dict[str, Path]
 ) -> None:
@@ -317,6 +320,7 @@ def test_pictures_are_the_same(anonymous: Path) -> None:
     assert again == [line.split()[-1] for line in lines if not line.startswith("#")]
 
 
+@pytest.mark.thorough
 def test_what_was_packed_can_be_verified(packed: dict[str, Path]) -> None:
     """Whatever one file says of another still holds."""
     for archive in packed["anonymous"].iterdir():

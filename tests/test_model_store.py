@@ -24,10 +24,9 @@ from PIL import Image
 
 from mjrec.errors import FileNotWritten, UnreadableFile
 from mjrec.simulation import model_store
+from mjrec.simulation.authored_model import AuthoredModel, authored_from_file
 from mjrec.simulation.model_store import (
-    AuthoredModel,
     ModelStore,
-    authored_from_file,
     load_model,
 )
 from mjrec.simulation.model_trust import seal_of

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from .errors import MissingDependency
 from .frames import Frame
 
-__all__ = ["Caption", "annotated", "check_annotation", "pillow_version"]
-
 # Of a frame's height, in pixels of letters; and what can still be read.
 _LETTERS = 30
 _LARGEST_LETTERS = 64

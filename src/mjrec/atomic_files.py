@@ -15,8 +15,6 @@ from pathlib import Path
 
 from .errors import FileNotWritten
 
-__all__ = ["replacing", "temporary_path", "write_text"]
-
 
 def temporary_path(path: Path) -> Path:
     """Return a new name for an unfinished `path`, in the same directory.

@@ -15,8 +15,6 @@ import numpy as np
 from .errors import BlankVideo
 from .frames import Frame
 
-__all__ = ["BlankFrames"]
-
 logger = logging.getLogger(__name__)
 
 # Of 255, the brightest that nobody can tell from black.

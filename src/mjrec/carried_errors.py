@@ -14,8 +14,6 @@ from typing import Any
 from . import errors
 from .errors import Error
 
-__all__ = ["carried", "unpacked"]
-
 
 def carried(error: BaseException) -> dict[str, Any]:
     """Return what `unpacked` makes an error like `error` of, in plain JSON."""

@@ -20,19 +20,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
-__all__ = [
-    "MOST_OF_STACKS",
-    "ask_for_stacks",
-    "environment_of_child",
-    "how_it_ended",
-    "python_command",
-    "said_in",
-    "say_stacks_when_asked",
-    "stacks_in",
-    "stacks_said_in",
-    "take_standard_output",
-]
-
 logger = logging.getLogger(__name__)
 
 MOST_OF_STACKS = 20_000

@@ -15,8 +15,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-__all__ = ["cpu_flags", "cpu_model", "machine_fingerprint"]
-
 _CPUINFO = Path("/proc/cpuinfo")
 # What is said of a CPU on x86 and on ARM.
 _FLAGS = ("flags", "Features")

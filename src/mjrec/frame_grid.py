@@ -11,8 +11,6 @@ import numpy as np
 from .errors import InvalidArgument
 from .frames import Frame
 
-__all__ = ["grid_frame", "grid_shape"]
-
 
 def grid_shape(count: int) -> tuple[int, int]:
     """Return the rows and columns of the grid of so many pictures.

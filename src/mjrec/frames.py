@@ -10,15 +10,6 @@ from numpy.typing import NDArray
 
 from .errors import InvalidArgument, InvalidFrame, UnknownName
 
-__all__ = [
-    "QUALITIES",
-    "Frame",
-    "check_frame",
-    "check_quality",
-    "check_size",
-    "pad_to_even",
-]
-
 Frame: TypeAlias = NDArray[np.uint8]
 
 # The model's own settings; or no multisampling and a small shadow map.

@@ -21,8 +21,6 @@ from collections.abc import Sequence
 
 from .child_python import environment_of_child, python_command, take_standard_output
 
-__all__ = ["Packages", "installed_packages"]
-
 logger = logging.getLogger(__name__)
 
 # By the names of the packages: `version`, and `record_sha256` as below.

@@ -22,8 +22,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["dumps", "float_from_json", "loads"]
-
 # Whatever can be read can also be written again, compared and shown, all of which
 # Python does recursively.
 _DEEPEST = 100

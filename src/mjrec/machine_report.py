@@ -19,16 +19,6 @@ from .gl import BACKENDS, Diagnosis, Probe, choose, diagnose, probe
 from .gl.backends import platforms_contradict
 from .machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
 
-__all__ = [
-    "Cpus",
-    "Ffmpeg",
-    "MachineReport",
-    "Package",
-    "examine_ffmpeg",
-    "examine_machine",
-    "examine_package",
-]
-
 # A distribution, a program that uses it as a recording does but draws nothing, and what
 # to run if it is missing.
 _PACKAGES = (

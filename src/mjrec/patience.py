@@ -9,8 +9,6 @@ import time
 
 from .errors import InvalidArgument
 
-__all__ = ["Patience", "patience_s"]
-
 _ENVIRONMENT_VARIABLE = "MJREC_PATIENCE"
 _DEFAULT_S = 120.0
 _LONGEST_SLICE_S = 1.0

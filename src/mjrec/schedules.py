@@ -12,16 +12,6 @@ import numpy as np
 
 from .errors import InvalidArgument
 
-__all__ = [
-    "Schedule",
-    "capped_cubic_video_schedule",
-    "check_takes_one",
-    "disable_videos",
-    "schedule_from_text",
-    "schedule_name",
-    "to_schedule",
-]
-
 Schedule: TypeAlias = Callable[[int], Any]
 
 _CAP = 1000
@@ -112,6 +102,7 @@ class EveryNth:
         self.__qualname__ = f"every:{n}"
 
     def __call__(self, episode_id: int) -> bool:
+        """Return whether the episode gets a video."""
         return episode_id % self.n == 0
 
 
@@ -127,6 +118,7 @@ class At:
         self.__qualname__ = "at:" + ",".join(map(str, sorted(episode_ids)))
 
     def __call__(self, episode_id: int) -> bool:
+        """Return whether the episode gets a video."""
         return episode_id in self.episode_ids
 
 

@@ -20,12 +20,8 @@ from .environments.from_name import NamedEnvironment, environment_from_name
 from .environments.global_generators import seed_global_generators
 from .environments.names import parse_environment_name
 from .environments.options import EnvironmentOptions
-from .environments.policies import (
-    Policy,
-    load_policy,
-    policy_file,
-    working_directory_importable,
-)
+from .environments.policies import Policy, load_policy, policy_file
+from .environments.working_directory import working_directory_importable
 from .errors import GLError, InvalidArgument
 from .formats.manifest import read_manifest
 from .formats.monitor_directory import Infix, infix_of, manifest_name
@@ -37,8 +33,6 @@ from .schedules import disable_videos, schedule_from_text
 if TYPE_CHECKING:
     from .monitors.dm_env_monitor import DmEnvMonitor
     from .monitors.gymnasium_monitor import GymnasiumMonitor
-
-__all__ = ["Session", "SessionEpisode", "record_session", "with_chosen_videos"]
 
 
 @dataclass(frozen=True, kw_only=True)

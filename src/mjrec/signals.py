@@ -13,8 +13,6 @@ from types import FrameType
 
 from .errors import Error
 
-__all__ = ["Terminated", "exit_on_signals", "exiting_on_signals", "received"]
-
 # What schedulers and CI send at a time limit, and terminals when they are closed.
 _SIGNALS = ("SIGTERM", "SIGHUP")
 

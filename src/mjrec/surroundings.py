@@ -23,8 +23,6 @@ from .fingerprint import cpu_flags, cpu_model, machine_fingerprint
 from .installed_packages import installed_packages
 from .machine import usable_cpus
 
-__all__ = ["Surroundings", "look_around"]
-
 logger = logging.getLogger(__name__)
 
 # What changes pictures, the last bits of numbers, or which library is loaded.

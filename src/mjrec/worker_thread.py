@@ -12,8 +12,6 @@ from typing import Generic, TypeVar
 
 from .errors import ClosedError
 
-__all__ = ["WorkerThread"]
-
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")

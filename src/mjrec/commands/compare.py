@@ -21,8 +21,6 @@ from ..evaluation.summaries import Bootstrap, Interval
 from .help_text import flowing_help
 from .terminal import printable, result_console
 
-__all__ = ["compare"]
-
 _USUAL = Bootstrap()
 
 

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-__all__ = ["counted"]
-
 
 def counted(number: int, noun: str) -> str:
     """Return `1 video`, `2 videos`."""

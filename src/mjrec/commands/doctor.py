@@ -15,8 +15,6 @@ from .. import json_text
 from ..gl import EglDevice, Probe
 from ..machine_report import Cpus, Ffmpeg, MachineReport, Package, examine_machine
 
-__all__ = ["doctor", "show_report"]
-
 _INDENT = 2
 # Where values stand, right of names.
 _DEEPER = 14

@@ -14,8 +14,6 @@ from ..engines.work import Engine
 from ..errors import InvalidArgument
 from .help_text import flowing_help
 
-__all__ = ["NO_ENGINE", "EngineOptions"]
-
 _LOCAL = "local"
 
 

@@ -8,8 +8,6 @@ from typing import Any
 
 from ..errors import InvalidArgument
 
-__all__ = ["kwargs_of"]
-
 
 def kwargs_of(text: str) -> dict[str, Any]:
     """Return the arguments that `--env-kwargs` names.

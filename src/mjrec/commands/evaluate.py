@@ -32,8 +32,6 @@ from .help_text import flowing_help
 from .terminal import printable, result_console
 from .view_options import camera_of, size_of
 
-__all__ = ["evaluate"]
-
 T = TypeVar("T")
 
 _FAILED = 1

@@ -7,8 +7,6 @@ import re
 from collections.abc import Callable
 from typing import TypeVar
 
-__all__ = ["flowing_help"]
-
 C = TypeVar("C", bound=Callable[..., object])
 
 # The lines of an argument's description after its first, in a Google-style docstring.

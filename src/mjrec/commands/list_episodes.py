@@ -22,8 +22,6 @@ from ..results import Episode, iter_episodes
 from .help_text import flowing_help
 from .terminal import result_console
 
-__all__ = ["episode_table", "list_episodes"]
-
 
 @flowing_help
 def list_episodes(

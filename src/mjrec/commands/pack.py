@@ -19,8 +19,6 @@ from ..evidence.packing.sizes import shown_size
 from ..monitors.render_progress import RenderProgress
 from .help_text import flowing_help
 
-__all__ = ["pack"]
-
 _NUMBERS = re.compile(r"\d{1,15}(,\d{1,15})*", re.ASCII)
 
 

@@ -10,8 +10,6 @@ import rich.progress
 
 from ..sessions import SessionEpisode
 
-__all__ = ["EpisodeProgress"]
-
 
 class EpisodeProgress:
     """Shows how far a recording is.

@@ -26,8 +26,6 @@ from .help_text import flowing_help
 from .progress import EpisodeProgress
 from .view_options import camera_of, number_or_name, size_of
 
-__all__ = ["record"]
-
 _INTERRUPTED = 130
 
 

@@ -15,8 +15,6 @@ from ..recovery import RecoveredFile, Recovery
 from ..recovery import recover as recover_directory
 from .help_text import flowing_help
 
-__all__ = ["recover"]
-
 _FAILED = 1
 
 

@@ -24,8 +24,6 @@ from .engine_options import NO_ENGINE, EngineOptions
 from .help_text import flowing_help
 from .view_options import camera_of, size_of
 
-__all__ = ["render"]
-
 _FAILED = 1
 _INTERRUPTED = 130
 

@@ -18,8 +18,6 @@ from ..reporting.media_files import OnProgress, ReportProgress
 from ..reporting.report_folder import write_report
 from .help_text import flowing_help
 
-__all__ = ["report"]
-
 
 @flowing_help
 def report(

@@ -14,8 +14,6 @@ from ..reporting.film_strips import film_strip, write_film_strip
 from .help_text import flowing_help
 from .view_options import camera_of, size_of
 
-__all__ = ["strip"]
-
 
 @flowing_help
 def strip(

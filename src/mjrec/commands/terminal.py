@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import rich.console
 
-__all__ = ["printable", "result_console"]
-
 _LOG_WIDTH = 160
 
 

@@ -23,8 +23,6 @@ from ..evidence.verifying import verify as verify_archive
 from .help_text import flowing_help
 from .terminal import printable, result_console
 
-__all__ = ["verify"]
-
 _FAILED = 1
 _MOST_SHOWN = 50
 

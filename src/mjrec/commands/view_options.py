@@ -8,8 +8,6 @@ import re
 from ..errors import InvalidArgument
 from ..frames import check_size
 
-__all__ = ["camera_of", "number_or_name", "size_of"]
-
 
 def size_of(text: str | None) -> tuple[int | None, int | None]:
     """Return `(height, width)` of WIDTHxHEIGHT; twice None for None.

@@ -14,8 +14,6 @@ from ..errors import ClosedError, InvalidArgument
 from .job_book import JobBook
 from .work import Job, JobOutcome
 
-__all__ = ["BaseRun"]
-
 
 class BaseRun(abc.ABC):
     """Work that has been begun, whose jobs are in a book; a `work.Run`.

@@ -11,8 +11,6 @@ from .ray import RayEngine
 from .slurm import SlurmEngine
 from .work import Engine
 
-__all__ = ["ENGINES", "engine_from"]
-
 ENGINES = ("local", "ray", "slurm")
 
 

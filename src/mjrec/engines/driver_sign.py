@@ -13,8 +13,6 @@ from typing import Any
 from ..child_python import said_in
 from .job_folder import JobFolder
 
-__all__ = ["DriverSign", "is_surely_dead"]
-
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 _PIDS = Path("/proc/self/ns/pid")
 _FACTS = ("machine", "pid", "started")

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from ..errors import InvalidArgument
 
-__all__ = ["GpuShare"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class GpuShare:

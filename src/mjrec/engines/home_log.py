@@ -6,8 +6,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 
-__all__ = ["HomeLog"]
-
 
 class HomeLog:
     """Logs here what was logged elsewhere, each text once in a run.

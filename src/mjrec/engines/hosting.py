@@ -34,8 +34,6 @@ from .job_book import JobBook, Task, as_json
 from .local import LocalRun
 from .work import Job, JobOutcome, Work
 
-__all__ = ["Host", "HostedWork", "take_home"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class HostedWork:

@@ -13,8 +13,6 @@ from typing import Any
 from ..errors import InvalidArgument
 from .work import AGAIN, Job, JobOutcome
 
-__all__ = ["TRIES", "JobBook", "Task", "as_json"]
-
 logger = logging.getLogger(__name__)
 
 # Once may be chance, such as the system's killer of processes that need much memory;

@@ -35,8 +35,6 @@ from typing import Self
 from ..atomic_files import replacing
 from .hosting import HostedWork
 
-__all__ = ["Answer", "HostState", "JobFolder", "Pace", "TakenJob"]
-
 _SUFFIX = ".json"
 # Whoever writes here lets hosts run code, and the work may hold a key.
 _PRIVATE = 0o700

@@ -18,8 +18,6 @@ from .hosting import Host
 from .job_folder import HostState, JobFolder, Pace, TakenJob
 from .local_worker import SECONDS_TO_CLOSE
 
-__all__ = ["GIVEN_BACK", "HAD_MUCH_TIME", "Notice", "heard_signals", "serve"]
-
 logger = logging.getLogger(__name__)
 
 # In an answer, instead of an outcome: why the job is not done, through no fault of its

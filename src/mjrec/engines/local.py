@@ -27,8 +27,6 @@ from .local_process import WorkerProcess
 from .local_worker import SECONDS_TO_CLOSE
 from .work import Work
 
-__all__ = ["LocalEngine", "LocalRun", "check_worker_count"]
-
 logger = logging.getLogger(__name__)
 
 _ENDS_AT_ONCE = 2

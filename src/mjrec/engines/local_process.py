@@ -16,8 +16,6 @@ from typing import IO, Any
 from ..child_python import how_it_ended, python_command, said_in
 from ..errors import Error
 
-__all__ = ["WorkerProcess"]
-
 _END_OF_WORDS = 2000
 _SECONDS_TO_DIE = 5.0
 _ONE_READ = 1 << 16

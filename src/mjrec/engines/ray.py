@@ -28,8 +28,6 @@ from .ray_connection import ClusterWatch, RayConnection, import_ray
 from .ray_worker import METHODS_AT_ONCE, RayWorker
 from .work import JobOutcome, Work
 
-__all__ = ["RayEngine", "RayRun"]
-
 logger = logging.getLogger(__name__)
 
 _ENDS_AT_ONCE = 2

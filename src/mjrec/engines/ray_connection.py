@@ -25,8 +25,6 @@ from ..errors import Error, InvalidArgument, MissingDependency
 from ..machine import usable_cpus
 from .gpu_shares import GpuShare
 
-__all__ = ["ClusterWatch", "RayConnection", "import_ray"]
-
 _ADDRESS = "RAY_ADDRESS"
 _TOKEN = "RAY_AUTH_TOKEN"
 _TOKEN_PATH = "RAY_AUTH_TOKEN_PATH"

@@ -18,8 +18,6 @@ import mjrec
 
 from .hosting import Host, HostedWork
 
-__all__ = ["METHODS_AT_ONCE", "RayWorker"]
-
 # A job, and the end of all jobs.
 METHODS_AT_ONCE = 2
 _SECONDS_BETWEEN_LOOKS = 0.1

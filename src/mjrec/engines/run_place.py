@@ -18,8 +18,6 @@ from .job_folder import JobFolder, Pace
 from .slurm_jobs import JobRequest, cluster_jobs
 from .work import WORK_FOLDER
 
-__all__ = ["EarlierRun", "RunPlace"]
-
 logger = logging.getLogger(__name__)
 
 _FOLDER_PREFIX = "slurm."

@@ -34,8 +34,6 @@ from .slurm_hosts import HostEnd, SlurmHosts
 from .slurm_jobs import ClusterJobs, JobRequest, check_cluster, cluster_jobs
 from .work import Run, Work
 
-__all__ = ["DEFAULT_WORKERS", "SlurmEngine", "SlurmRun"]
-
 logger = logging.getLogger(__name__)
 
 # What a cluster would grant is not known before; four are what nobody minds.

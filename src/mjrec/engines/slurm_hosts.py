@@ -15,8 +15,6 @@ from .job_folder import HostState, JobFolder, Pace
 from .local_worker import SECONDS_TO_CLOSE
 from .slurm_jobs import ClusterJobs, JobState, NotSubmitted
 
-__all__ = ["HostEnd", "SlurmHosts"]
-
 logger = logging.getLogger(__name__)
 
 _SHORTEST_POLL = 0.005

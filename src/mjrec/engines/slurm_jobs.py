@@ -27,18 +27,6 @@ from .job_folder import JobFolder, Pace
 from .job_folder_host import heard_signals, serve
 from .local_worker import SECONDS_TO_CLOSE
 
-__all__ = [
-    "CLUSTERS",
-    "ClusterJobs",
-    "JobRequest",
-    "JobState",
-    "LocalJobs",
-    "NotSubmitted",
-    "SlurmJobs",
-    "check_cluster",
-    "cluster_jobs",
-]
-
 CLUSTERS = ("slurm", "local")
 
 _COMMANDS = ("sbatch", "squeue", "scancel", "srun")

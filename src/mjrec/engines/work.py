@@ -15,17 +15,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-__all__ = [
-    "AGAIN",
-    "WORK_FOLDER",
-    "Engine",
-    "Handler",
-    "Job",
-    "JobOutcome",
-    "Run",
-    "Work",
-]
-
 # In `Work.shared_directory`: where an engine keeps what it needs while work is done.
 WORK_FOLDER = ".mjrec.work"
 

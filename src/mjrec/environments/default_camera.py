@@ -7,8 +7,6 @@ from typing import Any
 
 from ..simulation.cameras import FREE_CAMERA, raw_model, tracking_camera
 
-__all__ = ["default_camera"]
-
 
 def default_camera(model: Any) -> str | int:
     """Return the camera that follows the robot, else the first, else the free one.

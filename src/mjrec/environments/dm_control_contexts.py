@@ -15,8 +15,6 @@ from typing import Any
 
 from dm_control.mujoco import engine
 
-__all__ = ["ContextsOnDemand"]
-
 _UPLOADS = ("mjr_uploadHField", "mjr_uploadTexture", "mjr_uploadMesh")
 
 

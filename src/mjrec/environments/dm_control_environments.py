@@ -18,16 +18,6 @@ from .dm_env_episodes import StepLimit
 from .episode_seeds import EpisodeSeeds
 from .options import EnvironmentOptions
 
-__all__ = [
-    "arguments_of",
-    "begin_episode",
-    "begin_stream",
-    "make_dm_control",
-    "next_episode",
-    "step",
-    "step_limit",
-]
-
 _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 # Nothing in an environment says with which arguments it was made.

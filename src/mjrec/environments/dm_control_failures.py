@@ -8,8 +8,6 @@ import re
 
 from ..errors import EnvironmentNotMade, Error, MissingDependency
 
-__all__ = ["dm_control_failure"]
-
 
 def dm_control_failure(name: str, error: Exception) -> Error:
     """Return the error for what importing dm_control, or loading a task, raised.

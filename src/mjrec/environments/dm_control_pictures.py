@@ -15,13 +15,6 @@ from ..simulation.scene_pictures import (
     option_without_rangefinder,
 )
 
-__all__ = [
-    "PhysicsPictures",
-    "dm_control_pictures",
-    "drawn_by_physics",
-    "picture_size",
-]
-
 # The size of `physics.render()` where none is asked for.
 _HEIGHT, _WIDTH = 240, 320
 

@@ -10,9 +10,9 @@ from typing import Any
 
 from dm_control.mujoco import wrapper
 
+from ..simulation.authored_model import AuthoredModel
 from ..simulation.cameras import FREE_CAMERA, raw_data, raw_model, resolve_camera
 from ..simulation.episode_states import EpisodeStates
-from ..simulation.model_store import AuthoredModel
 from ..simulation.scene_pictures import camera_label, option_without_rangefinder
 from ..simulation.scene_view import SceneView
 from ..simulation.viewer_settings import place_free_camera
@@ -29,8 +29,6 @@ from .scenes import (
     plain_arguments,
 )
 from .wrapping import around_dm_env
-
-__all__ = ["dm_control_scenes"]
 
 _SUITE = "dm_control/"
 

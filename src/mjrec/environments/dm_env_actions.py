@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from ..errors import PolicyError
 
-__all__ = ["DmEnvActions"]
-
 # A spec, or a dictionary, list or tuple of such, however deep.
 Spec: TypeAlias = Any
 

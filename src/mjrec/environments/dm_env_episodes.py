@@ -7,8 +7,6 @@ from typing import Any
 
 import dm_env
 
-__all__ = ["StepLimit", "is_terminated", "is_truncated"]
-
 
 def is_terminated(timestep: dm_env.TimeStep) -> bool:
     """Tell whether the task itself ended the episode: LAST with a discount of 0."""

@@ -6,8 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-__all__ = ["VIEW_ARGUMENTS", "shown_arguments"]
-
 # How an environment is shown, on which no state and no reward depends.
 VIEW_ARGUMENTS: Final = frozenset(
     (

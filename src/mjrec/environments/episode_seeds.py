@@ -19,8 +19,6 @@ import numpy as np
 
 from ..errors import InvalidArgument
 
-__all__ = ["EpisodeSeeds", "episode_seeds"]
-
 # SeedSequence cuts larger numbers into words of 32 bits and pads with zeros, so that
 # [2**32 + 5, 0] and [5, 1] would be the same episode.
 _LIMIT = 2**32

@@ -19,8 +19,6 @@ from .names import (
 from .options import EnvironmentOptions
 from .scenes import Scenes
 
-__all__ = ["NamedEnvironment", "environment_from_name"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class NamedEnvironment:

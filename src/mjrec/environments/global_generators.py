@@ -8,8 +8,6 @@ import sys
 
 import numpy as np
 
-__all__ = ["seed_global_generators"]
-
 
 def seed_global_generators(seed: int) -> None:
     """Seed Python's, NumPy's and, where it is loaded, PyTorch's generators.

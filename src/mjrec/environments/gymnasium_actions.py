@@ -11,8 +11,6 @@ from gymnasium import Space, spaces
 
 from ..errors import PolicyError
 
-__all__ = ["GymnasiumActions"]
-
 
 class GymnasiumActions:
     """The actions of an action space.

@@ -27,14 +27,6 @@ from .episode_seeds import EpisodeSeeds
 from .options import EnvironmentOptions
 from .working_directory import working_directory_importable
 
-__all__ = [
-    "begin_episode",
-    "begin_stream",
-    "make_gymnasium",
-    "next_episode",
-    "step",
-]
-
 # What records as a video, before what records as text.
 _PREFERRED_MODES = ("rgb_array", "ansi")
 

@@ -15,13 +15,6 @@ from ..simulation.inside import simulation_in
 if TYPE_CHECKING:
     from ..simulation.scene_pictures import ScenePictures
 
-__all__ = [
-    "EnvironmentPictures",
-    "close_environment",
-    "free_viewers",
-    "gymnasium_pictures",
-]
-
 
 def gymnasium_pictures(
     env: gymnasium.Env[Any, Any],

@@ -25,11 +25,9 @@ from .scenes import (
 from .wrapping import around_gymnasium
 
 if TYPE_CHECKING:
+    from ..simulation.authored_model import AuthoredModel
     from ..simulation.episode_states import EpisodeStates
-    from ..simulation.model_store import AuthoredModel
     from .viewer_scene import ViewerScene
-
-__all__ = ["gymnasium_scenes"]
 
 _MUJOCO_ENV = ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render")
 _RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
@@ -177,7 +175,7 @@ def _at_picture(
 
 
 def _authored(simulated: Any) -> AuthoredModel | None:
-    from ..simulation.model_store import authored_from_file
+    from ..simulation.authored_model import authored_from_file
 
     path = getattr(simulated, "fullpath", None)
     return None if path is None else authored_from_file(Path(path))

@@ -26,8 +26,6 @@ from ..child_python import (
 from ..errors import EnvironmentNotMade
 from .dm_control_failures import dm_control_failure
 
-__all__ = ["gymnasium_ids", "mujoco_ids", "suite_tasks"]
-
 _SUITE = "dm_control"
 _GYMNASIUM = "gymnasium"
 

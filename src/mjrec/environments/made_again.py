@@ -27,20 +27,6 @@ from .names import DmControlName, parse_environment_name
 from .robotics_scenes import drawn_part
 from .working_directory import working_directory_importable
 
-__all__ = [
-    "UNKNOWN",
-    "EnvironmentAgain",
-    "EpisodeStart",
-    "NotMadeAgain",
-    "RecordedEnvironment",
-    "StepAgain",
-    "is_installed_name",
-    "made_with",
-    "make_again",
-    "recorded_environment",
-    "wrappers_refused",
-]
-
 UNKNOWN = "unknown"
 
 # Where the registry's entry points of what is trusted without asking lie.

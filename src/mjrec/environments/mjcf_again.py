@@ -15,8 +15,6 @@ from .made_again import (
     wrappers_refused,
 )
 
-__all__ = ["MjcfAgain"]
-
 
 class MjcfAgain:
     """Does what `MjcfEnvironment` does, and its `TimeLimit`.

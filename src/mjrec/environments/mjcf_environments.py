@@ -23,8 +23,6 @@ from ..simulation.scene_pictures import camera_label
 from .default_camera import default_camera
 from .options import EnvironmentOptions
 
-__all__ = ["MjcfEnvironment", "make_mjcf"]
-
 _SIDE = 480
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from ..simulation.authored_model import authored_from_file
 from ..simulation.episode_states import EpisodeStates
-from ..simulation.model_store import authored_from_file
 from .mjcf_environments import MjcfEnvironment
 from .scenes import Scenes, generator_state, has_own_method, overriding_class
 from .viewer_scene import ViewerScene
-
-__all__ = ["mjcf_scenes"]
 
 
 def mjcf_scenes(

@@ -9,14 +9,6 @@ from typing import TypeAlias
 
 from ..errors import InvalidArgument, UnknownName
 
-__all__ = [
-    "DmControlName",
-    "EnvironmentName",
-    "GymnasiumName",
-    "MjcfName",
-    "parse_environment_name",
-]
-
 _DM_CONTROL = "dm_control/"
 _MJCF_SUFFIXES = (".xml", ".mjcf")
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["NoPictureSource"]
-
 
 class NoPictureSource:
     """Gives no pictures.

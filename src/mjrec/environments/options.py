@@ -12,8 +12,6 @@ import numpy as np
 from ..errors import InvalidArgument
 from ..frames import check_size
 
-__all__ = ["DEFAULT_MAX_STEPS", "EnvironmentOptions"]
-
 DEFAULT_MAX_STEPS = 1000
 
 

@@ -34,15 +34,6 @@ from ..errors import Error, PolicyError, UnknownName
 from .episode_seeds import EpisodeSeeds
 from .working_directory import working_directory_importable
 
-__all__ = [
-    "Actions",
-    "Policy",
-    "load_policy",
-    "policy_file",
-    "policy_from",
-    "working_directory_importable",
-]
-
 _BUILT_IN = ("random", "zero")
 _FORMS = (
     "Or give module:name (a class, a function or an object of yours) or module:name()."

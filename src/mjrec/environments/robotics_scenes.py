@@ -12,8 +12,6 @@ from typing import Any
 
 from .scenes import is_defined_by
 
-__all__ = ["drawn_part", "has_known_render", "picture_moment"]
-
 _MAZES = "gymnasium_robotics.envs.maze"
 
 # Environments whose `render` is that of an environment inside them: the module, the

@@ -15,15 +15,6 @@ import numpy as np
 if TYPE_CHECKING:
     from ..simulation.episode_states import EpisodeStates
 
-__all__ = [
-    "Scenes",
-    "class_name",
-    "generator_state",
-    "is_defined_by",
-    "overriding_class",
-    "plain_arguments",
-]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes:

@@ -24,8 +24,6 @@ from ..simulation.viewer_settings import (
 )
 from .scenes import class_name, has_own_method, is_defined_by
 
-__all__ = ["ViewerScene"]
-
 _MODE = "rgb_array"
 _RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
 

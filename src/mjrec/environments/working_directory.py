@@ -8,8 +8,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["working_directory_importable"]
-
 
 @contextlib.contextmanager
 def working_directory_importable() -> Iterator[None]:

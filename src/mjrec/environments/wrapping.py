@@ -15,8 +15,6 @@ import gymnasium
 
 from .scenes import class_name
 
-__all__ = ["around_dm_env", "around_gymnasium"]
-
 # They hand actions, rewards and the ends of episodes on as they are. `TimeLimit` does
 # not, and is told apart, by its number.
 _TRANSPARENT = frozenset(

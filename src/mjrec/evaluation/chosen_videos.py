@@ -14,8 +14,6 @@ from ..rendering.progress import Progress
 from .evaluation import EvaluationProgress
 from .following import TaskRun
 
-__all__ = ["ChosenVideos", "drawn_by_workers", "render_chosen"]
-
 logger = logging.getLogger(__name__)
 
 

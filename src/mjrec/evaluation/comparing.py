@@ -26,16 +26,6 @@ from .statistics import FloatArray
 from .summaries import Bootstrap, Interval
 from .summarizing import scaled
 
-__all__ = [
-    "Comparison",
-    "PairedDifference",
-    "ScoreComparison",
-    "TaskComparison",
-    "compare",
-    "compare_results",
-    "holm_adjusted",
-]
-
 # Of the plan: what changes returns though the policy is the same.
 _CONDITIONS: Final = ("max_steps", "env_kwargs")
 # What only chooses which episodes are seen.

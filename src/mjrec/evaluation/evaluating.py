@@ -51,8 +51,6 @@ from .summarizing import (
     summarize_results,
 )
 
-__all__ = ["evaluate"]
-
 logger = logging.getLogger(__name__)
 
 _WORKER = "mjrec.evaluation.worker:EvaluationWorker"

@@ -12,8 +12,6 @@ from .plan import EvaluationPlan
 from .results_files import ChosenEpisode
 from .summaries import AcrossTasks, Bootstrap, TaskSummary
 
-__all__ = ["Evaluation", "EvaluationProgress"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationProgress:

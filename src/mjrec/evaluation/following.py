@@ -32,8 +32,6 @@ from .plan import Batch, EvaluatedTask, EvaluationPlan
 from .progress_counts import LedgerCounts
 from .splitting import batches_of
 
-__all__ = ["CheckedTask", "TaskRun", "check_tasks", "run_tasks"]
-
 logger = logging.getLogger(__name__)
 
 # How often somebody who waits is told how far it is.

@@ -47,21 +47,6 @@ from .statistics import (
 )
 from .summaries import Bootstrap, Interval
 
-__all__ = [
-    "LARGE_SAMPLE",
-    "MOST_RESAMPLED",
-    "PERCENTILE_BOOTSTRAP",
-    "AcrossIntervals",
-    "ImprovementIntervals",
-    "TaskIntervals",
-    "across_intervals",
-    "improvement_intervals",
-    "interval_method",
-    "iqm_difference_interval",
-    "mean_interval",
-    "task_intervals",
-]
-
 MOST_RESAMPLED: Final = 3000
 """Of how many episodes, of all strata together, figures are bootstrapped."""
 

@@ -39,8 +39,6 @@ from ..errors import InvalidArgument, UnknownName
 from ..schedules import capped_cubic_video_schedule
 from .episode_results import EpisodeResult
 
-__all__ = ["RULES", "Chosen", "KeepRule", "keep_rule"]
-
 Chosen: TypeAlias = tuple[EpisodeResult, str]
 _Part: TypeAlias = Callable[[Sequence[EpisodeResult]], list[Chosen]]
 

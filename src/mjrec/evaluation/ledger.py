@@ -52,8 +52,6 @@ from ..json_text import dumps
 from .episode_results import EpisodeResult
 from .plan import Batch
 
-__all__ = ["LEDGER_PATTERN", "Ledger", "Unit", "ledger_name", "read_ledgers"]
-
 logger = logging.getLogger(__name__)
 
 Unit = tuple[int, int]

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
-__all__ = ["SEEDED", "SUITE", "Batch", "EvaluatedTask", "EvaluationPlan", "Protocol"]
-
 Protocol: TypeAlias = Literal["seeded", "suite"]
 SEEDED: Protocol = "seeded"
 SUITE: Protocol = "suite"

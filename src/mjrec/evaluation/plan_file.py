@@ -14,8 +14,6 @@ from .plan import SUITE, EvaluationPlan
 from .plan_json import plan_from_json, plan_to_json
 from .results_files import FORMAT_VERSION, PLAN_NAME
 
-__all__ = ["check_continues", "read_plan", "write_plan"]
-
 # What may be asked for anew: each task, seed and episode stands for itself.
 _MAY_DIFFER = ("tasks", "seeds")
 

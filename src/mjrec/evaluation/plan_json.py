@@ -20,8 +20,6 @@ from ..formats.json_fields import (
 )
 from .plan import SEEDED, SUITE, EvaluatedTask, EvaluationPlan, Protocol
 
-__all__ = ["plan_from_json", "plan_to_json"]
-
 _QUALITIES = ("full", "draft")
 
 

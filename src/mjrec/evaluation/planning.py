@@ -20,8 +20,6 @@ from .kept_episodes import keep_rule
 from .plan import SEEDED, SUITE, EvaluatedTask, EvaluationPlan
 from .task_sets import tasks_from
 
-__all__ = ["DEFAULT_SEEDS", "check_score_ranges", "plan_from"]
-
 DEFAULT_SEEDS = 5
 
 _PROTOCOLS = (SEEDED, SUITE)

@@ -9,8 +9,6 @@ from typing import Any
 
 from ..errors import PolicyError
 
-__all__ = ["SentPolicy", "sent_policy"]
-
 
 @dataclass(frozen=True)
 class SentPolicy:

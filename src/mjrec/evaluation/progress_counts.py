@@ -19,8 +19,6 @@ from pathlib import Path
 from ..formats.monitor_directory import names_in
 from .ledger import LEDGER_PATTERN
 
-__all__ = ["LedgerCounts"]
-
 # How a line begins that says how an episode ended, and what stands in it where that
 # was no failure. Only for a bar: what counts in the end is what `ledger` reads.
 _ENDED = b'{"ended"'

@@ -13,8 +13,6 @@ from .episode_results import EpisodeResult
 from .result_columns import ResultVideo
 from .result_tables import EpisodeFiles
 
-__all__ = ["RecordedFiles"]
-
 _TRAJECTORIES = (".h5", ".log")
 # Also text recordings.
 _VIDEOS = (".mp4", ".json")

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
 from .episode_results import EpisodeResult
 
-__all__ = ["ResultColumns", "ResultVideo"]
-
 _TRUTH = {1: True, 0: False, -1: None}
 
 

@@ -39,8 +39,6 @@ from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
 from .result_columns import ResultColumns, ResultVideo
 
-__all__ = ["EpisodeFiles", "read_tables", "write_results_table", "write_timing_table"]
-
 _RESULTS = (
     *("task", "seed", "episode", "return", "length"),
     *("terminated", "truncated", "success", "failure"),

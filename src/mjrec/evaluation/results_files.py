@@ -48,18 +48,6 @@ from .result_tables import (
 from .summaries import AcrossTasks, Bootstrap, TaskSummary
 from .summaries_json import summary_from_json, summary_to_json
 
-__all__ = [
-    "FORMAT_VERSION",
-    "PLAN_NAME",
-    "RESULTS_NAME",
-    "ChosenEpisode",
-    "ReadResults",
-    "is_evaluation",
-    "read_results",
-    "read_summaries",
-    "write_results",
-]
-
 FORMAT_VERSION = 1
 PLAN_NAME = "evaluation.json"
 RESULTS_NAME = "results.json"

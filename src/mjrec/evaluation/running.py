@@ -22,13 +22,8 @@ from ..environments.episode_seeds import EpisodeSeeds, episode_seeds
 from ..environments.from_name import NamedEnvironment, environment_from_name
 from ..environments.global_generators import seed_global_generators
 from ..environments.options import EnvironmentOptions
-from ..environments.policies import (
-    Policy,
-    load_policy,
-    policy_file,
-    policy_from,
-    working_directory_importable,
-)
+from ..environments.policies import Policy, load_policy, policy_file, policy_from
+from ..environments.working_directory import working_directory_importable
 from ..errors import Error, InvalidArgument, PolicyError
 from ..monitors import Monitor
 from ..monitors.rendering_choice import rendering_choice
@@ -47,8 +42,6 @@ from .plan import SUITE, Batch, EvaluationPlan
 if TYPE_CHECKING:
     from ..monitors.dm_env_monitor import DmEnvMonitor
     from ..monitors.gymnasium_monitor import GymnasiumMonitor
-
-__all__ = ["Acting", "Evaluation", "make_acting", "rendering_of", "run_batch"]
 
 _OF_EPISODES = (PolicyError, InvalidArgument)
 

@@ -42,14 +42,6 @@ from ..rendering.pending import EpisodeKey, claim, recorded_episodes
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.rendered_manifests import update_manifest
 
-__all__ = [
-    "EVALUATION",
-    "finish_logs",
-    "settle",
-    "settle_monitor",
-    "unsettled_monitors",
-]
-
 # Under `scope`, in a manifest: the choice was made over all monitors of one.
 EVALUATION = "evaluation"
 

@@ -7,8 +7,6 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 
 from .plan import SUITE, Batch, EvaluatedTask, EvaluationPlan
 
-__all__ = ["batches_of"]
-
 # So that the last ones end at about the same time, and making an environment, which
 # each of them does, does not cost more than running it.
 _BATCHES_PER_WORKER = 4

@@ -23,23 +23,6 @@ import numpy.typing as npt
 
 from .summaries import Interval
 
-__all__ = [
-    "FloatArray",
-    "Samples",
-    "interquartile_bounds",
-    "interquartile_mean",
-    "interquartile_mean_across",
-    "mean_probability_of_improvement",
-    "normal_quantile",
-    "optimality_gap",
-    "performance_profile",
-    "placements",
-    "probability_of_improvement",
-    "standard_deviation",
-    "task_means",
-    "wilson_interval",
-]
-
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 Samples: TypeAlias = Mapping[str, FloatArray]
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 
 from ..errors import InvalidArgument
 
-__all__ = ["AcrossTasks", "Bootstrap", "Interval", "Profile", "TaskSummary"]
-
 _MOST_RESAMPLES = 1_000_000
 
 

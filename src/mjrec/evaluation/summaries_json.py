@@ -21,8 +21,6 @@ from ..formats.json_fields import (
 )
 from .summaries import AcrossTasks, Bootstrap, TaskSummary
 
-__all__ = ["summary_from_json", "summary_to_json"]
-
 S = TypeVar("S", TaskSummary, AcrossTasks, Bootstrap)
 
 _PLAIN: dict[object, Callable[[Any], Any]] = {

@@ -21,16 +21,6 @@ from .episode_results import EpisodeResult
 from .statistics import FloatArray
 from .summaries import AcrossTasks, Bootstrap, Interval, Profile, TaskSummary
 
-__all__ = [
-    "PROFILE_THRESHOLDS",
-    "default_score_range",
-    "scaled",
-    "split_by_scale",
-    "summarize_across",
-    "summarize_results",
-    "summarize_task",
-]
-
 PROFILE_THRESHOLDS: Final = tuple(k / 100 for k in range(101))
 
 _SUITE: Final = "dm_control/"

@@ -23,8 +23,6 @@ from ..environments.known_names import gymnasium_ids, mujoco_ids, suite_tasks
 from ..environments.names import parse_environment_name
 from ..errors import InvalidArgument, MissingDependency, UnknownName
 
-__all__ = ["TASK_SETS", "tasks_from"]
-
 TASK_SETS: Mapping[str, Callable[[], Sequence[str]]] = {
     "dm_control:all": partial(suite_tasks, "all"),
     "dm_control:benchmarking": partial(suite_tasks, "benchmarking"),

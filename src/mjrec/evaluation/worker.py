@@ -45,8 +45,6 @@ from .running import Evaluation, make_acting, rendering_of, run_batch
 if TYPE_CHECKING:
     from ..rendering.video_jobs import VideoWorker
 
-__all__ = ["EvaluationWorker"]
-
 logger = logging.getLogger(__name__)
 
 _GL = "MUJOCO_GL"

@@ -25,19 +25,6 @@ from __future__ import annotations
 
 from typing import Final
 
-__all__ = [
-    "CITATION",
-    "CRATE",
-    "ENVIRONMENT",
-    "FORMAT_KEY",
-    "FORMAT_VERSION",
-    "PAYLOAD",
-    "README",
-    "RECORDINGS",
-    "STATISTICS",
-    "STATISTICS_COLUMNS",
-]
-
 PAYLOAD: Final = "data"
 # Below the payload.
 CRATE: Final = "ro-crate-metadata.json"

@@ -10,8 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-__all__ = ["Check", "Level", "Verdict", "Verification"]
-
 
 class Level(enum.StrEnum):
     """How deep a verification goes; each level includes those before it."""

@@ -27,8 +27,6 @@ from typing import IO
 from ..errors import ArchiveError
 from ..json_text import dumps
 
-__all__ = ["MAX_VIDEOS", "write_archive"]
-
 MAX_VIDEOS = 100
 
 _MANIFEST = "manifest.json"

@@ -22,8 +22,6 @@ from ..json_text import loads
 from ..rates import rate_from_timestep
 from .json_fields import unreadable
 
-__all__ = ["AsciicastWriter", "text_of_frame", "unfinished_recording"]
-
 _CLEAR_AND_HOME = "\x1b[2J\x1b[1;1H"
 # Control sequences (colours, cursor) take no room on the screen. ECMA-48, 5.4.
 _CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")

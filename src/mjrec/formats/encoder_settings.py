@@ -23,8 +23,6 @@ from .ffmpeg import (
     video_encoders,
 )
 
-__all__ = ["MUXERS", "EncoderSettings", "encoder_settings", "try_encoding"]
-
 _DEFAULT_CODEC = "libx264"
 _DEFAULT_CRF = 18.0
 _WORST_CRF = 51.0

@@ -29,16 +29,6 @@ from ..file_digests import file_sha256
 from ..frames import Frame
 from ..patience import Patience
 
-__all__ = [
-    "FfmpegProcess",
-    "every_frame_arguments",
-    "ffmpeg_executable",
-    "ffmpeg_sha256",
-    "ffmpeg_version",
-    "run_ffmpeg",
-    "video_encoders",
-]
-
 _ENVIRONMENT_VARIABLE = "IMAGEIO_FFMPEG_EXE"
 _END_OF_STDERR = 2000
 _PIPE_SIZE = 1 << 20

@@ -37,15 +37,6 @@ from ..atomic_files import replacing, temporary_path
 from ..errors import DirectoryNotWritable, FileNotWritten
 from ..frames import Frame
 
-__all__ = [
-    "FrameHashFile",
-    "cut_frame_hashes",
-    "frame_hash_header",
-    "frame_hash_line",
-    "frame_hash_path",
-]
-
-
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

@@ -18,8 +18,6 @@ from ..rates import to_rate
 from ..schedules import capped_cubic_video_schedule
 from .video_writer import VideoWriter
 
-__all__ = ["save_video"]
-
 
 def save_video(
     frames: Iterable[Frame],

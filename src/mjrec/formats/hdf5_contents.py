@@ -11,8 +11,6 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Something", "contents_of_hdf5"]
-
 # A name, the bytes of a text, or numbers.
 Something: TypeAlias = str | bytes | NDArray[Any]
 

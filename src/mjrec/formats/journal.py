@@ -46,17 +46,6 @@ from .json_fields import (
 )
 from .regular_files import open_regular
 
-__all__ = [
-    "MOST_EPISODES",
-    "UNKNOWN",
-    "JournalEntry",
-    "JournalReader",
-    "JournalWriter",
-    "count_lines",
-    "entry_of",
-    "read_journal",
-]
-
 logger = logging.getLogger(__name__)
 
 # Bounds, so that no file can fill the memory or keep a reader busy for ever. They are

@@ -18,22 +18,6 @@ from ..errors import UnreadableFile
 from ..json_text import float_from_json, loads
 from .regular_files import read_regular
 
-__all__ = [
-    "base_name",
-    "boolean",
-    "field",
-    "integer",
-    "json_object",
-    "list_of",
-    "mapping",
-    "number",
-    "optional",
-    "rate",
-    "read_object",
-    "text",
-    "unreadable",
-]
-
 T = TypeVar("T")
 
 # The statistics of several million episodes.

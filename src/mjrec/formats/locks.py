@@ -26,8 +26,6 @@ import weakref
 from pathlib import Path
 from typing import Self
 
-__all__ = ["Lock", "is_locked", "try_lock", "wait_for_lock"]
-
 # Whoever asks `is_locked` holds a lock for a moment, which is no reason to give up.
 _MOMENTS = 5
 _MOMENT = 0.002

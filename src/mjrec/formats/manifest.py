@@ -26,8 +26,6 @@ from .json_fields import (
     unreadable,
 )
 
-__all__ = ["Manifest", "read_manifest", "write_manifest"]
-
 
 @dataclass(frozen=True)
 class Manifest:

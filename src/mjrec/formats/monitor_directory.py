@@ -46,33 +46,6 @@ from pathlib import Path
 
 from ..errors import InvalidArgument
 
-__all__ = [
-    "FILE_PREFIX",
-    "MANIFEST_PREFIX",
-    "ClipPart",
-    "Infix",
-    "clip_lock_name",
-    "clip_part_name",
-    "clip_prefix",
-    "clip_video_prefix",
-    "episode_of",
-    "infix_of",
-    "is_manifest",
-    "iter_monitor_files",
-    "journal_name",
-    "lock_name",
-    "manifest_lock_name",
-    "manifest_name",
-    "monitor_directories_in",
-    "names_in",
-    "render_lock_name",
-    "stats_prefix",
-    "trajectory_prefix",
-    "video_lock_name",
-    "video_prefix",
-    "where_recordings_are",
-]
-
 FILE_PREFIX = "openaigym"
 MANIFEST_PREFIX = f"{FILE_PREFIX}.manifest"
 

@@ -6,8 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["pending_clip", "pending_video", "with_reason"]
-
 # What ffmpeg or a driver says can be long; what matters is where it begins and ends.
 _LONGEST_REASON = 1000
 _CUT = " [...] "

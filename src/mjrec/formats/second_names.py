@@ -27,14 +27,6 @@ from .monitor_directory import episode_of, iter_monitor_files
 from .video_metadata import finished_videos, metadata_path
 from .video_names import is_second_name, second_name_of, without_part
 
-__all__ = [
-    "give_all_second_names",
-    "give_second_names",
-    "is_called_like_second",
-    "second_names",
-    "take_second_names",
-]
-
 logger = logging.getLogger(__name__)
 
 

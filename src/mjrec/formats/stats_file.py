@@ -26,8 +26,6 @@ from .json_fields import (
     unreadable,
 )
 
-__all__ = ["StatsFile", "read_stats_file", "write_stats_file"]
-
 
 @dataclass(frozen=True)
 class StatsFile:

@@ -15,8 +15,6 @@ import time
 import weakref
 from typing import Protocol
 
-__all__ = ["Flushed", "flush_in_time"]
-
 logger = logging.getLogger(__name__)
 
 _SECONDS = 0.2

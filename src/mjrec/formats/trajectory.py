@@ -16,17 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "FORMAT_VERSION",
-    "Array",
-    "Field",
-    "ModelChange",
-    "RowLayout",
-    "StateComponent",
-    "TrajectoryContent",
-    "TrajectoryHeader",
-]
-
 FORMAT_VERSION = 1
 
 

@@ -17,14 +17,6 @@ from .trajectory_hdf5 import SIGNATURE, TrajectoryHdf5Reader, write_hdf5
 from .trajectory_log_reader import TrajectoryLogReader
 from .trajectory_reader import TrajectoryReader, added_up
 
-__all__ = [
-    "TrajectoryReader",
-    "amend_trajectory",
-    "find_trajectory",
-    "finish_trajectory",
-    "open_trajectory",
-]
-
 _LOG = ".log"
 _FINISHED = ".h5"
 

@@ -47,8 +47,6 @@ from .trajectory_layout import (
 from .trajectory_log import LONGEST_RECORD
 from .trajectory_reader import TrajectoryReader
 
-__all__ = ["SIGNATURE", "TrajectoryHdf5Reader", "write_hdf5"]
-
 # How every HDF5 file begins.
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 

@@ -24,17 +24,6 @@ from .trajectory import (
     TrajectoryHeader,
 )
 
-__all__ = [
-    "LARGEST_ROW",
-    "MOST_PARTS",
-    "array_from_json",
-    "array_to_json",
-    "check_version",
-    "field_name",
-    "header_from_json",
-    "layout_to_json",
-]
-
 # Bytes. Far beyond any simulation's; a bound, so that no file can fill the memory.
 LARGEST_ROW = 1 << 28
 

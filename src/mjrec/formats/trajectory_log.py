@@ -48,27 +48,6 @@ from .trajectory_layout import (
     layout_to_json,
 )
 
-__all__ = [
-    "CHANGE",
-    "CHANGE_PREFIX",
-    "FACTS",
-    "FIRST_LINE",
-    "FIRST_LINE_SIZE",
-    "FRAME",
-    "FRAME_PREFIX",
-    "HEADER",
-    "LONGEST_RECORD",
-    "RECORD_PREFIX",
-    "STEP",
-    "STEP_PREFIX",
-    "RowFormat",
-    "TrajectoryLogWriter",
-    "checksum_seed",
-    "facts_record",
-    "padded",
-    "write_all",
-]
-
 # The line is padded, so that every record begins at a multiple of 8 bytes.
 FIRST_LINE_SIZE = 32
 FIRST_LINE = b"mjrec trajectory log "

@@ -14,8 +14,6 @@ from .regular_files import open_regular
 from .trajectory_log import facts_record, write_all
 from .trajectory_log_reader import end_of_records
 
-__all__ = ["append_facts"]
-
 
 def append_facts(log: Path, facts: Mapping[str, Any]) -> None:
     """Add to the facts of a log that is closed; of a key, the newest counts.

@@ -49,8 +49,6 @@ from .trajectory_log import (
 )
 from .trajectory_reader import TrajectoryReader
 
-__all__ = ["TrajectoryLogReader", "end_of_records"]
-
 _KINDS = frozenset((HEADER, STEP, FRAME, CHANGE, FACTS))
 
 # What is read at once while looking through a log.

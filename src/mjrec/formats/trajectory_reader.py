@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InvalidArgument
 from .trajectory import ModelChange, TrajectoryContent, TrajectoryHeader
 
-__all__ = ["TrajectoryReader", "added_up"]
-
 
 def added_up(rewards: ArrayLike) -> float:
     """Return the sum of rewards, one added after the other, as a monitor does.

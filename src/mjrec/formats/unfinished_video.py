@@ -38,16 +38,6 @@ from .json_fields import (
     unreadable,
 )
 
-__all__ = [
-    "UnfinishedVideo",
-    "VideoFile",
-    "VideoNote",
-    "as_file",
-    "note_path",
-    "read_note",
-    "write_note",
-]
-
 _READ_SIZE = 1 << 20
 _LARGEST_SIDE = 1 << 16
 _LONGEST_NOTE = 1 << 24

@@ -15,20 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from .json_fields import read_object
-from .video_writer import VideoFile
-
-__all__ = [
-    "StepRuns",
-    "file_facts",
-    "finished_videos",
-    "further_live_videos",
-    "is_broken",
-    "is_done",
-    "metadata_path",
-    "playback_speed",
-    "timing_facts",
-]
-
+from .unfinished_video import VideoFile
 
 # Of a file's name, as `video_names` makes them.
 _PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)

@@ -25,18 +25,6 @@ import urllib.parse
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = [
-    "camera_part",
-    "further_parts",
-    "is_second_name",
-    "name_part",
-    "second_name_of",
-    "tiled_name",
-    "view_of",
-    "with_part",
-    "without_part",
-]
-
 _VIDEO = ".mp4"
 _TILED = "tiled"
 

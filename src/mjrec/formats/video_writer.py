@@ -48,8 +48,6 @@ from .frame_hashes import FrameHashFile, frame_hash_path
 from .locks import Lock
 from .unfinished_video import UnfinishedVideo, VideoFile, as_file
 
-__all__ = ["VideoFile", "VideoWriter"]
-
 # ffmpeg takes no larger number, above or below, for a rate as a fraction: given one, it
 # silently takes the nearest fraction that fits.
 _MAX_RATE_TERM = 10**6

@@ -8,15 +8,6 @@ from collections.abc import Mapping
 
 from ..errors import GLError, UnknownName
 
-__all__ = [
-    "BACKENDS",
-    "backend_in_environment",
-    "backend_name",
-    "environment_for",
-    "platforms_contradict",
-    "rendering_is_off",
-]
-
 # In the order in which they are tried: EGL needs no display and can use a GPU, OSMesa
 # needs no display, GLFW needs one.
 BACKENDS = ("egl", "osmesa", "glfw")

@@ -18,8 +18,6 @@ from .backends import (
 from .diagnosis import Diagnosis
 from .probing import Probe, probe
 
-__all__ = ["Choice", "choose", "conflict_with", "set_backend", "use_gl"]
-
 _LOG = logging.getLogger(__name__)
 
 _EARLIER = (

@@ -26,14 +26,6 @@ from .choice import conflict_with, set_backend
 from .egl_device import EglDevice
 from .probing import Probe, probe
 
-__all__ = [
-    "CUDA_VISIBLE_DEVICES",
-    "GivenGpu",
-    "device_of_gpu",
-    "render_on_given_gpu",
-    "visible_gpus",
-]
-
 _LOG = logging.getLogger(__name__)
 
 CUDA_VISIBLE_DEVICES = "CUDA_VISIBLE_DEVICES"

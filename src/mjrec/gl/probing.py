@@ -19,8 +19,6 @@ from .backends import backend_name, environment_for
 from .diagnosis import Diagnosis, diagnose
 from .egl_device import EglDevice
 
-__all__ = ["Probe", "probe", "probe_environment"]
-
 # Drivers of machines with many GPUs take ten seconds and more to wake up.
 TIMEOUT = 60.0
 

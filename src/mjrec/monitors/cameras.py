@@ -16,8 +16,6 @@ from ..frames import Frame
 from ..recorder.subject import EpisodePictures
 from ..rendering.views import plain_camera
 
-__all__ = ["CameraPictures", "camera_pictures"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPictures:

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from .gymnasium_monitor import GymnasiumMonitor
     from .vector_monitor import VectorMonitor
 
-__all__ = ["Monitor"]
-
 logger = logging.getLogger(__name__)
 
 

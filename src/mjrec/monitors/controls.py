@@ -28,8 +28,6 @@ from .lifetime import MonitorLifetime
 from .rendering_choice import rendering_choice
 from .waiting import waiting_display
 
-__all__ = ["MonitorControls"]
-
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")

@@ -18,8 +18,6 @@ from ..recorder.options import RecorderOptions
 from .cameras import camera_pictures
 from .controls import MonitorControls
 
-__all__ = ["DmEnvMonitor"]
-
 logger = logging.getLogger(__name__)
 
 _NO_PHYSICS = (

@@ -22,8 +22,6 @@ from .cameras import camera_pictures
 from .controls import MonitorControls
 from .success import success_in
 
-__all__ = ["GymnasiumMonitor", "env_id_of"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -11,8 +11,6 @@ from typing import Any, Literal, NoReturn, Self, SupportsIndex
 from ..errors import NotPicklable, RenderError
 from ..recorder.options import WARN, RecorderOptions
 
-__all__ = ["MonitorLifetime"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -10,8 +10,6 @@ import rich.progress
 
 from ..rendering.progress import Progress
 
-__all__ = ["RenderProgress"]
-
 
 class RenderProgress:
     """Shows how far a rendering is.

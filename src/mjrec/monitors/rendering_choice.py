@@ -9,8 +9,6 @@ from ..environments.scenes import Scenes
 from ..errors import PicturesDiffer
 from ..recorder.options import DEFERRED, LIVE, OFF, RenderingChoice
 
-__all__ = ["rendering_choice"]
-
 logger = logging.getLogger(__name__)
 
 _NO_SIMULATION = "it has no MuJoCo model and data that can be seen"

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["success_in"]
-
 # Gymnasium-Robotics' Fetch and Hand environments say the first, its Adroit and maze
 # environments the second, as MetaWorld and others do.
 _KEYS = ("is_success", "success")

@@ -20,8 +20,6 @@ from ..simulation.inside import simulation_time
 from .gymnasium_monitor import GymnasiumMonitor, env_id_of
 from .vector_recording import VectorRecording, opened_together, options_of
 
-__all__ = ["InsideRecording", "environments_inside"]
-
 _Env = gymnasium.Env[Any, Any]
 
 

@@ -11,8 +11,6 @@ import numpy as np
 
 from ..errors import InvalidArgument
 
-__all__ = ["DISABLED", "NEXT_STEP", "SAME_STEP", "autoreset_mode", "reset_indices"]
-
 # The names of the members of Gymnasium's AutoresetMode.
 DISABLED, NEXT_STEP, SAME_STEP = "DISABLED", "NEXT_STEP", "SAME_STEP"
 

@@ -28,8 +28,6 @@ from .vector_recording import VectorRecording, for_each
 from .vector_tiles import TiledVideo, check_tiled, wants_tiles
 from .waiting import waiting_display
 
-__all__ = ["VectorMonitor"]
-
 logger = logging.getLogger(__name__)
 
 _VectorEnv = gymnasium.vector.VectorEnv[Any, Any, Any]

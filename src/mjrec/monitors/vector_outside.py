@@ -30,8 +30,6 @@ from .vector_recording import (
     options_of,
 )
 
-__all__ = ["OutsideMonitor", "OutsideRecording"]
-
 logger = logging.getLogger(__name__)
 
 _VectorEnv = gymnasium.vector.VectorEnv[Any, Any, Any]

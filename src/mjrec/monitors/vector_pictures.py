@@ -13,8 +13,6 @@ from ..frame_grid import grid_frame, grid_shape
 from ..frames import Frame, check_frame
 from ..recorder.subject import EpisodePictures
 
-__all__ = ["OutsidePictures", "TilePictures", "VectorFrames"]
-
 _RGB_ARRAY = "rgb_array"
 
 

@@ -16,8 +16,6 @@ from ..recorder.options import RecorderOptions
 from ..rendering.shared_rendering import SharedRendering
 from .controls import MonitorControls
 
-__all__ = ["VectorRecording", "for_each", "opened_together", "options_of"]
-
 T = TypeVar("T")
 
 

@@ -17,8 +17,6 @@ from ..schedules import disable_videos, to_schedule
 from .controls import MonitorControls
 from .vector_pictures import TilePictures
 
-__all__ = ["TiledVideo", "check_tiled", "wants_tiles"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator
 
 from ..rendering.progress import Progress
 
-__all__ = ["waiting_display"]
-
 
 @contextlib.contextmanager
 def waiting_display() -> Iterator[Callable[[Progress], None]]:

@@ -6,8 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["BegunEpisode"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class BegunEpisode:

@@ -19,8 +19,6 @@ from .trajectory_recorder import Pace
 from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder
 
-__all__ = ["ClipMaker"]
-
 
 class ClipMaker:
     """Makes what records the clips of a run.

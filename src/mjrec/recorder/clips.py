@@ -6,8 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-__all__ = ["Clip", "Clips"]
-
 
 class Clip(Protocol):
     """What records one video that is counted in steps, and lists it at its end."""

@@ -16,8 +16,6 @@ from ..errors import InvalidArgument
 from ..rates import rate_from_timestep, to_rate
 from ..simulation.inside import simulation_in
 
-__all__ = ["declared_rate"]
-
 logger = logging.getLogger(__name__)
 
 _DEFAULT_RATE = Fraction(30)

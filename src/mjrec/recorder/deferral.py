@@ -10,8 +10,6 @@ from ..simulation.state_source import EpisodeStart
 from .subject import Subject, what_is_missing
 from .video_recorder import can_give_pictures
 
-__all__ = ["Deferral"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -30,8 +30,6 @@ from ..formats.trajectory_log import RowFormat
 from ..simulation.state_source import EpisodeStart, StateSource
 from .trajectory_recorder import Pace, TrajectoryRecorder
 
-__all__ = ["ClipLogs", "DeferredClip"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -8,8 +8,6 @@ from typing import Any
 
 from .trajectory_recorder import TrajectoryRecorder
 
-__all__ = ["DeferredVideo"]
-
 
 class DeferredVideo:
     """Stands where a `VideoRecorder` stands when pictures are drawn live.

@@ -10,8 +10,6 @@ from typing import Any, Protocol
 
 from ..errors import Error
 
-__all__ = ["EndedTrajectories", "Rendering"]
-
 _NO_FAILURES: Mapping[str, str] = MappingProxyType({})
 
 

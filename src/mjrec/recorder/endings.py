@@ -8,8 +8,6 @@ from typing import Any
 
 from ..signals import received
 
-__all__ = ["CLOSE", "EXCEPTION", "INTERRUPT", "KILLED", "RESET", "ending", "last_error"]
-
 CLOSE, EXCEPTION, INTERRUPT, KILLED, RESET = (
     "close",
     "exception",

@@ -7,8 +7,6 @@ from ..schedules import Schedule, disable_videos, schedule_name, to_schedule
 from .options import OFF, RecorderOptions
 from .selection import Selection, selection_from
 
-__all__ = ["EpisodeChoice"]
-
 _EVALUATION = "e"
 
 

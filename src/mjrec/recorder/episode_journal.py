@@ -10,8 +10,6 @@ from ..errors import FileNotWritten
 from ..formats.journal import JournalEntry, JournalWriter
 from .tracking import FinishedEpisode
 
-__all__ = ["EpisodeJournal"]
-
 
 class EpisodeJournal:
     """Adds a line to the journal for each finished episode.

@@ -13,8 +13,6 @@ from ..formats.trajectory_log import RowFormat
 from .deferred_video import DeferredVideo
 from .trajectory_recorder import TrajectoryRecorder
 
-__all__ = ["EpisodeTrajectory"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -20,8 +20,6 @@ from .deferred_clip import DeferredClip
 from .deferred_video import DeferredVideo
 from .video_recorder import VideoRecorder
 
-__all__ = ["EpisodeVideos"]
-
 
 class EpisodeVideos:
     """The videos of the episodes that are over."""

@@ -9,8 +9,6 @@ import threading
 import weakref
 from collections.abc import Callable
 
-__all__ = ["ExitGuard"]
-
 # How the names of this package's own threads begin.
 _OWN_THREADS = "mjrec-"
 

@@ -9,8 +9,6 @@ from typing import Any, Literal
 
 from .options import WARN
 
-__all__ = ["Faults", "What"]
-
 logger = logging.getLogger(__name__)
 
 What = Literal["video", "trajectory", "statistics", "journal", "model", "tracker"]

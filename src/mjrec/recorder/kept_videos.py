@@ -28,8 +28,6 @@ from .selection import Selection, Standing
 from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
 
-__all__ = ["KeptVideos"]
-
 logger = logging.getLogger(__name__)
 
 

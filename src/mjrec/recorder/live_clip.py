@@ -11,8 +11,6 @@ from .live_videos import end_each
 from .subject import EpisodePictures
 from .video_recorder import VideoRecorder
 
-__all__ = ["LiveClip"]
-
 
 class LiveClip:
     """Records one such video, of one camera or a file for each; a `Clip`.

@@ -17,8 +17,6 @@ from .options import RecorderOptions
 from .subject import EpisodePictures, Subject
 from .video_recorder import VideoRecorder
 
-__all__ = ["LiveVideoMaker", "LiveVideos", "end_each", "name_again"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class LiveVideoMaker:

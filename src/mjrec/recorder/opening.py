@@ -39,8 +39,6 @@ from ..results import clear_monitor_files
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.sources import MonitorResults
 
-__all__ = ["JOIN", "OpenDirectory", "open_directory"]
-
 # To record beside monitors that are of the same environment, without a look at them.
 JOIN = "join"
 

@@ -22,17 +22,6 @@ from .opening import JOIN
 from .selection import selection_from
 from .tracking import FinishedEpisode, Tracker
 
-__all__ = [
-    "DEFERRED",
-    "LIVE",
-    "OFF",
-    "RAISE",
-    "WARN",
-    "RecorderOptions",
-    "RenderingChoice",
-    "type_of_mode",
-]
-
 DEFERRED, LIVE, OFF = "deferred", "live", "off"
 RAISE, WARN = "raise", "warn"
 # Not gym's own, which would be taken for a monitor's files.

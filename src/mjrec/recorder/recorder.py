@@ -54,8 +54,6 @@ from .usual_steps import CountedSteps, UsualSteps
 from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder
 
-__all__ = ["Recorder"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -14,8 +14,6 @@ from .options import LIVE
 from .subject import Subject
 from .versions import versions
 
-__all__ = ["RecordingFacts"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingFacts:

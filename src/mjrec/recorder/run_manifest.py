@@ -17,8 +17,6 @@ from .kept_videos import KeptVideos
 from .options import RecorderOptions
 from .versions import versions
 
-__all__ = ["RunManifest"]
-
 _FORMAT_VERSION = 1
 
 

@@ -19,8 +19,6 @@ from ..errors import InvalidArgument, UnknownName
 from ..schedules import check_takes_one, schedule_name
 from .tracking import FinishedEpisode
 
-__all__ = ["RULES", "UNDECIDED", "Keep", "Selection", "Standing", "selection_from"]
-
 Keep: TypeAlias = str | Callable[[Sequence[FinishedEpisode]], Iterable[int]]
 
 

@@ -13,8 +13,6 @@ import numpy as np
 from ..errors import ClosedError, InvalidArgument, ResetNeeded, ResetNotAllowed
 from ..formats.stats_file import StatsFile, write_stats_file
 
-__all__ = ["StatsRecorder", "reward_to_float"]
-
 _TYPES = ("t", "e")
 
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from ..formats.trajectory import Array
 
-__all__ = ["StepArray", "action_array", "step_array"]
-
 _ARRAY = np.ndarray
 
 # What every value of a kind fits into exactly: people give float32 to an environment

@@ -13,8 +13,6 @@ from ..simulation.state_source import StateSource
 from .options import RenderingChoice
 from .video_recorder import PictureSource, can_give_pictures
 
-__all__ = ["EpisodePictures", "Subject", "check_pictures", "what_is_missing"]
-
 
 class EpisodePictures(PictureSource, Protocol):
     """Where the pictures of a run come from, episode by episode."""

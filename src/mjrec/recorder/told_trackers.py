@@ -12,8 +12,6 @@ from typing import Any
 from ..formats.video_names import view_of
 from .tracking import FinishedEpisode, FinishedVideo, Run, Tracker
 
-__all__ = ["ToldTrackers"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["FinishedEpisode", "FinishedVideo", "Run", "Tracker"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Run:

@@ -20,8 +20,6 @@ from ..rates import rate_from_timestep, stride_for
 from ..simulation.state_source import EpisodeStart, StateSource
 from .step_arrays import StepArray, action_array, step_array
 
-__all__ = ["MomentCopier", "Pace", "TrajectoryRecorder"]
-
 logger = logging.getLogger(__name__)
 
 

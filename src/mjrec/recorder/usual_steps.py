@@ -21,8 +21,6 @@ from ..errors import FileNotWritten
 from .stats_recorder import StatsRecorder
 from .trajectory_recorder import MomentCopier
 
-__all__ = ["CountedSteps", "UsualSteps"]
-
 # Of a reward, which is NumPy's float64 as a rule, and those before: `+` would make one
 # of the sum too, and converting each takes ten times as long.
 _sum = float.__add__

@@ -9,8 +9,6 @@ import platform
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["versions"]
-
 _PACKAGES = (
     *("mjrec", "mujoco", "gymnasium", "gymnasium-robotics", "dm-control", "numpy"),
     "imageio-ffmpeg",

@@ -12,8 +12,6 @@ from ..formats.monitor_directory import Infix, clip_video_prefix, video_prefix
 from .options import LIVE, RecorderOptions
 from .subject import Subject
 
-__all__ = ["VideoPromises"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class VideoPromises:

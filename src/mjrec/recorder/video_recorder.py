@@ -27,8 +27,6 @@ from ..rates import rate_from_timestep, stride_for, to_rate
 from ..simulation.inside import simulation_time
 from .declared_rate import declared_rate
 
-__all__ = ["PictureSource", "VideoRecorder", "can_give_pictures"]
-
 logger = logging.getLogger(__name__)
 
 _IMAGE_MODES = ("rgb_array", "rgb_array_list")

@@ -18,13 +18,6 @@ from ..rendering.videos import video_path
 from .remains import Remains
 from .report import RecoveredFile
 
-__all__ = [
-    "last_clip_episode",
-    "pending_clips",
-    "remove_empty_parts",
-    "videos_begun_by_steps",
-]
-
 _END = ".meta.json"
 _METADATA = re.compile(r"openaigym\.video\..+\.video[0-9]+\.step[0-9]+\.meta\.json")
 

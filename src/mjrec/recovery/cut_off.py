@@ -13,8 +13,6 @@ from ..errors import UnreadableFile
 from ..formats.video_metadata import metadata_path
 from .known_episodes import KnownEpisodes
 
-__all__ = ["facts_of", "how_it_ended", "sums_of", "write_metadata"]
-
 
 def how_it_ended(episode_id: int | None, known: KnownEpisodes) -> dict[str, Any] | None:
     """Return what is known of an episode's end; None where it was cut off."""

@@ -17,8 +17,6 @@ from ..results.sources import MonitorResults
 from .clips import last_clip_episode
 from .remains import Remains
 
-__all__ = ["KnownEpisodes"]
-
 
 class KnownEpisodes:
     """The episodes of a monitor, as its journal and its trajectories have them.

@@ -31,8 +31,6 @@ from .cut_off import how_it_ended, sums_of, write_metadata
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
 
-__all__ = ["finish_video"]
-
 _MOMENT = 0.05
 
 

@@ -45,8 +45,6 @@ from .remains import Remains, look_through
 from .report import RecoveredFile
 from .selections import choice_of
 
-__all__ = ["write_results"]
-
 _FORMAT_VERSION = 1
 
 

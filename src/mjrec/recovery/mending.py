@@ -35,8 +35,6 @@ from .report import RecoveredFile
 from .text_recordings import finish_text
 from .unfinished_logs import finish_log_of_dead
 
-__all__ = ["Mending"]
-
 logger = logging.getLogger(__name__)
 
 _MOMENT = 0.05

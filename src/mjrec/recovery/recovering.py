@@ -14,8 +14,6 @@ from ..formats.second_names import give_all_second_names
 from .remains import Remains, has_work, is_open, model_leftovers, remains_of
 from .report import Recovery
 
-__all__ = ["recover"]
-
 # One recovery of a directory at a time.
 _LOCK = ".openaigym.recover.lock"
 _SECONDS = 5.0

@@ -31,17 +31,6 @@ from ..formats.video_metadata import is_broken, metadata_path
 from ..results.monitor_files import MonitorFiles
 from ..results.sources import MonitorResults
 
-__all__ = [
-    "Remains",
-    "has_work",
-    "is_open",
-    "lacks_results",
-    "look_through",
-    "model_leftovers",
-    "remains_of",
-    "unfinished_logs",
-]
-
 # A note is rewritten as every file is: an unfinished one has both endings.
 _PART = re.compile(
     r"\.(?P<final>openaigym\..+?)(?:\.note\.part\.[0-9a-f]{8}|\.[0-9a-f]{8}|\.note)\.part"

@@ -11,8 +11,6 @@ from ..formats.json_fields import read_object
 from .known_episodes import KnownEpisodes
 from .remains import Remains
 
-__all__ = ["choice_of"]
-
 
 def choice_of(
     remains: Remains, known: KnownEpisodes, old_details: Mapping[str, Any]

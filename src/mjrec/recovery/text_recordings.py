@@ -18,8 +18,6 @@ from .cut_off import facts_of, how_it_ended, sums_of, write_metadata
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
 
-__all__ = ["finish_text"]
-
 _TOLD_BY_TRAJECTORY = ("type", "env_id", "seed", "options", "versions")
 
 

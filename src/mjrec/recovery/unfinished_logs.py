@@ -19,8 +19,6 @@ from ..rendering.videos import video_path
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
 
-__all__ = ["finish_log_of_dead"]
-
 
 def finish_log_of_dead(log: Path, known: KnownEpisodes) -> RecoveredFile | None:
     """Give a log its final form, as far as it goes.

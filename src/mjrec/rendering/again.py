@@ -24,8 +24,6 @@ from .videos import further_video_paths, render_video
 from .views import PlainCamera, View, plain_camera
 from .workers import DrawingWorkers
 
-__all__ = ["Variant", "render_again", "render_one_again", "videos_of_variant"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from ..annotation import Caption
 from ..formats.trajectory_reader import TrajectoryReader
 
-__all__ = ["Captions"]
-
 _BLOCK_BYTES = 1 << 20
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..annotation import Caption, check_annotation
-from ..formats.video_writer import VideoFile
+from ..formats.unfinished_video import VideoFile
 from .captions import Captions
 from .recorded_clips import RecordedClip, read_clip
 from .recorded_facts import open_for_rendering
@@ -26,8 +26,6 @@ from .videos import (
 )
 from .views import View
 from .workers import DrawingWorkers
-
-__all__ = ["render_clip"]
 
 _NO_FRAME = "the process was killed before its first frame"
 

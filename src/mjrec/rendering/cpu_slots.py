@@ -18,8 +18,6 @@ from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name
 from ..machine import usable_cpus
 
-__all__ = ["CpuSlots", "check_workers"]
-
 _SECONDS_BETWEEN_TRIES = 0.1
 
 

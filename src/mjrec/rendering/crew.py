@@ -10,8 +10,6 @@ from pathlib import Path
 from .cpu_slots import CpuSlots, check_workers
 from .workers import DrawingWorkers
 
-__all__ = ["Crew"]
-
 
 class Crew:
     """Hands out drawing workers.

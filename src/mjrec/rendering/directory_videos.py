@@ -26,8 +26,6 @@ from .pending import EpisodeKey, RecordingKey, key_of, recordings
 from .progress import Progress
 from .views import View, plain_camera
 
-__all__ = ["RenderedVideos", "iter_rendered_videos", "render_videos"]
-
 _SHOWN = 20
 
 _OnProgress = Callable[[Progress], object]

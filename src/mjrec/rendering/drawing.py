@@ -25,8 +25,6 @@ from .recorded_facts import open_for_rendering
 from .recorded_pictures import check_has_pictures
 from .views import PlainCamera, View
 
-__all__ = ["Drawing", "StatesDrawing", "TrajectoryDrawing", "open_drawing"]
-
 
 class Drawing(Protocol):
     """Pictures that are known by their numbers, from 0."""

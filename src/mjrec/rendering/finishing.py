@@ -20,7 +20,7 @@ from typing import Protocol, Self
 from ..errors import BlankVideo, Error, GLError
 from ..formats.second_names import give_all_second_names
 from ..formats.trajectory_file import finish_trajectory
-from ..formats.video_writer import VideoFile
+from ..formats.unfinished_video import VideoFile
 from .clip_videos import render_clip
 from .crew import Crew
 from .outcomes import Outcome
@@ -37,8 +37,6 @@ from .recorded_clips import PendingClip
 from .rendered_manifests import reconcile, update_manifest
 from .videos import render_video
 from .workers import DrawingWorkers
-
-__all__ = ["EpisodeFinisher", "bring_up_to_date", "finish_pending", "note_failure"]
 
 logger = logging.getLogger(__name__)
 

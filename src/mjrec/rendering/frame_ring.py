@@ -11,8 +11,6 @@ import numpy as np
 from ..errors import Error
 from ..frames import Frame
 
-__all__ = ["SLOTS", "FrameRing"]
-
 # As many as keep a worker drawing while its reader is busy with the pictures before.
 SLOTS = 4
 

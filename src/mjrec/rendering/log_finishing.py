@@ -34,8 +34,6 @@ from ..errors import Error
 from ..formats.trajectory_file import finish_trajectory
 from ..patience import Patience
 
-__all__ = ["finish_log", "main"]
-
 logger = logging.getLogger(__name__)
 
 _MODULE = "mjrec.rendering.log_finishing"

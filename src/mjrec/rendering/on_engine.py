@@ -22,8 +22,6 @@ from .pending import RecordingKey, may_be_left
 from .progress import Progress
 from .video_jobs import again_job, environ_for_drawing, finishing_job, outcome_of
 
-__all__ = ["finish_on_engine", "given_engine", "render_again_on_engine"]
-
 _WORKER = "mjrec.rendering.video_jobs:VideoWorker"
 
 _OnProgress = Callable[[Progress], object]

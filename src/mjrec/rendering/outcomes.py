@@ -8,8 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
 
-__all__ = ["Outcome"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:

@@ -37,20 +37,6 @@ from .recorded_clips import ClipKey, PendingClip, look_at_clip, recorded_clips
 from .recorded_facts import model_file, open_for_rendering
 from .videos import further_video_paths, video_path
 
-__all__ = [
-    "EpisodeKey",
-    "PendingEpisode",
-    "PendingRecording",
-    "RecordingKey",
-    "claim",
-    "key_of",
-    "look_at",
-    "may_be_left",
-    "recorded_episodes",
-    "recordings",
-    "remove_unfinished",
-]
-
 _PART = re.compile(r"[0-9a-f]{8}\.part", re.ASCII)
 
 

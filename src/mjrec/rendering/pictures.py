@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from ..simulation.cameras import Camera
     from ..simulation.trajectories import Trajectory
 
-__all__ = ["render", "render_states"]
-
 
 def render(
     trajectory: Trajectory | str | os.PathLike[str],

@@ -31,16 +31,6 @@ from .recorded_facts import model_file, open_for_rendering
 from .recorded_pictures import ChosenFrames, chosen_frames, recorded_rate
 from .videos import further_video_paths, video_path
 
-__all__ = [
-    "ClipKey",
-    "PendingClip",
-    "RecordedClip",
-    "clip_parts",
-    "look_at_clip",
-    "read_clip",
-    "recorded_clips",
-]
-
 _VIDEO = re.compile(r".*\.video[0-9]{6,18}\.step(?P<step>[0-9]{6,18})\.mp4")
 
 

@@ -25,13 +25,12 @@ from ..formats.json_fields import (
     text,
     unreadable,
 )
-from ..formats.trajectory_file import TrajectoryReader, open_trajectory
+from ..formats.trajectory_file import open_trajectory
+from ..formats.trajectory_reader import TrajectoryReader
 from ..formats.video_names import is_second_name
 from ..frames import QUALITIES
 from ..rates import to_rate
 from .views import PlainCamera, plain_camera
-
-__all__ = ["model_file", "open_for_rendering"]
 
 # Not all that `Fraction` takes: 1e20000000 keeps it busy for a minute.
 _RATE = re.compile(r"\d{1,12}(/\d{1,12})?", re.ASCII)

@@ -12,14 +12,6 @@ from ..errors import InvalidArgument, NoPictures
 from ..formats.trajectory_reader import TrajectoryReader
 from ..rates import stride_for, to_rate
 
-__all__ = [
-    "ChosenFrames",
-    "check_has_pictures",
-    "chosen_frames",
-    "recorded_rate",
-    "warn_of_other_pictures",
-]
-
 logger = logging.getLogger(__name__)
 
 

@@ -40,8 +40,6 @@ from .pending import RecordingKey, key_of
 from .progress import Progress
 from .render_service import ALL_SAID
 
-__all__ = ["main"]
-
 _NICE = 10
 _SECONDS_BETWEEN_REPORTS = 0.2
 # How long workers without work keep their memory.

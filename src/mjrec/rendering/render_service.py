@@ -31,8 +31,6 @@ from ..patience import Patience, patience_s
 from .cpu_slots import check_workers
 from .progress import Progress
 
-__all__ = ["ALL_SAID", "Progress", "RenderService"]
-
 logger = logging.getLogger(__name__)
 
 # The line that ends the names. It is none of a trajectory.

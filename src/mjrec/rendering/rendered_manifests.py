@@ -37,8 +37,6 @@ from ..formats.video_metadata import (
     metadata_path,
 )
 
-__all__ = ["reconcile", "update_manifest"]
-
 
 def reconcile(directory: Path) -> None:
     """Update the manifests of all monitors that are closed.

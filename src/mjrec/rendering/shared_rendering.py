@@ -11,8 +11,6 @@ from ..formats.monitor_directory import infix_of
 from .progress import Progress
 from .render_service import RenderService
 
-__all__ = ["Share", "SharedRendering"]
-
 
 class SharedRendering:
     """Renders for several monitors, each of which has a share of one service.

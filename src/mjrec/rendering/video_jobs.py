@@ -32,14 +32,6 @@ from .outcomes import Outcome
 from .pending import RecordingKey, key_of
 from .workers import DrawingWorkers
 
-__all__ = [
-    "VideoWorker",
-    "again_job",
-    "environ_for_drawing",
-    "finishing_job",
-    "outcome_of",
-]
-
 _RASTERISER_THREADS = "LP_NUM_THREADS"
 
 

@@ -32,6 +32,7 @@ from ..formats.monitor_directory import (
 )
 from ..formats.second_names import give_second_names, take_second_names
 from ..formats.trajectory_reader import TrajectoryReader, added_up
+from ..formats.unfinished_video import VideoFile
 from ..formats.video_metadata import (
     StepRuns,
     file_facts,
@@ -39,7 +40,7 @@ from ..formats.video_metadata import (
     timing_facts,
 )
 from ..formats.video_names import further_parts, second_name_of, with_part
-from ..formats.video_writer import VideoFile, VideoWriter
+from ..formats.video_writer import VideoWriter
 from ..frame_grid import grid_shape
 from ..frames import Frame
 from ..rates import to_rate
@@ -55,20 +56,6 @@ from .recorded_pictures import (
 )
 from .views import PlainCamera, View, plain_camera
 from .workers import DrawingWorkers
-
-__all__ = [
-    "Footage",
-    "ending_facts",
-    "further_video_paths",
-    "is_annotated",
-    "known_facts",
-    "render_footage",
-    "render_video",
-    "usual_fps",
-    "video_path",
-    "what_broke",
-    "write_that_it_broke",
-]
 
 logger = logging.getLogger(__name__)
 

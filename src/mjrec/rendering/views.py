@@ -12,8 +12,6 @@ import numpy as np
 from ..errors import InvalidArgument, UnknownName
 from ..frames import check_quality, check_size
 
-__all__ = ["CAMERA_MEMBERS", "PlainCamera", "View", "plain_camera"]
-
 PlainCamera: TypeAlias = "str | int | dict[str, Any]"
 
 # The public members of an `mujoco.MjvCamera`.

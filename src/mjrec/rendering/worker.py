@@ -37,8 +37,6 @@ from ..child_python import say_stacks_when_asked, take_standard_output
 from ..gl import use_gl
 from .frame_ring import FrameRing
 
-__all__ = ["main"]
-
 _NICE = 10
 
 

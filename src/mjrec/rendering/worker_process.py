@@ -25,8 +25,6 @@ from ..child_python import (
 from ..errors import Error
 from .frame_ring import FrameRing
 
-__all__ = ["WorkerProcess"]
-
 _END_OF_STDERR = 2000
 _SECONDS_TO_DIE = 5.0
 _SECONDS_TO_SAY_STACKS = 5.0

@@ -26,8 +26,6 @@ from .frame_ring import SLOTS, FrameRing
 from .views import PlainCamera, View, plain_camera
 from .worker_process import WorkerProcess
 
-__all__ = ["DrawingWorkers"]
-
 _LOG = logging.getLogger(__name__)
 
 # Pictures that a worker draws one after the other before it leaves some out. While one

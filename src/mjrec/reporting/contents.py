@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from ..evaluation.summaries import AcrossTasks, Bootstrap, TaskSummary
 
-__all__ = ["EpisodeColumns", "ReportContents", "ReportTask", "ReportVideo", "Verdict"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeColumns:

@@ -33,8 +33,6 @@ from .numbers import decimals_for, number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["SERIES", "evaluation_curve", "learning_curve", "profile_curve"]
-
 _Floats: TypeAlias = NDArray[np.float64]
 
 # The classes that tell lines apart, each with a dash pattern of its own as well.

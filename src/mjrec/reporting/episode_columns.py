@@ -15,15 +15,6 @@ from ..evaluation.summarizing import default_score_range, summarize_task
 from ..results.episodes import Episode
 from .contents import EpisodeColumns
 
-__all__ = [
-    "ROLES",
-    "EpisodeRows",
-    "columns_of_results",
-    "episodes_with_roles",
-    "summary_of_columns",
-    "what_disagrees",
-]
-
 ROLES: Final = ("best", "median", "worst")
 
 _UNKNOWN: Final = 0

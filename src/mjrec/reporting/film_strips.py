@@ -35,8 +35,6 @@ from ..rendering.views import View, plain_camera
 from ..rendering.workers import DrawingWorkers
 from .video_stream import VideoStream, read_stream, stream_frames, video_kind
 
-__all__ = ["film_strip", "write_film_strip"]
-
 _TRAJECTORIES: Final = (".h5", ".log")
 _MOST_IN_A_ROW: Final = 8
 _DOTS_PER_INCH: Final = 300

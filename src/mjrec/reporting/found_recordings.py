@@ -13,8 +13,6 @@ from ..errors import InvalidArgument
 from ..evaluation.results_files import is_evaluation
 from ..results.monitor_files import MonitorFiles, monitors_of
 
-__all__ = ["FoundRecordings", "find_recordings"]
-
 
 @dataclass(frozen=True)
 class FoundRecordings:

@@ -45,8 +45,6 @@ from .provenance import (
 from .recorded_videos import RecordedVideo, recorded_videos, report_video
 from .verdicts import VERIFICATION_NAME, read_verdict
 
-__all__ = ["gather"]
-
 _UNKNOWN_ENVIRONMENT = "unknown environment"
 _LONGEST_NAME = 1000
 

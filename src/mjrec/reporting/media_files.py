@@ -25,17 +25,6 @@ from .contents import ReportContents, ReportVideo
 from .posters import Poster, poster_of
 from .video_stream import video_kind
 
-__all__ = [
-    "POSTERS",
-    "VIDEOS",
-    "OnProgress",
-    "ReportProgress",
-    "is_own_name",
-    "with_copied_videos",
-    "with_embedded_videos",
-    "with_posters",
-]
-
 VIDEOS: Final = "videos"
 POSTERS: Final = "posters"
 

@@ -7,8 +7,6 @@ import math
 from collections.abc import Iterable
 from typing import Final
 
-__all__ = ["NOTHING", "decimals_for", "number", "whole_number"]
-
 # What stands where there is no number.
 NOTHING: Final = "\N{EN DASH}"
 

@@ -34,8 +34,6 @@ from .contents import EpisodeColumns, ReportContents, ReportTask, ReportVideo, V
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
 from .numbers import NOTHING, decimals_for, number, whole_number
 
-__all__ = ["page_of"]
-
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 
 # Of a text that is a name, a reason, or a command line.

@@ -10,8 +10,6 @@ from typing import Final
 from ..errors import Error
 from .video_stream import jpeg_at, read_stream
 
-__all__ = ["Poster", "poster_of"]
-
 _MOST_WIDTH: Final = 640
 
 

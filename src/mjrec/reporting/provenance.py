@@ -23,13 +23,6 @@ from ..results.sources import MonitorResults
 from .contents import EpisodeColumns
 from .recorded_videos import RecordedVideo
 
-__all__ = [
-    "MonitorOrigin",
-    "origin_of",
-    "provenance_of_evaluation",
-    "provenance_of_monitors",
-]
-
 Rows = list[tuple[str, str]]
 
 # In this order, by the names of the packages.

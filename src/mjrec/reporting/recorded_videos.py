@@ -20,8 +20,6 @@ from ..formats.video_names import view_of
 from ..results.sources import MonitorResults
 from .contents import ReportVideo
 
-__all__ = ["RecordedVideo", "recorded_videos", "report_video"]
-
 _SHA256: Final = re.compile(r"[0-9a-f]{64}", re.ASCII)
 _NUMBER: Final = re.compile(r"-?\d+", re.ASCII)
 _LONGEST_TEXT: Final = 1000

@@ -39,8 +39,6 @@ from .media_files import (
 )
 from .page import page_of
 
-__all__ = ["write_report"]
-
 PAGE_NAME: Final = "index.html"
 
 _PAGE_ENDINGS: Final = (".html", ".htm")

@@ -18,8 +18,6 @@ from ..formats.json_fields import (
 )
 from .contents import Verdict
 
-__all__ = ["VERIFICATION_NAME", "read_verdict"]
-
 # Where it is looked for, in each directory with recordings.
 VERIFICATION_NAME: Final = "verification.json"
 

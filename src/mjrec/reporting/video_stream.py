@@ -24,8 +24,6 @@ from ..formats.regular_files import open_regular, regular_path
 from ..formats.unfinished_video import as_file
 from ..frames import Frame
 
-__all__ = ["VideoStream", "jpeg_at", "read_stream", "stream_frames", "video_kind"]
-
 _BEGIN: Final = 12
 # By ending: what ffmpeg calls them.
 _KINDS: Final = {".mp4": "mp4", ".avi": "avi", ".mkv": "matroska"}

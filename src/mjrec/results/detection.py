@@ -13,8 +13,6 @@ from ..formats.locks import is_locked
 from ..formats.monitor_directory import is_manifest, iter_monitor_files
 from ..formats.second_names import is_called_like_second, second_names
 
-__all__ = ["clear_monitor_files", "detect_monitor_files", "detect_training_manifests"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -17,8 +17,6 @@ from .monitor_files import MonitorFiles, monitors_of
 from .numbering import NumberedEpisode, number_episodes
 from .sources import MonitorResults
 
-__all__ = ["Episode", "episodes_of", "iter_episodes"]
-
 
 @dataclass(frozen=True)
 class Episode:

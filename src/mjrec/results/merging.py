@@ -16,8 +16,6 @@ from .monitor_files import MonitorFiles, monitors_of
 from .recorded_environment import GYM_VERSION
 from .sources import MonitorResults
 
-__all__ = ["MergedStats", "load_results", "merge_stats_files"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -16,8 +16,6 @@ from ..formats.monitor_directory import (
     iter_monitor_files,
 )
 
-__all__ = ["MonitorFiles", "monitors_of"]
-
 # Videos of further cameras have the camera's name before the ending.
 _VIDEO = re.compile(r".*\.video(?P<episode>\d{6,})\.(?P<kind>meta\.json|mp4|avi|json)")
 

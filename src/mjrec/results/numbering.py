@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from ..formats.journal import JournalEntry
 from ..formats.stats_file import StatsFile
 
-__all__ = ["NumberedEpisode", "number_episodes"]
-
 
 @dataclass(frozen=True)
 class NumberedEpisode:

@@ -15,8 +15,6 @@ from ..formats.manifest import Manifest
 from ..formats.trajectory_log_reader import TrajectoryLogReader
 from .monitor_files import MonitorFiles
 
-__all__ = ["GYM_VERSION", "recorded_env_info"]
-
 # What stands for gym's version in what this package writes.
 GYM_VERSION = "mjrec-1"
 

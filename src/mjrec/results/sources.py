@@ -23,8 +23,6 @@ from ..formats.stats_file import StatsFile, read_stats_file
 from .monitor_files import MonitorFiles
 from .recorded_environment import recorded_env_info
 
-__all__ = ["MonitorResults"]
-
 logger = logging.getLogger(__name__)
 
 

@@ -41,15 +41,6 @@ from ..json_text import loads
 from .model_differences import differing_fields
 from .model_fields import apply_fields
 
-__all__ = [
-    "AuthoredModel",
-    "authored_from_file",
-    "compile_authored",
-    "read_authored",
-    "with_embedded_files",
-    "write_authored",
-]
-
 logger = logging.getLogger(__name__)
 
 _FORMAT = 1

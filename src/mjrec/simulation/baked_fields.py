@@ -16,8 +16,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-__all__ = ["BakedFields", "is_kept_by_context"]
-
 _HFIELD = ("hfield_data", "hfield_size")
 _TEXTURE = ("tex_data",)
 _MESH = (

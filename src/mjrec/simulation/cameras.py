@@ -15,18 +15,6 @@ import numpy as np
 
 from ..errors import InvalidArgument, UnknownName
 
-__all__ = [
-    "FREE_CAMERA",
-    "Camera",
-    "camera_from_members",
-    "camera_names",
-    "check_camera",
-    "raw_data",
-    "raw_model",
-    "resolve_camera",
-    "tracking_camera",
-]
-
 Camera: TypeAlias = "str | int | mujoco.MjvCamera"
 
 FREE_CAMERA = -1

@@ -18,18 +18,6 @@ from .model_differences import differing_fields
 from .model_fields import apply_fields, array_names, read_fields, struct_names
 from .model_store import load_model
 
-__all__ = [
-    "are_same_models",
-    "changed_model",
-    "changed_names",
-    "differing_from",
-    "has_jumping_contacts",
-    "keeps_paths",
-    "model_digest",
-    "model_from_sources",
-    "turns_by_rk4",
-]
-
 _SMOOTH = ("PLANE", "SPHERE", "CAPSULE")
 
 

@@ -15,8 +15,6 @@ from typing import Any
 
 import mujoco
 
-__all__ = ["drawing_plugin"]
-
 # The one plugin that comes with MuJoCo and draws only if told to: with this attribute
 # it paints the geoms of its bodies, in the model itself.
 _CABLE = "mujoco.elasticity.cable"

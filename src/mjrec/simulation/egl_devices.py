@@ -10,8 +10,6 @@ from typing import Any
 
 from ..gl.egl_device import EglDevice
 
-__all__ = ["egl_devices"]
-
 _EXTENSIONS = 0x3055
 _DEVICE = 0x322C
 _CUDA_DEVICE = 0x323A

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from ..errors import ClosedError, PicturesDiffer
 from ..formats.trajectory import RowLayout
+from .authored_model import AuthoredModel
 from .cameras import raw_data, raw_model
 from .integration_state import STATE_SPEC, state_components
 from .model_fields import is_settable
 from .model_memory import ModelMemory
-from .model_store import AuthoredModel, ModelStore
+from .model_store import ModelStore
 from .picture_states import (
     CheckedPictures,
     KeptCameras,
@@ -29,8 +30,6 @@ from .picture_states import (
 from .scene_view import SceneView, ViewMemory
 from .state_memory import has_state_memory, state_memory
 from .state_source import EpisodeStart, MomentMemory
-
-__all__ = ["EpisodeStates"]
 
 T = TypeVar("T")
 

@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike
 from .cameras import Camera
 from .renderer import SceneRenderer
 
-__all__ = ["Eye"]
-
 # A plain integer: see `cameras`.
 _TRACKING = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
 

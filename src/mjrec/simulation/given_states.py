@@ -14,8 +14,6 @@ from ..errors import FileNotWritten, InvalidArgument
 from .authored_model import with_embedded_files
 from .cameras import raw_model
 
-__all__ = ["GivenStates", "check_states", "save_states"]
-
 _MODEL, _STATES = "model.mjb", "states.npy"
 
 

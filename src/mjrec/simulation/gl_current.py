@@ -8,8 +8,6 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-__all__ = ["current_context_kept"]
-
 
 @contextlib.contextmanager
 def current_context_kept() -> Iterator[None]:

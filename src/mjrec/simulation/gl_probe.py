@@ -35,8 +35,6 @@ from ..machine import gpu_device_files
 from .egl_devices import egl_devices
 from .gl_strings import current_gl_strings
 
-__all__ = ["check_picture", "main"]
-
 _SIZE = 480
 _MEASURED_SECONDS = 0.8
 _MEASURED_FRAMES = 200

@@ -9,8 +9,6 @@ from typing import Any
 
 from .egl_devices import egl_devices
 
-__all__ = ["current_gl_facts", "current_gl_strings"]
-
 _NAMES = ("GL_VENDOR", "GL_RENDERER", "GL_VERSION")
 
 

@@ -29,8 +29,6 @@ import mujoco
 from ..errors import ClosedError, Error, GLError
 from .gl_strings import current_gl_facts, current_gl_strings
 
-__all__ = ["GLStrings", "GLThread", "gl_error", "opengl"]
-
 _logger = logging.getLogger(__name__)
 
 P = ParamSpec("P")

@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-__all__ = ["simulation_in", "simulation_time"]
-
 # Where the simulated part is, if it is not the environment itself: dm_control's
 # physics, and the environments inside Gymnasium-Robotics' mazes and kitchen.
 _HOLDERS = ("physics", "point_env", "ant_env", "robot_env")

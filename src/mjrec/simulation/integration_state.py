@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from ..errors import InvalidArgument
 from ..formats.trajectory import StateComponent
 
-__all__ = ["STATE_SPEC", "set_state", "state_components"]
-
 STATE_SPEC = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 _PREFIX = "mjSTATE_"

@@ -8,8 +8,6 @@ from collections.abc import Iterator
 
 import mujoco
 
-__all__ = ["KeptSimulation"]
-
 # What an environment moves or colours to show a goal or a touch.
 _FIELDS = (
     *("site_pos", "site_quat", "site_size", "site_rgba"),

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from ..errors import UnreadableFile
 from ..rates import MAX_DENOMINATOR
 
-__all__ = ["FRAME_RATE", "MjcfSimulation", "load_mjcf"]
-
 FRAME_RATE = Fraction(60)
 
 # Authors write five digits of a timestep that is one over a whole number.

@@ -8,8 +8,6 @@ import numpy as np
 
 from .mjcf import FRAME_RATE, MjcfSimulation, _meant_timestep
 
-__all__ = ["CompiledSimulation"]
-
 
 class CompiledSimulation(MjcfSimulation):
     """An `MjcfSimulation` whose file somebody else has compiled, within bounds.

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from .model_fields import array_names, is_settable, read_fields, struct_names
 
-__all__ = ["differing_fields"]
-
 # Where a model's files were when it was compiled, and a checksum that nothing here
 # depends on.
 _PLACES = re.compile(r"paths|npaths|nbuffer|signature|\w+_(path|contenttype)adr")

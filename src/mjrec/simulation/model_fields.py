@@ -15,16 +15,6 @@ from numpy.typing import NDArray
 from ..errors import InvalidArgument
 from .struct_memory import member_names, read_member
 
-__all__ = [
-    "VIEW_STRUCTS",
-    "apply_fields",
-    "array_names",
-    "empty_model",
-    "is_settable",
-    "read_fields",
-    "struct_names",
-]
-
 # What in a name's first part stands for the view and not for the model.
 VIEW_STRUCTS = ("camera", "option")
 

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from .model_fields import array_names, empty_model, read_fields, struct_names
 from .struct_memory import Members, Memory, Place, array_address, find_places
 
-__all__ = ["ModelMemory"]
-
 # What MuJoCo's visualiser reads of a model whenever it makes a scene (traced in 3.17
 # and 4.0). These are compared at every captured step, the others at every reset.
 _SHOWN = frozenset(

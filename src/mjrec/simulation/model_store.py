@@ -36,7 +36,6 @@ from ..formats.regular_files import open_regular
 from ..worker_thread import WorkerThread
 from .authored_model import (
     AuthoredModel,
-    authored_from_file,
     with_embedded_files,
     write_authored,
 )
@@ -47,8 +46,6 @@ from .model_trust import (
     seal_of,
 )
 from .source_compiler import compile_within
-
-__all__ = ["AuthoredModel", "ModelStore", "authored_from_file", "load_model"]
 
 logger = logging.getLogger(__name__)
 

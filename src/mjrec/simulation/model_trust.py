@@ -37,17 +37,6 @@ from pathlib import Path
 
 from ..atomic_files import temporary_path
 
-__all__ = [
-    "TRUST_VARIABLE",
-    "environ_with_key",
-    "is_sealed",
-    "is_trusted",
-    "seal_of",
-    "trusting_all_models",
-    "trusting_models",
-    "with_all_models_trusted",
-]
-
 logger = logging.getLogger(__name__)
 
 TRUST_VARIABLE = "MJREC_TRUST_MODELS"

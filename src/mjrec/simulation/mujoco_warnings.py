@@ -8,8 +8,6 @@ import logging
 
 import mujoco
 
-__all__ = ["log_mujoco_warnings"]
-
 _LOG = logging.getLogger(__name__)
 
 

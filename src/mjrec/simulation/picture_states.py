@@ -16,8 +16,6 @@ from .scene_check import scene_difference
 from .scene_view import SceneView, ViewMemory
 from .snapshot import SnapshotSource, needs_constraints, snapshot_layout
 
-__all__ = ["CheckedPictures", "KeptCameras", "PictureStates", "moves_cameras"]
-
 _TRACKING = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 

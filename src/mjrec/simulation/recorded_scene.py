@@ -23,8 +23,6 @@ from .scene_view import SceneView, scene_view_from_facts
 from .snapshot import restore_snapshot
 from .struct_memory import read_member
 
-__all__ = ["RecordedScene"]
-
 _BLOCK_BYTES = 1 << 20
 
 

@@ -20,8 +20,6 @@ from .baked_fields import BakedFields
 from .cameras import FREE_CAMERA, Camera, raw_data, raw_model, resolve_camera
 from .gl_thread import GLStrings, GLThread, gl_error, opengl
 
-__all__ = ["SceneRenderer"]
-
 
 class SceneRenderer:
     """Draws a simulation: the pictures of `mujoco.Renderer`, byte for byte.

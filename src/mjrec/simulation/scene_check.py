@@ -23,8 +23,6 @@ from .scene_view import SceneView
 from .snapshot import restore_snapshot
 from .struct_memory import kind_of
 
-__all__ = ["differences", "scene_difference", "updated_scene"]
-
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 
 # Not set by `mjv_updateScene` in every geom, or only later, when it is drawn.

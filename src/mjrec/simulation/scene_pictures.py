@@ -13,8 +13,6 @@ from ..frames import Frame, check_size
 from .cameras import camera_names, raw_data, raw_model, resolve_camera
 from .renderer import SceneRenderer
 
-__all__ = ["Look", "ScenePictures", "camera_label", "option_without_rangefinder"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Look:

@@ -21,15 +21,6 @@ from ..errors import InvalidArgument
 from ..formats.trajectory import Array, RowLayout
 from .tendon_colours import TendonColours, has_limited_tendons, has_plastic_tendons
 
-__all__ = [
-    "SnapshotSource",
-    "drawn_readings",
-    "layout_objection",
-    "needs_constraints",
-    "restore_snapshot",
-    "snapshot_layout",
-]
-
 # Not an array of `MjData`: the colours that tendons have in the picture. They are
 # restored into the model's array of this name.
 _TENDON_RGBA = "tendon_rgba"

@@ -23,8 +23,6 @@ from .integration_state import STATE_SPEC, set_state, state_components
 from .model_fields import apply_fields
 from .snapshot import SnapshotSource, drawn_readings, layout_objection
 
-__all__ = ["SnapshotSteps", "column_names", "live_snapshot", "numbers_of"]
-
 
 class SnapshotSteps:
     """Takes snapshots of a model again, each from recorded states alone.

@@ -25,8 +25,6 @@ from ..child_python import environment_of_child, python_command
 from ..errors import UnreadableFile
 from .authored_model import read_authored
 
-__all__ = ["compile_within"]
-
 _MODEL = "model.mjb"
 _REASON = "reason.txt"
 _LONGEST_REASON = 2000

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from .integration_state import STATE_SPEC, state_components
 from .struct_memory import Memory, Place, array_address, find_places
 
-__all__ = ["has_state_memory", "state_memory"]
-
 # Components whose array in `MjData` has another name.
 _ARRAYS = {"warmstart": "qacc_warmstart", "plugin": "plugin_state"}
 # No array, but a number of the struct, which lies close to this array of the struct.

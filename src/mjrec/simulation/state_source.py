@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from ..formats.trajectory import RowLayout, StateComponent
 
-__all__ = ["EpisodeStart", "MomentMemory", "StateSource"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class MomentMemory:

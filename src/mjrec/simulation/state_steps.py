@@ -22,8 +22,6 @@ from ..formats.trajectory import StateComponent
 from .integration_state import STATE_SPEC, state_components
 from .model_fields import apply_fields
 
-__all__ = ["LiveStates", "StateSteps"]
-
 # What a simulation with these keeps outside its state, so that no step follows from it.
 _BEYOND_STATE = ("mjENBL_SLEEP", "mjENBL_IPC")
 

@@ -18,17 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Members",
-    "Memory",
-    "Place",
-    "array_address",
-    "find_places",
-    "kind_of",
-    "member_names",
-    "read_member",
-]
-
 # Values whose bytes differ from each other, and so from the member's, in each place.
 _TRIED_INTEGERS = (0x01020304, 0x7A6B5C4D)
 _TRIED_FLOATS = (1 / 3, -7e9 / 11)

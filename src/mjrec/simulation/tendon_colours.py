@@ -15,8 +15,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["TendonColours", "has_limited_tendons", "has_plastic_tendons"]
-
 # The colour of a tendon that nobody has given one.
 _UNCHOSEN = np.array([0.5, 0.5, 0.5, 1], np.float32)
 _LIMIT_TENDON = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnknownName, UnreadableFile
 from ..formats.monitor_directory import infix_of, iter_monitor_files
-from ..formats.trajectory_file import TrajectoryReader, open_trajectory
+from ..formats.trajectory_file import open_trajectory
+from ..formats.trajectory_reader import TrajectoryReader
 
 if TYPE_CHECKING:
     import mujoco
-
-__all__ = ["Trajectory", "load_trajectory"]
 
 _SHOWN = 10
 

@@ -12,15 +12,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-__all__ = [
-    "copy_members",
-    "new_scene_flags",
-    "place_free_camera",
-    "place_viewer_camera",
-    "select_camera",
-    "viewer_option",
-]
-
 _FREE = int(mujoco.mjtCamera.mjCAMERA_FREE)
 _FIXED = int(mujoco.mjtCamera.mjCAMERA_FIXED)
 

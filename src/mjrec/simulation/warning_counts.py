@@ -7,8 +7,6 @@ from typing import Any
 
 import mujoco
 
-__all__ = ["warning_counts"]
-
 _PREFIX = "mjWARN_"
 
 

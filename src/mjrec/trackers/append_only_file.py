@@ -8,8 +8,6 @@ from pathlib import Path
 
 from ..errors import DirectoryNotWritable, FileNotWritten
 
-__all__ = ["AppendOnlyFile", "make_directory"]
-
 
 class AppendOnlyFile:
     """A new file, to which a piece is added whole or not at all, and at once.

@@ -25,8 +25,6 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 from ..errors import DirectoryNotWritable
 from .append_only_file import AppendOnlyFile, make_directory
 
-__all__ = ["EventFile"]
-
 # Where a GIF has its width and height.
 _GIF_SIZE = struct.Struct("<HH")
 _GIF_SIZE_AT = 6

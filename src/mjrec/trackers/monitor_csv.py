@@ -24,8 +24,6 @@ from ..formats.monitor_directory import FILE_PREFIX
 from ..recorder.tracking import FinishedEpisode, Run, Tracker
 from .append_only_file import AppendOnlyFile
 
-__all__ = ["MonitorCsvTracker"]
-
 # What Stable-Baselines3 looks for: every file of a directory whose name ends so.
 _ENDING = "monitor.csv"
 

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from ..formats.ffmpeg import run_ffmpeg
 
-__all__ = ["animated_gif"]
-
 _MOST_BYTES = 2 << 20
 # Of the longer side, in pixels. The last is small enough for any hundred pictures.
 _SIDES = (320, 160, 80)

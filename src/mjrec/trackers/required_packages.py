@@ -7,8 +7,6 @@ import importlib
 
 from ..errors import MissingDependency
 
-__all__ = ["require"]
-
 
 def require(package: str, *, purpose: str, extra: str) -> None:
     """Import `package`.

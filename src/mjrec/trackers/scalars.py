@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from ..recorder.tracking import FinishedEpisode, FinishedVideo
 
-__all__ = ["group_of", "name_of", "scalars_of"]
-
 
 def group_of(episode: FinishedEpisode | None) -> str:
     """Return what comes before the slash; of no episode, that of training."""

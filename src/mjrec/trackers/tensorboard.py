@@ -20,8 +20,6 @@ from .scalars import group_of, name_of, scalars_of
 if TYPE_CHECKING:
     from .event_file import EventFile
 
-__all__ = ["TensorBoardTracker"]
-
 # Videos that wait for their previews; what is kept of each is a name.
 _MOST_WAITING = 100
 

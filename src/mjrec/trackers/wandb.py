@@ -11,8 +11,6 @@ from ..recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
 from .required_packages import require
 from .scalars import group_of, name_of, scalars_of
 
-__all__ = ["WandbTracker"]
-
 _STEPS = "total_steps"
 _VIDEO_STEPS = "video_total_steps"
 

@@ -40,9 +40,6 @@ from .anonymous_models import anonymous_sources, compiled_model
 from .anonymous_trajectories import write_anonymous_trajectory
 from .identity import Identity
 from .identity_matching import IdentityMatcher
-from .identity_traces import remaining_identity
-
-__all__ = ["make_anonymous", "remaining_identity"]
 
 logger = logging.getLogger(__name__)
 

@@ -22,8 +22,6 @@ from ...formats.json_fields import unreadable
 from .identity_matching import IdentityMatcher
 from .model_file_names import is_xml, with_other_names
 
-__all__ = ["anonymous_sources", "compiled_model"]
-
 # What begins like a comment inside CDATA is none.
 _BESIDE_THE_MODEL = re.compile(
     r"(?P<cdata><!\[CDATA\[.*?\]\]>)|<!--(?P<comment>.*?)-->", re.DOTALL

@@ -11,8 +11,6 @@ from typing import Any
 from ...formats.trajectory_file import open_trajectory
 from ...formats.trajectory_hdf5 import write_hdf5
 
-__all__ = ["write_anonymous_trajectory"]
-
 
 def write_anonymous_trajectory(path: Path, anonymous: Callable[[Any], Any]) -> None:
     """Replace a trajectory by one whose facts are anonymous.

@@ -19,8 +19,6 @@ from .sizes import byte_count
 from .staging import TRY_AGAIN, publish, stage, staging_folder
 from .statements import state
 
-__all__ = ["pack"]
-
 _ENDING = ".zip"
 
 

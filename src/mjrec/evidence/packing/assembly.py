@@ -20,21 +20,20 @@ from ..layout import (
     RECORDINGS,
     STATISTICS,
 )
-from .anonymity import make_anonymous, remaining_identity
+from .anonymity import make_anonymous
 from .bag import make_bag
 from .citation import citation
 from .contents import Contents
 from .crate import crate
 from .environment_file import environment
 from .identity import Identity
+from .identity_traces import remaining_identity
 from .packed_run import PackedRun, read_run
 from .readme import readme
 from .staging import copy_folder
 from .statements import Statements
 from .statistics_table import write_statistics
 from .zip_file import STORED, write_zip
-
-__all__ = ["Assembly"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,8 +19,6 @@ from typing import Any
 from ...errors import MissingDependency, PackError
 from ..layout import PAYLOAD
 
-__all__ = ["check_bagit", "make_bag"]
-
 _ALGORITHM = "sha512"
 
 

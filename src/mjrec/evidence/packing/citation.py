@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from .packed_run import PackedRun
 from .statements import Author
 
-__all__ = ["citation"]
-
 
 def citation(run: PackedRun) -> str:
     """Return the content of the file, which is YAML.

@@ -44,8 +44,6 @@ from ...rendering.recorded_facts import open_for_rendering
 from ...results import iter_episodes
 from ...results.monitor_files import monitors_of
 
-__all__ = ["PACKED_EPISODES", "Contents", "VideoFiles", "look_for_contents"]
-
 # In the key `mjrec` of a packed manifest: the episodes that were chosen for packing.
 PACKED_EPISODES = "packed_episodes"
 

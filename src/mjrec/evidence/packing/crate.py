@@ -26,8 +26,6 @@ from ..layout import (
 from .packed_run import PackedRun, Session, iso_time
 from .statements import Author
 
-__all__ = ["crate"]
-
 Entity = dict[str, Any]
 
 _CONTEXT = "https://w3id.org/ro/crate/1.1/context"

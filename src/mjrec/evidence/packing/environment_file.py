@@ -10,8 +10,6 @@ from typing import Any
 
 from .packed_run import PackedRun, Session
 
-__all__ = ["environment"]
-
 # What the metadata of a video says of whatever made it.
 _OF_PICTURES = ("gl_vendor", "gl_renderer", "gl_version", "rendered_with")
 _OF_ENCODING = ("ffmpeg_sha256",)

@@ -14,8 +14,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-__all__ = ["HOME_OF_ANYBODY", "Identity", "identity_of_user"]
-
 logger = logging.getLogger(__name__)
 
 _USER_VARIABLES = ("USER", "LOGNAME", "USERNAME", "SUDO_USER")

@@ -28,8 +28,6 @@ import numpy as np
 from .identity import HOME_OF_ANYBODY, Identity
 from .ordinary_words import ORDINARY_WORDS
 
-__all__ = ["IdentityMatcher"]
-
 _SHORTEST_INSIDE_WORDS = 6
 _SHORTEST_WORD = 4
 _SHORTEST_PERSON_INSIDE_WORDS = 9

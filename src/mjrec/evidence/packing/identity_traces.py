@@ -23,8 +23,6 @@ from ...formats.trajectory_hdf5 import SIGNATURE
 from .identity import Identity
 from .identity_matching import IdentityMatcher
 
-__all__ = ["remaining_identity"]
-
 _GZIP = b"\x1f\x8b"
 _ZIP = b"PK\3\4"
 _FILM = re.compile(rb"....ftyp|RIFF....AVI ", re.DOTALL)

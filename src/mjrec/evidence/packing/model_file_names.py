@@ -16,8 +16,6 @@ from xml.etree import ElementTree
 
 from ...json_text import loads
 
-__all__ = ["CONTENTS", "SOURCE", "is_xml", "with_other_names"]
-
 # As `simulation.authored_model` lays the zip out.
 CONTENTS = "contents.json"
 SOURCE = "source/"

@@ -7,8 +7,6 @@ simulations and of the files here.
 
 from __future__ import annotations
 
-__all__ = ["ORDINARY_WORDS"]
-
 _WORDS = """
     acrobot actions actuator actuatorgroup admin administrator adroit agent also
     also_named analysis anonymous ant architecture arm armature asset author authors

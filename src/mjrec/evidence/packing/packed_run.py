@@ -19,8 +19,6 @@ from ...results.monitor_files import MonitorFiles, monitors_of
 from ...results.sources import MonitorResults
 from .statements import Statements
 
-__all__ = ["PackedRun", "PackedVideo", "Session", "iso_time", "read_run"]
-
 _SHOWN = 3
 
 

@@ -17,8 +17,6 @@ from ..layout import (
 )
 from .packed_run import PackedRun, PackedVideo, Session, iso_time
 
-__all__ = ["readme"]
-
 # Of the table of videos; the statistics have them all.
 _MOST_VIDEOS = 200
 _NOT_SAID = "not recorded"

@@ -13,8 +13,6 @@ from ...rendering.workers import DrawingWorkers
 from .assembly import Assembly
 from .smaller_videos import SCALES, draw_smaller, redrawable
 
-__all__ = ["archive_within"]
-
 # Of the files that an archive that is too large is made of.
 _LARGEST = 10
 

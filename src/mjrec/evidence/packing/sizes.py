@@ -7,8 +7,6 @@ import re
 
 from ...errors import InvalidArgument
 
-__all__ = ["byte_count", "shown_size"]
-
 _SIZE = re.compile(
     r"(?P<number>\d{1,15}(\.\d{1,6})?)\s*(?P<unit>[KMGT]?)(?P<bin>i?)B?", re.IGNORECASE
 )

@@ -25,8 +25,6 @@ from ...rendering.views import View
 from ...rendering.workers import DrawingWorkers
 from .contents import VideoFiles
 
-__all__ = ["SCALES", "Redrawable", "draw_smaller", "redrawable"]
-
 # Of width and height, one after the other until the archive is small enough.
 SCALES = (Fraction(3, 4), Fraction(1, 2), Fraction(3, 8), Fraction(1, 4))
 

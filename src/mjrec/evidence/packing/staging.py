@@ -20,8 +20,6 @@ from ...errors import DirectoryNotWritable, FileNotWritten, UnreadableFile
 from ...formats.manifest import write_manifest
 from .contents import Contents
 
-__all__ = ["TRY_AGAIN", "copy_folder", "publish", "stage", "staging_folder"]
-
 # What a full disk calls for.
 TRY_AGAIN = "then pack again"
 

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from ...errors import InvalidArgument, MissingDependency
 
-__all__ = ["Author", "License", "Statements", "state"]
-
 _AUTHOR = re.compile(r"(?P<name>[^<>]+?)\s*(<\s*(?P<inside>[^<>\s]+)\s*>)?")
 _ORCID = re.compile(r"(https?://orcid\.org/)?(?P<digits>(\d{4}-){3}\d{3}[\dX])")
 _EMAIL = re.compile(r"[^@\s]+@[^@\s]+\.[^@\s]+")

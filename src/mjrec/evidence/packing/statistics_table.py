@@ -12,8 +12,6 @@ from ...formats.json_fields import read_object, unreadable
 from ...results import Episode, iter_episodes
 from ..layout import STATISTICS_COLUMNS
 
-__all__ = ["write_statistics"]
-
 
 def write_statistics(recordings: Path, path: Path) -> None:
     """Write the table of the episodes of a monitor directory.

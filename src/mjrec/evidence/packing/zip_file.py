@@ -18,8 +18,6 @@ from pathlib import Path
 from ...errors import FileNotWritten
 from .staging import TRY_AGAIN
 
-__all__ = ["STORED", "write_zip"]
-
 # The endings of files in which nothing is left to be compressed.
 STORED = (".mp4", ".avi", ".h5", ".gz", ".zip")
 

@@ -17,8 +17,6 @@ from ..layout import PAYLOAD, RECORDINGS
 from .digests import digest_of
 from .unpacking import unpack
 
-__all__ = ["BAG_DECLARATION", "Archive", "Kind", "open_archive"]
-
 # What makes a folder a bag.
 BAG_DECLARATION = "bagit.txt"
 

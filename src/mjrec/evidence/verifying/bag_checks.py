@@ -22,8 +22,6 @@ from .findings import Findings
 from .portable_names import check_distinct, portable_parts
 from .task import Count
 
-__all__ = ["check_bag", "no_bag"]
-
 _INFO = "bag-info.txt"
 _MANIFEST = "manifest-sha512.txt"
 # Of bags that leave files out; a packed run never does.

@@ -10,8 +10,6 @@ from typing import Any
 from ..verification import Check, Level, Verdict
 from .task import Task
 
-__all__ = ["check_from_json", "check_to_json", "task_from_json", "task_to_json"]
-
 
 def check_to_json(check: Check) -> dict[str, Any]:
     """Return a check as JSON knows it."""

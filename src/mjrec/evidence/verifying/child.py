@@ -40,8 +40,6 @@ from .file_checks import check_files
 from .statistics_checks import check_statistics
 from .task import Checker
 
-__all__ = ["main"]
-
 logger = logging.getLogger(__name__)
 
 _SECONDS_BETWEEN_COUNTS = 0.1

@@ -30,8 +30,6 @@ from ..verification import Check, Level, Verdict
 from .findings import Findings
 from .recorded_monitors import RecordedMonitor, RecordedVideo
 
-__all__ = ["check_choice"]
-
 _CLAIM = "the episodes with a video are those that the schedule names"
 _VIDEOS_CLAIM = "there is a video of each episode that was to have one, and of no other"
 

@@ -22,8 +22,6 @@ from ...formats.regular_files import regular_path
 from ...formats.unfinished_video import as_file
 from .picture_similarity import Planes
 
-__all__ = ["DecodedVideo"]
-
 _READ_SIZE: Final = 1 << 20
 _LONGEST_HEADER: Final = 1024
 _HEADER: Final = re.compile(rb"YUV4MPEG2 W(\d{1,5}) H(\d{1,5}) [^\n]*")

@@ -12,8 +12,6 @@ import numpy as np
 from ...frames import Frame
 from .picture_similarity import Planes, frame_of
 
-__all__ = ["AMPLIFIED", "difference_picture", "png"]
-
 AMPLIFIED: Final = 8
 _GAP: Final = 4
 _MIDDLE: Final = 128

@@ -13,8 +13,6 @@ from ...formats.trajectory import StateComponent
 from ..verification import Verdict
 from .tolerances import Fit
 
-__all__ = ["Differences", "compared_columns", "judged"]
-
 
 class Differences:
     """Gathers the errors of rows of numbers, and remembers the first difference.

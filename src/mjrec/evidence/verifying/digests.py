@@ -8,8 +8,6 @@ from pathlib import Path
 
 from ...formats.regular_files import open_regular
 
-__all__ = ["digest_of"]
-
 _CHUNK = 1 << 20
 
 

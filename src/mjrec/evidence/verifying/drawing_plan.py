@@ -39,8 +39,6 @@ from ...rendering.views import PlainCamera, View, plain_camera
 from .live_pictures import told_live, why_others_are_shown
 from .shipped_video import ShippedVideo
 
-__all__ = ["DoesNotFit", "DrawingPlan", "NotDrawable", "plan_drawing"]
-
 
 class NotDrawable(Exception):
     """There is nothing that pictures of a video could be drawn from."""

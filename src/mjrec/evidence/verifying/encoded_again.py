@@ -20,8 +20,6 @@ from ...formats.video_writer import VideoWriter
 from ...frames import Frame
 from .shipped_video import ShippedVideo
 
-__all__ = ["OLD_RATE", "EncodedAgain"]
-
 OLD_RATE: Final = "-framerate"
 
 _READ_SIZE: Final = 1 << 20

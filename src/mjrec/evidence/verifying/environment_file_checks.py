@@ -17,8 +17,6 @@ from ..verification import Check, Level
 from .findings import Findings
 from .recorded_monitors import RecordedMonitor
 
-__all__ = ["check_environment_file"]
-
 _OF_PICTURES = ("gl_vendor", "gl_renderer", "gl_version", "rendered_with")
 _PACKED_WITH = ("mjrec", "bagit", "python", "zlib")
 _ABSENT = object()

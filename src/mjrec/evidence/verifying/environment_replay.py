@@ -34,8 +34,6 @@ from .differences import Differences, compared_columns
 from .recorded_models import is_of_pictures
 from .step_checks import BLOCK_ROWS
 
-__all__ = ["Replay", "action_kinds", "replay_episode"]
-
 _MOST_PARTS = 1000
 
 

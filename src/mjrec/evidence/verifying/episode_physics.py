@@ -40,8 +40,6 @@ from .snapshot_checks import FollowedSnapshots, begun_snapshot, follow_snapshots
 from .step_checks import follow_steps
 from .tolerances import Fit, derived_fit, framework_doubt, state_fit
 
-__all__ = ["EpisodePhysics"]
-
 _MODEL = "the model is the one that the environment has"
 _SOURCES = "the model is made from the sources in the archive"
 _STEPS = "each recorded state follows from the one before and the recorded controls"

@@ -12,8 +12,6 @@ from .packed_file_checks import check_packed_files
 from .recorded_file_checks import check_recorded_files
 from .task import Count, Task
 
-__all__ = ["check_files"]
-
 
 def check_files(task: Task, count: Count, *, bag: Path | None) -> Iterator[Check]:
     """Yield what is found about the files.

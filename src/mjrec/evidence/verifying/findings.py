@@ -13,8 +13,6 @@ from typing import Any
 
 from ..verification import Check, Level, Verdict
 
-__all__ = ["Findings"]
-
 _MOST_NAMED = 100
 _LONGEST_REASON = 1000
 

@@ -20,8 +20,6 @@ from ...formats.ffmpeg import FfmpegProcess
 from ...formats.regular_files import regular_path
 from ...formats.unfinished_video import as_file
 
-__all__ = ["UnevenTimes", "rate_of_frames"]
-
 _READ_SIZE: Final = 1 << 16
 _LONGEST_LINE: Final = 4096
 _TIME_BASE: Final = re.compile(rb"#tb 0: (\d{1,10})/(\d{1,10})")

@@ -27,8 +27,6 @@ from ..verification import Check, Level, Verdict
 from .carried_checks import check_from_json, task_to_json
 from .task import Task
 
-__all__ = ["LIMITS", "checks_of"]
-
 logger = logging.getLogger(__name__)
 
 _MODULE = "mjrec.evidence.verifying.child"

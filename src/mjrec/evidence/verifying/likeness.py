@@ -16,8 +16,6 @@ from typing import Any, Final
 
 from .picture_similarity import SAMPLES_OF_BLOCK, Similarity
 
-__all__ = ["MOST_SHADOW", "OTHER_ENCODER", "OTHER_RENDERER", "Likeness", "Limits"]
-
 # Half of what lies between black and white, in the limited range of a video's luma.
 _HALF_CONTRAST: Final = 110.0
 # Of three samples two are luma's: what changes luma alone changes so much less.

@@ -19,8 +19,6 @@ from ...environments.made_again import (
 )
 from .shipped_video import ShippedVideo
 
-__all__ = ["told_live", "why_others_are_shown"]
-
 
 def why_others_are_shown(video: ShippedVideo, facts: Mapping[str, Any]) -> str | None:
     """Return why a live video may show something else than its snapshots.

@@ -19,8 +19,6 @@ from ...environments.made_again import (
 )
 from ..verification import Check, Level, Verdict
 
-__all__ = ["EnvironmentNames"]
-
 _CLAIM = "the name that the results bear is that of the environment that was made"
 _WORST_FIRST = (Verdict.FAIL, Verdict.NOT_CHECKABLE, Verdict.PASS)
 

@@ -29,8 +29,6 @@ from ..verification import Check, Level
 from .archive import BAG_DECLARATION
 from .findings import Findings
 
-__all__ = ["check_packed_files"]
-
 _DESCRIPTIONS = (CRATE, README, CITATION, ENVIRONMENT, STATISTICS)
 _BAG = (
     *(BAG_DECLARATION, "bag-info.txt"),

@@ -40,8 +40,6 @@ from .name_checks import EnvironmentNames
 from .recorded_models import RecordedModels
 from .task import Count, Task
 
-__all__ = ["check_physics"]
-
 
 def check_physics(
     task: Task, count: Count, *, made_again: set[str] | None = None

@@ -16,17 +16,6 @@ from numpy.typing import NDArray
 
 from ...frames import Frame, pad_to_even
 
-__all__ = [
-    "BLOCK",
-    "SAMPLES_OF_BLOCK",
-    "Planes",
-    "Similarity",
-    "but_for_shadows",
-    "frame_of",
-    "planes_of",
-    "similarity",
-]
-
 # Two pictures that are equal have an infinite one, which JSON cannot say.
 _BEST_PSNR: Final = 100.0
 # In pixels, and the samples of all planes in it.

@@ -56,8 +56,6 @@ from .shipped_video import (
 )
 from .task import Count, Task
 
-__all__ = ["check_pixels"]
-
 _DECODES: Final = "the video decodes to the recorded number of frames and to their hash"
 _PACED: Final = "each frame of the video is shown for as long as was recorded"
 _DRAWN: Final = "the pictures drawn from the recorded snapshots have the shipped hashes"

@@ -11,8 +11,6 @@ import re
 import unicodedata
 from collections.abc import Iterable
 
-__all__ = ["check_distinct", "portable_parts"]
-
 # In bytes of UTF-8: what every file system of today takes.
 _LONGEST_NAME = 1000
 _LONGEST_PART = 255

@@ -26,8 +26,6 @@ from .digests import digest_of
 from .findings import Findings
 from .task import Count
 
-__all__ = ["check_recorded_files"]
-
 _METADATA = ".meta.json"
 _VIDEOS = (".mp4", ".avi")
 _MODEL = re.compile(r"openaigym\.model\.(?P<digits>[0-9a-f]{16})\.mjb\.gz")

@@ -26,14 +26,6 @@ from ...simulation.compiled_models import (
     model_from_sources,
 )
 
-__all__ = [
-    "ModelComparison",
-    "RecordedModels",
-    "compare_models",
-    "first_changes",
-    "is_of_pictures",
-]
-
 _ZIP = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 
 # What no step depends on.

@@ -19,8 +19,6 @@ from ...formats.video_metadata import metadata_path
 from ...formats.video_names import view_of
 from ...results.monitor_files import MonitorFiles, monitors_of
 
-__all__ = ["RecordedMonitor", "RecordedVideo", "recorded_monitors"]
-
 # Of each, some hundred bytes are in memory.
 _MOST_EPISODES = 10_000_000
 

@@ -12,8 +12,6 @@ from ...formats.trajectory_reader import TrajectoryReader
 from ...json_text import dumps
 from .findings import Findings
 
-__all__ = ["RepeatedEpisodes"]
-
 _CHUNK = 4096
 _MOST_NAMED = 20
 

@@ -31,8 +31,6 @@ from ...formats.video_metadata import metadata_path
 from ...frames import QUALITIES, check_size
 from ...rendering.views import PlainCamera, plain_camera
 
-__all__ = ["GL_STRINGS", "ShippedVideo", "read_frame_hashes", "read_shipped_video"]
-
 GL_STRINGS: Final = ("gl_vendor", "gl_renderer", "gl_version")
 
 _MOST_FRAMES: Final = 10**8

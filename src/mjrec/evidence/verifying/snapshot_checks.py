@@ -29,8 +29,6 @@ from .step_checks import BLOCK_ROWS, allowed_substeps, substeps_between
 # Most of the price is reading them: half a millisecond each.
 _FEW: Final = 3
 
-__all__ = ["FollowedSnapshots", "begun_snapshot", "follow_snapshots"]
-
 
 @dataclass
 class FollowedSnapshots:

@@ -16,7 +16,8 @@ import numpy as np
 
 from ...errors import UnreadableFile
 from ...formats.journal import JournalEntry
-from ...formats.trajectory_file import TrajectoryReader, open_trajectory
+from ...formats.trajectory_file import open_trajectory
+from ...formats.trajectory_reader import TrajectoryReader
 from ..layout import ENVIRONMENT, STATISTICS
 from ..verification import Check, Level
 from .choice_checks import check_choice
@@ -26,8 +27,6 @@ from .recorded_monitors import RecordedMonitor, RecordedVideo, recorded_monitors
 from .repeated_episodes import RepeatedEpisodes
 from .statistics_table import check_table
 from .task import Count, Task
-
-__all__ = ["check_statistics", "same", "sum_of"]
 
 _MOST_NUMBERS = 20
 

@@ -18,8 +18,6 @@ from ..verification import Check, Level
 from .findings import Findings
 from .recorded_monitors import RecordedMonitor
 
-__all__ = ["check_table"]
-
 _LARGEST = 1 << 28
 
 

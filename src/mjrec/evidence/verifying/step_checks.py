@@ -27,14 +27,6 @@ from ...simulation.state_steps import StateSteps
 from .differences import Differences, compared_columns
 from .recorded_models import is_of_pictures
 
-__all__ = [
-    "BLOCK_ROWS",
-    "FollowedSteps",
-    "allowed_substeps",
-    "follow_steps",
-    "substeps_between",
-]
-
 # Of a row in a hundred numbers this is a hundred kilobytes.
 BLOCK_ROWS: Final = 256
 

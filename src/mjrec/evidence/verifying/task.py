@@ -11,8 +11,6 @@ from typing import Any, TypeAlias
 
 from ..verification import Check, Level
 
-__all__ = ["Checker", "Count", "Task"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Task:

@@ -28,8 +28,6 @@ from ...fingerprint import machine_fingerprint
 from ...recorder.versions import versions
 from ...simulation.compiled_models import has_jumping_contacts, turns_by_rk4
 
-__all__ = ["Fit", "derived_fit", "framework_doubt", "state_fit"]
-
 _TOLERANCE: Final = 1e-9
 _LIMIT: Final = 1e-2
 # Velocities are differences divided by a time; rewards are made from them.

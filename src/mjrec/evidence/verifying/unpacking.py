@@ -14,8 +14,6 @@ from ...formats.regular_files import open_regular
 from .portable_names import portable_parts
 from .zip_contents import ZipContents, check_table, zip_contents
 
-__all__ = ["unpack"]
-
 _CHUNK = 1 << 20
 # What else is on a disk that is nearly full must go on.
 _ROOM = 1 << 26

@@ -20,8 +20,6 @@ from ...errors import MissingDependency
 from ..verification import Check, Level, Verdict, Verification
 from .difference_picture import AMPLIFIED
 
-__all__ = ["write_verification_report"]
-
 _TEMPLATE: Final = "verification_report.html.jinja"
 
 _MEANINGS: Final = {

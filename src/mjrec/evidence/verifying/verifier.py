@@ -28,8 +28,6 @@ from .level_process import checks_of
 from .task import Task
 from .working_folder import working_folder
 
-__all__ = ["VerificationProgress", "verify"]
-
 _PACKAGES = ("mjrec", "mujoco", "numpy", "gymnasium", "dm-control", "imageio-ffmpeg")
 
 

@@ -14,8 +14,6 @@ from pathlib import Path
 
 from ...formats.locks import Lock, is_locked
 
-__all__ = ["working_folder"]
-
 _PREFIX = "mjrec-verify-"
 # Held by the process whose folder it is in.
 _LOCK = "lock"

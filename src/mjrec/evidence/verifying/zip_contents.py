@@ -20,8 +20,6 @@ from typing import BinaryIO
 from ...formats.regular_files import open_regular
 from .portable_names import check_distinct, portable_parts
 
-__all__ = ["ZipContents", "check_table", "zip_contents"]
-
 # Twenty thousand recorded episodes.
 _MOST_ENTRIES = 100_000
 _LONGEST_TABLE = 1 << 26
