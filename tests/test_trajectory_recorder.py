@@ -20,7 +20,7 @@ from mjrec.formats.trajectory import (
     TrajectoryContent,
 )
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.formats.trajectory_log import RowFormat
+from mjrec.formats.trajectory_log import RowFormat, TrajectoryLogWriter
 from mjrec.recorder.stats_recorder import StatsRecorder
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
 from mjrec.recorder.usual_steps import UsualSteps
@@ -500,6 +500,27 @@ def test_step_without_a_state_is_a_step_all_the_same(tmp_path: Path) -> None:
     assert read.rewards.tolist() == [0.5, 1, 1.5]
     assert read.actions is not None
     assert read.actions[-1].tolist() == [3, 3]
+
+
+@pytest.mark.parametrize("place", ["add_step", "add_frame"])
+def test_an_interrupted_beginning_is_begun_anew(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A log of states alone would promise a video that nothing can be drawn of."""
+    path = tmp_path / "t.log"
+    trajectory = recorder(path, Counter())
+
+    def handler(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrajectoryLogWriter, place, handler)
+        with pytest.raises(KeyboardInterrupt):
+            trajectory.before_step(np.zeros(2))
+    trajectory.end({"complete": False})
+    read = content(path)
+    assert read.states.tolist() == [[0, 0, 0]]
+    assert read.frame_steps.tolist() == [0]
 
 
 def test_what_is_said_first_of_the_end_counts(tmp_path: Path) -> None:

@@ -290,7 +290,7 @@ class TrajectoryRecorder:
 
     def _begin_log(self) -> None:
         start = self._start
-        self._log = log = TrajectoryLogWriter(
+        log = TrajectoryLogWriter(
             self.path,
             TrajectoryHeader(
                 facts={**self._facts, **self._parts()},
@@ -301,8 +301,18 @@ class TrajectoryRecorder:
             ),
             rows=self.rows,
         )
+        try:
+            self._add_first(log)
+            self._log = log
+        except BaseException:
+            # A signal's handler may have raised: without its first row and frame it
+            # would promise a video of nothing. The end begins it anew.
+            log.discard()
+            raise
+
+    def _add_first(self, log: TrajectoryLogWriter) -> None:
         self.rows = log.rows
-        for fields in (start.model_fields, self._first_change):
+        for fields in (self._start.model_fields, self._first_change):
             if fields:
                 log.add_model_change(ModelChange(step=0, fields=fields))
         arrays = [array for array in (self._action, self._observation) if array]
