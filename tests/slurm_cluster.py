@@ -58,6 +58,9 @@ def slurm_cluster(place: Path) -> Iterator[Path]:
             host=socket.gethostname(), place=place, ports=_free_ports(2)
         )
     )
+    # By default slurmd looks for a mounted cgroup file system, which a change of root
+    # has none of, and ends where there is none.
+    (place / "cgroup.conf").write_text("CgroupPlugin=cgroup/v1\n")
     environ = {**os.environ, "SLURM_CONF": str(configuration)}
     daemons = [
         [
