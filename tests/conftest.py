@@ -185,6 +185,14 @@ def kill_children(name: str) -> int:
 
 
 @pytest.fixture
+def no_process_is_left() -> Iterator[None]:
+    """See that a test leaves no process that was not there before, zombies included."""
+    before = children()
+    yield
+    assert children() <= before
+
+
+@pytest.fixture
 def kill_ffmpeg() -> Callable[[], int]:
     """Return a function that kills this process's encoders."""
     return lambda: kill_children("ffmpeg")

@@ -362,6 +362,7 @@ BY_DEFAULT = {
 }
 
 
+# Takes more than five seconds: the videos of a run are drawn, forged and drawn again.
 @parametrize(
     "case",
     CASES,

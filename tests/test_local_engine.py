@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +25,7 @@ from mjrec.engines.work import Engine, Job, JobOutcome, Run, Work
 from mjrec.errors import ClosedError, Error, GLError, InvalidArgument
 from mjrec.machine import usable_cpus
 
-
-@pytest.fixture(autouse=True)
-def no_process_is_left() -> Iterator[None]:
-    """Every test cleans up, zombies included."""
-    before = children()
-    yield
-    assert children() <= before
+pytestmark = pytest.mark.usefixtures("no_process_is_left")
 
 
 def begun(

@@ -48,6 +48,7 @@ def test_a_short_log_is_finished_here(
     assert finish_log(write_log(tmp_path)).exists()
 
 
+@pytest.mark.usefixtures("no_process_is_left")
 @pytest.mark.usefixtures("elsewhere")
 def test_a_long_log_is_finished_in_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, names: Callable[[Path], list[str]]
@@ -60,7 +61,6 @@ def test_a_long_log_is_finished_in_another_process(
     assert names(tmp_path) == [finished.name]
     with open_trajectory(finished) as reader:
         assert reader.step_count == 4
-    assert not children()
 
 
 @pytest.mark.usefixtures("elsewhere")
@@ -100,6 +100,7 @@ def test_a_process_that_dies_is_told(
     assert log.exists()
 
 
+@pytest.mark.usefixtures("no_process_is_left")
 @pytest.mark.thorough
 @pytest.mark.usefixtures("elsewhere")
 def test_a_process_that_hangs_is_ended(
@@ -124,7 +125,6 @@ def test_a_process_that_hangs_is_ended(
         finish_log(log)
     assert log.exists()
     assert "in wait_for_a_disk" in caplog.text
-    assert not children()
 
 
 def test_without_another_process_it_is_done_here(
@@ -136,6 +136,7 @@ def test_without_another_process_it_is_done_here(
     assert finish_log(write_log(tmp_path)).exists()
 
 
+@pytest.mark.usefixtures("no_process_is_left")
 @pytest.mark.usefixtures("elsewhere")
 def test_ctrl_c_leaves_no_process_and_no_half_file(
     tmp_path: Path,
@@ -152,7 +153,6 @@ def test_ctrl_c_leaves_no_process_and_no_half_file(
     log = write_log(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         finish_log(log)
-    assert not children()
     assert names(tmp_path) == [log.name]
 
 

@@ -105,6 +105,7 @@ def verdicts(directory: Path, episode: int = 0, **options: Any) -> list[Verdict]
     return [check.verdict for (number, _), check in checks.items() if number == episode]
 
 
+# Takes more than five seconds: its fixture records what all tests of the file read.
 def test_an_honest_run_passes(honest: Path) -> None:
     """Bit for bit and byte for byte, on the machine that recorded it."""
     checks = found(honest)
