@@ -4,12 +4,10 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import children
 
 from mjrec.engines.gpu_shares import GpuShare
 from mjrec.engines.home_log import HomeLog
@@ -18,13 +16,7 @@ from mjrec.engines.job_book import JobBook, Task
 from mjrec.engines.work import Job, Work
 from mjrec.errors import InvalidArgument, UnknownName
 
-
-@pytest.fixture(autouse=True)
-def no_process_is_left() -> Iterator[None]:
-    """Every test cleans up."""
-    before = children()
-    yield
-    assert children() <= before
+pytestmark = pytest.mark.usefixtures("no_process_is_left")
 
 
 def hosted(make: str = "make", **settings: Any) -> HostedWork:
