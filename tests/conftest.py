@@ -36,7 +36,7 @@ collect_ignore = (
 
 @pytest.fixture(scope="session", autouse=True)
 def own_state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep the key of the tests' recordings out of the home directory."""
+    """Keep the list of the tests' models out of the home directory."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield

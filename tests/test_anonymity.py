@@ -290,7 +290,6 @@ def test_placeholders_stand_for_what_was_there(anonymous: Path) -> None:
     assert trajectory.facts["options"] == {"goal": "<path>/goal.npy"}
     kwargs = trajectory.facts["environment"]["kwargs"]
     assert kwargs["xml_file"] == "<path>/models/<user>.xml"
-    assert trajectory.facts["model"]["seal"] is None
     details = _read(next((anonymous / "pendulum").glob("*.manifest.json")))["mjrec"]
     assert "no key in <path>/wandb.key" in details["faults"][0]["reason"]
     surroundings = details["surroundings"]

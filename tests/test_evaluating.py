@@ -9,9 +9,9 @@ import random
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -28,12 +28,14 @@ from mjrec import (
     PolicyError,
     UnknownName,
 )
+from mjrec.engines.work import Job, JobOutcome, Work
 from mjrec.evaluation import evaluating
 from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.results_files import read_results
 from mjrec.evaluation.splitting import batches_of
+from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.locks import try_lock
 from mjrec.formats.video_metadata import metadata_path
 
@@ -184,6 +186,63 @@ def test_an_engine_changes_nothing(tmp_path: Path, engine: Any) -> None:
         assert {path.name for path in folder.glob("*.mp4")} == {
             video for video, _ in manifest_videos(folder)
         }
+
+
+class Wandering:
+    """An engine whose worker does each job as on a machine with another home.
+
+    Args:
+        homes: where these are.
+    """
+
+    workers = 1
+    unfinished = 0
+
+    def __init__(self, homes: Path) -> None:
+        self.homes = homes
+        self.jobs: list[Job] = []
+
+    def begin(self, work: Work) -> Self:
+        settings = json.loads(json.dumps(work.settings))
+        self.worker = EvaluationWorker(settings, work.payload)
+        return self
+
+    def submit(self, job: Job) -> None:
+        self.jobs.append(job)
+
+    def results(self, *, patience_s: float | None = None) -> Iterator[JobOutcome]:
+        while self.jobs:
+            job = self.jobs.pop(0)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setenv("XDG_STATE_HOME", str(self.homes / job.key))
+                value = self.worker(json.loads(json.dumps(job.arguments)))
+            yield JobOutcome(key=job.key, value=json.loads(json.dumps(value)))
+
+    def cancel(self) -> None:
+        self.worker.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.cancel()
+
+
+@pytest.mark.dm_control
+def test_machines_with_other_homes_draw_what_others_recorded(tmp_path: Path) -> None:
+    """Also where there is only a compiled model; and so does this machine."""
+    pytest.importorskip("dm_control")
+    evaluation = run(
+        tmp_path / "out",
+        tasks=["dm_control/swimmer-swimmer6"],
+        engine=Wandering(tmp_path / "homes"),
+        workers=None,
+        keep="best",
+    )
+    assert not list(evaluation.directory.rglob("*.model.*.zip"))
+    assert len(list(evaluation.directory.rglob("*.mp4"))) == 1
+    for path in evaluation.directory.rglob("*.h5"):
+        assert mjrec.load_trajectory(path).model().nv == 8
 
 
 def manifest_videos(folder: Path) -> list[list[str]]:

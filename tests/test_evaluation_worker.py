@@ -118,7 +118,7 @@ def test_a_unit_is_the_episode_that_a_session_records(
     plan = plan_of(task, seeds=(4,))
     worker = worker_of(tmp_path, plan)
     for batch in ((2,), (1, 0)):
-        assert worker(run_job(plan, 4, *batch)) == {"episodes": len(batch)}
+        assert worker(run_job(plan, 4, *batch))["episodes"] == len(batch)
     results = read_ledgers(tmp_path / FOLDER)
     for episode in range(3):
         result = results[4, episode]
@@ -134,9 +134,9 @@ def test_what_is_done_is_not_repeated(tmp_path: Path, names: Any) -> None:
     worker = worker_of(tmp_path, plan)
     worker(run_job(plan, 0, 1))
     first = read_ledgers(tmp_path / FOLDER)[0, 1]
-    assert worker(run_job(plan, 0, again=True)) == {"episodes": 2}
+    assert worker(run_job(plan, 0, again=True))["episodes"] == 2
     before = names(tmp_path / FOLDER)
-    assert worker(run_job(plan, 0, again=True)) == {"episodes": 0}
+    assert worker(run_job(plan, 0, again=True))["episodes"] == 0
     assert names(tmp_path / FOLDER) == before
     assert read_ledgers(tmp_path / FOLDER)[0, 1] == first
 
@@ -229,7 +229,7 @@ def test_a_policy_that_fails_loses_its_episode_only(
     [trajectory] = (tmp_path / FOLDER).glob(path)
     facts = facts_of(trajectory)
     assert (facts["complete"], facts["length"]) == (False, 2)
-    assert worker_of(tmp_path, plan)(run_job(plan, 0, again=True)) == {"episodes": 0}
+    assert worker_of(tmp_path, plan)(run_job(plan, 0, again=True))["episodes"] == 0
 
 
 def test_an_object_is_a_policy_in_each_of_its_forms(tmp_path: Path) -> None:
@@ -260,7 +260,7 @@ def test_a_signal_is_no_failure(tmp_path: Path) -> None:
     assert [*read_ledgers(tmp_path / FOLDER)] == [(0, 0)]
     logs = sorted((tmp_path / FOLDER).glob("*.log"))
     assert [facts_of(log)["complete"] for log in logs] == [True, False]
-    assert worker_of(tmp_path, plan)(run_job(plan, 0, again=True)) == {"episodes": 2}
+    assert worker_of(tmp_path, plan)(run_job(plan, 0, again=True))["episodes"] == 2
 
 
 class Unsteady(Corridor):
@@ -294,7 +294,7 @@ def test_an_environment_that_cannot_be_made_any_more_fails_its_episodes(
     assert len(results) == 3
     assert all("switched off" in str(r.failure) for r in results.values())
     assert {r.monitor for r in results.values()} == {None}
-    assert worker_of(tmp_path, plan)(run_job(plan, 0, again=True)) == {"episodes": 0}
+    assert worker_of(tmp_path, plan)(run_job(plan, 0, again=True))["episodes"] == 0
 
 
 def test_without_videos_trajectories_are_final_at_once(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.json_text import dumps, loads
 from mjrec.rendering.rendered_manifests import reconcile
-from mjrec.simulation.model_trust import seal_of
+from mjrec.simulation.model_trust import note_models
 from mjrec.simulation.source_compiler import compile_within
 
 
@@ -555,12 +555,13 @@ def facts_of(directory: Path) -> dict[str, Any]:
 
 
 def put_compiled(directory: Path, content: bytes, packed: bytes | None = None) -> Path:
-    """Store bytes as a compiled model, with facts that are true of them, and sealed."""
+    """Store bytes as a compiled model of this user's, with facts that are true."""
     digest = hashlib.sha256(content).hexdigest()
     path = directory / f"openaigym.model.{digest[:16]}.mjb.gz"
     path.write_bytes(gzip.compress(content) if packed is None else packed)
     facts = {"sha256": digest, "bytes": len(content), "mjb": path.name, "xml": None}
-    facts |= {"mujoco": mujoco.__version__, "seal": seal_of(digest)}
+    facts |= {"mujoco": mujoco.__version__}
+    note_models([digest])
     (directory / "facts.json").write_text(json.dumps(facts))
     return path
 

@@ -45,7 +45,7 @@ from mjrec.rendering.progress import Progress
 from mjrec.rendering.recorded_clips import ClipKey
 from mjrec.rendering.video_jobs import VideoWorker, again_job, finishing_job
 from mjrec.rendering.views import View
-from mjrec.simulation.model_trust import environ_with_key
+from mjrec.simulation.model_trust import note_models
 
 VIDEO = "openaigym.video.0.7.video000000"
 DIED = "Its worker died, which was try 3 of 3: it was killed by SIGKILL."
@@ -356,16 +356,19 @@ def test_one_worker_serves_several_directories(
 def test_workers_get_what_rendering_needs(
     tmp_path: Path, painter: Painter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One thread each, this user's key and trust, and where all of them see files."""
+    """One thread each, this user's models and trust, and where all see files."""
     monkeypatch.setenv("MJREC_TRUST_MODELS", "1")
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     monkeypatch.chdir(tmp_path)
     write_finished(tmp_path)
+    digest = "0123456789abcdef" * 4
+    note_models([digest, digest[::-1]])
+    (tmp_path / f"openaigym.model.{digest[:16]}.mjb.gz").touch()
     engine = Here()
     finish(engine, Path())
     [work] = engine.works
-    said = {"LP_NUM_THREADS": "1", "MJREC_TRUST_MODELS": "1"}
-    assert work.environ == {**said, **environ_with_key()}
+    assert work.environ == {"LP_NUM_THREADS": "1", "MJREC_TRUST_MODELS": "1"}
+    assert work.settings == {"models": [digest]}
     assert work.shared_directory == tmp_path
     assert engine.jobs[0].arguments["directory"] == str(tmp_path)
 

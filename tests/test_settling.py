@@ -256,7 +256,7 @@ def test_after_a_kill_nothing_finished_is_repeated_or_lost(tmp_path: Path) -> No
     assert [*before] == [(0, 0), (0, 1)]
     plan = plan_of(seeds=(0,), policy="zero")
     worker = worker_of(tmp_path, plan)
-    assert worker(run_job(plan, 0, again=True)) == {"episodes": 1}
+    assert worker(run_job(plan, 0, again=True))["episodes"] == 1
     monitors = worker({"kind": "recover", "folder": FOLDER})["monitors"]
     results = read_ledgers(tmp_path / FOLDER)
     assert len(monitors) == 2

@@ -30,6 +30,7 @@ from ..gl.choice import choose
 from ..recorder.versions import versions
 from ..rendering.on_engine import given_engine
 from ..rendering.video_jobs import environ_for_drawing
+from ..simulation.model_trust import stored_models
 from .chosen_videos import ChosenVideos, drawn_by_workers, render_chosen
 from .episode_results import EpisodeResult
 from .evaluation import Evaluation, EvaluationProgress
@@ -276,6 +277,10 @@ def _run(
             "plan": plan_to_json(plan),
             # What works here may not work where an engine has its workers.
             "chooses_gl": draws,
+            # Of what was recorded before; their homes may be others.
+            "models": stored_models(
+                directory / task.folder for task in plan.tasks if is_begun and draws
+            ),
         },
         payload=sent.payload,
         environ=_environ_of_workers(plan, draws=draws),

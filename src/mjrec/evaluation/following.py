@@ -24,6 +24,7 @@ from ..rendering.finishing import note_failure
 from ..rendering.outcomes import Outcome
 from ..rendering.pending import EpisodeKey, may_be_left
 from ..rendering.video_jobs import outcome_of
+from ..simulation.model_trust import note_models
 from .episode_results import EpisodeResult
 from .evaluation import EvaluationProgress
 from .kept_episodes import Chosen, KeepRule, keep_rule
@@ -49,6 +50,7 @@ class TaskRun:
         task: which one.
         unfinished: how many of its batches are not over.
         reasons: why episodes are not in any ledger, by seed and number.
+        models: the hashes of compiled models that workers stored of episodes, likewise.
         results: of all its episodes, in the order of the plan, when they are over.
         chosen: of those, which get a video, each with its role.
         unsettled: how many of its recordings are being settled.
@@ -61,6 +63,7 @@ class TaskRun:
     task: EvaluatedTask
     unfinished: int = 0
     reasons: dict[tuple[int, int], str] = field(default_factory=dict)
+    models: dict[tuple[int, int], Sequence[str]] = field(default_factory=dict)
     results: list[EpisodeResult] = field(default_factory=list)
     chosen: list[Chosen] = field(default_factory=list)
     unsettled: int = 0
@@ -72,12 +75,18 @@ class TaskRun:
     @property
     def chosen_keys(self) -> list[EpisodeKey]:
         """The chosen episodes as their recording knows them, each once."""
-        keys: dict[EpisodeKey, None] = {}
+        return list(self.chosen_models)
+
+    @property
+    def chosen_models(self) -> dict[EpisodeKey, Sequence[str]]:
+        """The models of the chosen episodes, as far as workers have reported them."""
+        keys: dict[EpisodeKey, Sequence[str]] = {}
         for result, _ in self.chosen:
             infix = Infix.parse(result.monitor or "")
             if infix is not None and result.episode_id is not None:
-                keys[EpisodeKey(infix, result.episode_id)] = None
-        return list(keys)
+                key = EpisodeKey(infix, result.episode_id)
+                keys[key] = self.models.get(result.unit, ())
+        return keys
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,8 +260,12 @@ class _Runner:
 
     def _take_batch(self, of: TaskRun, outcome: JobOutcome) -> None:
         batch = self._batches[outcome.key]
+        units = [(batch.seed, number) for number in batch.episodes]
+        # This user's, though it was done elsewhere: by workers of this process.
+        models = (outcome.value or {}).get("models", ())
+        note_models(models)
+        of.models.update(dict.fromkeys(units, models))
         if outcome.failure is not None:
-            units = [(batch.seed, number) for number in batch.episodes]
             of.reasons.update(dict.fromkeys(units, _in_short(outcome.failure)))
         of.unfinished -= 1
         if not of.unfinished:
@@ -304,15 +317,18 @@ class _Runner:
 
     def _submit_videos(self, of: TaskRun) -> None:
         folder = of.task.folder
-        keys = of.chosen_keys
-        of.videos = len(keys)
-        for key in keys:
+        chosen = of.chosen_models
+        of.videos = len(chosen)
+        for key, models in chosen.items():
             if not may_be_left(self._directory / folder, key):
                 of.videos_done += 1
                 continue
             job = f"draw/{folder}/{key.told_name}"
             self._recordings[job] = key
-            self._submit(job, {"folder": folder, "recording": key.told_name})
+            self._submit(
+                job,
+                {"folder": folder, "recording": key.told_name, "models": models},
+            )
 
     def _take_drawn(self, of: TaskRun, outcome: JobOutcome) -> None:
         key = self._recordings[outcome.key]

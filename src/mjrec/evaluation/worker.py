@@ -3,8 +3,8 @@
 
 Settings: `{"directory": DIR, "plan": <the plan as JSON>}`, and `"chooses_gl": true`
 where the worker is to choose an OpenGL backend that works on its machine, if episodes
-get videos; payload: the pickled policy, where it is an object. Jobs, by their `kind`,
-each of which may be done again:
+get videos, and `"models"` as in `rendering.video_jobs`; payload: the pickled policy,
+where it is an object. Jobs, by their `kind`, each of which may be done again:
 
 `check`    `{"task"}`: makes the environment and the policy, and takes no step. Returns
            `{"env_id", "step_limit", "deferrable", "reason", "velocities"}`, the last
@@ -13,13 +13,14 @@ each of which may be done again:
            as what it is, and leaves no traceback in the log that nobody needs.
 `run`      `{"task", "folder", "seed", "episodes"}`: runs the episodes of a batch; where
            somebody has begun it before, those that no ledger has. Returns
-           `{"episodes": how many it ran}`.
+           `{"episodes": how many it ran, "models": [sha256 of compiled ones, ...]}`,
+           the models that it has stored.
 `recover`  `{"folder"}`: puts in order what killed workers left. Returns
            `{"monitors": infixes of those that are left to settle}`.
 `settle`   `{"folder", "monitor", "chosen": [[number, facts], ...]}`, see `settling`.
            Returns `{}`.
-`draw`     `{"folder", "recording"}`: finishes a recording, see
-           `rendering.video_jobs`.
+`draw`     `{"folder", "recording", "models"}`: finishes a recording, see
+           `rendering.video_jobs`, with models that other workers may have stored.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from ..errors import Error, GLError
 from ..gl import use_gl
 from ..recorder.options import DEFERRED
 from ..simulation.inside import simulation_in
+from ..simulation.model_trust import note_models, noting_models
 from .plan import Batch
 from .plan_json import plan_from_json
 from .running import Evaluation, make_acting, rendering_of, run_batch
@@ -72,6 +74,7 @@ class EvaluationWorker:
             "draw": self._draw,
         }
         self._videos: VideoWorker | None = None
+        note_models(settings.get("models", ()))
         # dm_control tries GLFW where no other backend was found, and complains of the
         # display that a machine without a screen has not got. Where that matters,
         # drawing says so.
@@ -119,7 +122,9 @@ class EvaluationWorker:
             episodes=tuple(arguments["episodes"]),
         )
         again = bool(arguments.get(AGAIN, False))
-        return {"episodes": run_batch(self._evaluation, batch, again=again)}
+        with noting_models() as models:
+            episodes = run_batch(self._evaluation, batch, again=again)
+        return {"episodes": episodes, "models": list(dict.fromkeys(models))}
 
     # What is imported below loads HDF5, which stepping has no use for.
 
@@ -152,6 +157,7 @@ class EvaluationWorker:
 
         key = key_of(arguments["recording"])
         assert key is not None
+        note_models(arguments["models"])
         if self._videos is None:
             self._videos = VideoWorker()
         return dict(self._videos(finishing_job(self._folder(arguments), key)))

@@ -7,7 +7,7 @@ be killed at any time, and what its workers have finished stays.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 from ..engines.choice import engine_from
 from ..engines.work import Engine, Job, Work
 from ..errors import InvalidArgument
+from ..simulation.model_trust import stored_models
 from .again import Variant, videos_of_variant
 from .finishing import bring_up_to_date, note_failure
 from .outcomes import Outcome
@@ -90,7 +91,7 @@ def finish_on_engine(
         job: Outcome(name=key.told_name, directory=directory)
         for job, key in by_key.items()
     }
-    for job, outcome in _done(engine, directory, jobs, nothing, on_progress):
+    for job, outcome in _done(engine, [directory], jobs, nothing, on_progress):
         if outcome.failure is not None and not outcome.is_video:
             # Where the worker has died, it could not.
             note_failure(directory, by_key[job], {outcome.name: outcome.failure})
@@ -131,14 +132,14 @@ def render_again_on_engine(
         job = f"video/{video.name}"
         jobs[job] = again_job(path, variant, video, strict=strict)
         nothing[job] = Outcome(name=video.name, directory=video.parent)
-    directory = paths[0].parent if paths else Path()
-    for _, outcome in _done(engine, directory, jobs, nothing, on_progress):
+    directories = list(dict.fromkeys(path.parent for path in paths))
+    for _, outcome in _done(engine, directories, jobs, nothing, on_progress):
         yield outcome
 
 
 def _done(
     engine: Engine,
-    directory: Path,
+    directories: Sequence[Path],
     jobs: Mapping[str, Mapping[str, Any]],
     nothing: Mapping[str, Outcome],
     on_progress: _OnProgress,
@@ -150,8 +151,10 @@ def _done(
     on_progress(now)
     work = Work(
         entry=_WORKER,
+        # Workers elsewhere may have another home, and no list of this user's models.
+        settings={"models": stored_models(directories)},
         environ=environ_for_drawing(),
-        shared_directory=directory.absolute(),
+        shared_directory=directories[0].absolute(),
     )
     with engine.begin(work) as run:
         for key, arguments in jobs.items():

@@ -95,7 +95,6 @@ def _model(value: Any) -> Mapping[str, Any]:
     model = mapping(value)
     for key in ("mjb", "xml"):
         field(model, key, optional(_base_name), default=None)
-    field(model, "seal", optional(text), default=None)
     return model
 
 

@@ -6,8 +6,10 @@ A job is about one recording, lies in files that all workers see, and is one of:
     {"do": "finish", "directory", "recording", "strict"}
     {"do": "again", "trajectory", "variant", "video", "strict"}
 
-`recording` is the name of one of its files. What comes back is `{"outcome": {...}}`, as
-`Outcome.as_json` says it; null where nothing was left to do.
+`recording` is the name of one of its files. The settings of the workers may be
+`{"models": [sha256, ...]}`: compiled models in these directories that the user whose
+jobs they are has stored, and that the workers load. What comes back is
+`{"outcome": {...}}`, as `Outcome.as_json` says it; null where nothing was left to do.
 
 A job can be done twice, also by two workers at once. Who finishes a recording holds its
 lock, and whoever comes second finds nothing to do; a video that is rendered another way
@@ -25,7 +27,7 @@ from typing import Any
 
 from ..engines.work import JobOutcome
 from ..errors import GLError
-from ..simulation.model_trust import TRUST_VARIABLE, environ_with_key
+from ..simulation.model_trust import TRUST_VARIABLE, note_models
 from .again import Variant, render_one_again
 from .finishing import EpisodeFinisher
 from .outcomes import Outcome
@@ -40,8 +42,6 @@ def environ_for_drawing() -> dict[str, str]:
     # There are several, and Mesa's rasteriser would start as many threads as there are
     # CPUs in each of them.
     environ = {_RASTERISER_THREADS: os.environ.get(_RASTERISER_THREADS, "1")}
-    # Models that one has stored are loaded by the others, whatever their homes.
-    environ.update(environ_with_key())
     if TRUST_VARIABLE in os.environ:
         # Those on other machines do not have it from this process.
         environ[TRUST_VARIABLE] = os.environ[TRUST_VARIABLE]
@@ -106,14 +106,15 @@ class VideoWorker:
     A process of its own draws, which stays from job to job.
 
     Args:
-        settings: there are none.
-        payload: likewise.
+        settings: see the module.
+        payload: there is none.
     """
 
     def __init__(
         self, settings: Mapping[str, Any] | None = None, payload: bytes | None = None
     ) -> None:
-        del settings, payload
+        del payload
+        note_models((settings or {}).get("models", ()))
         self._again = _Again()
         self._finishing = _Finishing()
         self._by_name: Mapping[str, Callable[[Mapping[str, Any]], Outcome | None]] = {

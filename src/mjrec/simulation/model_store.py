@@ -41,9 +41,9 @@ from .authored_model import (
 )
 from .model_trust import (
     TRUST_VARIABLE,
-    is_sealed,
+    is_stored,
     is_trusted,
-    seal_of,
+    note_models,
 )
 from .source_compiler import compile_within
 
@@ -106,7 +106,7 @@ class ModelStore:
         Returns:
             The facts by which `load_model` finds it: `sha256` of the compiled model,
             `bytes` of it, `mjb` and `xml` (base names; `xml` may be None), `mujoco`
-            (the version), `seal` (of this user; None where there is no key).
+            (the version).
         """
         compiled = _compiled(model)
         digest = hashlib.sha256(compiled.data).hexdigest()
@@ -117,11 +117,11 @@ class ModelStore:
             "mjb": f"{stem}.mjb.gz",
             "xml": None if authored is None else f"{stem}.zip",
             "mujoco": mujoco.__version__,
-            "seal": seal_of(digest),
         }
         names = {name for name in (facts["mjb"], facts["xml"]) if name is not None}
         if not names <= self._known:
             self._known |= names
+            note_models([digest])
             self._queue(_Job(stem, compiled, authored))
         return facts
 
@@ -204,19 +204,19 @@ def load_model(
     """Return a stored model.
 
     It is loaded as it was compiled, where this is the MuJoCo version that compiled it
-    and the seal says that this user has stored it. Else it is compiled again from what
+    and this user has stored it (`model_trust`). Else it is compiled again from what
     it was made from; of that, only files from the zip are read.
 
     Args:
         directory: of the recording.
         facts: as `ModelStore.add` returned them.
-        trust_models: whether to load a compiled model without a seal too. MuJoCo
+        trust_models: whether to load a stranger's compiled model too. MuJoCo
             believes what stands in it: a crafted one can do anything.
 
     Raises:
         UnreadableFile: the files are missing, damaged or not what the facts say, or
             another MuJoCo version is needed.
-        UntrustedModel: there is only a compiled model without a seal.
+        UntrustedModel: there is only a stranger's compiled model.
     """
     compiled, source = (
         path if path is not None and path.exists() else None
@@ -227,7 +227,8 @@ def load_model(
         if source is None:
             raise _not_loadable(directory, facts, is_same_version=is_same_version)
         return _compile(source, facts)
-    if not (trust_models or _is_trusted(facts)):
+    digest = facts.get("sha256")
+    if not (trust_models or is_stored(digest) or is_trusted(digest)):
         return _compile_instead_of(compiled, source, facts)
     try:
         return _load_compiled(compiled, facts)
@@ -236,11 +237,6 @@ def load_model(
             raise
         logger.warning("%s It is compiled from %s again.", error, source.name)
         return _compile(source, facts)
-
-
-def _is_trusted(facts: Mapping[str, Any]) -> bool:
-    digest = facts.get("sha256")
-    return is_sealed(facts.get("seal"), digest) or is_trusted(digest)
 
 
 def _compile(source: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:

@@ -2,20 +2,23 @@
 """Which compiled models are loaded: those that this user has stored.
 
 MuJoCo believes the addresses and types in a compiled model, so that a crafted one can
-do anything to whoever loads it. Whoever makes a directory writes its hashes too; what
-only this user can write is a seal, which takes a key that nobody else can read::
+do anything to the process that loads it. The hashes in a directory prove nothing:
+its maker wrote them too. So the models that this user stores are listed where only
+this user can write::
 
-    $XDG_STATE_HOME/mjrec/model-key        32 random bytes; ~/.local/state by default
-    <temporary directory>/mjrec-<uid>/model-key       where that cannot be written
+    $XDG_STATE_HOME/mjrec/models       their sha256, one a line
+    ~/.local/state/mjrec/models        by default
+    <temporary directory>/mjrec-<uid>/models       where that cannot be written
 
-The first model that is stored makes the key. One that others can read, or that is no
-key, is neither used nor replaced: only its owner knows who has read it, and a new one
-would make all earlier recordings a stranger's. Until it is mended, the other place has
-a key.
+A list that others can open is neither used nor replaced, because only its owner knows
+what they wrote. Until it is mended, the other place has a list.
 
-Workers on other machines, whose homes may be others, are given this user's key in an
-environment variable, and use it before their own: what one of them stores, the others
-load, and so does this machine.
+The list keeps the newest models: beyond 131,072 the older half is forgotten, and
+counts as a stranger's from then on.
+
+Workers on other machines, whose homes may be others, are sent the hashes that their
+jobs need and list them as their own; what they store, they report, and the machine
+that sent the job lists it.
 
 Needs no simulator.
 """
@@ -23,92 +26,103 @@ Needs no simulator.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
-import hashlib
-import hmac
 import logging
 import os
 import pwd
-import secrets
+import re
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
 
-from ..atomic_files import temporary_path
+from ..atomic_files import replacing
+from ..formats.locks import wait_for_lock
+from ..formats.monitor_directory import FILE_PREFIX
 
 logger = logging.getLogger(__name__)
 
 TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 
-# With the line before, because variables that begin with MJREC_ are recorded.
-_KEY_VARIABLE = "_MJREC_MODEL_KEY"
 _ONE_BY_ONE = "sha256:"
-_KEY_NAME = "model-key"
-_KEY_SIZE = 32
-# So that no seal is ever one of something else.
-_PURPOSE = b"mjrec: a compiled model, sha256 "
+_LIST_NAME = "models"
+_LOCK_NAME = ".models.lock"
+_DIGEST = re.compile("[0-9a-f]{64}")
+_DIGITS_IN_NAME = 16
+# A task may compile a model for each episode. So many are 4.3 MB, read in 2 ms.
+_KEPT = 1 << 16
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
+# What is listed in this context, for a worker's report.
+_noting: ContextVar[list[str] | None] = ContextVar("noting", default=None)
 
-def seal_of(digest: str) -> str | None:
-    """Return this user's seal of a model; the first one makes the key.
+
+def note_models(digests: Iterable[str]) -> None:
+    """List models as this user's; those that are listed already stay where they are.
+
+    Where no list can be kept, a warning says so.
 
     Args:
-        digest: the sha256 of the compiled model, in hex.
-
-    Returns:
-        None, with a warning, where no key can be kept.
+        digests: the sha256 of the compiled models, in hex.
     """
-    given = _given_key()
-    if given is not None:
-        return _seal(given, digest)
+    wanted = list(dict.fromkeys(digests))
+    noting = _noting.get()
+    if noting is not None:
+        noting += wanted
     reasons = []
-    for directory in _directories():
+    for directory in _directories() if wanted else ():
         try:
-            return _seal(_made_key(directory), digest)
-        except _NoKey as error:
+            _add(directory, wanted)
+            return
+        except _Refused as error:
             _warn_once(str(error))
             reasons.append(str(error))
         except OSError as error:
-            logger.debug("There is no key in %s.", directory, exc_info=True)
+            logger.debug("There is no list in %s.", directory, exc_info=True)
             reasons.append(f"{directory}: {error.strerror or error}")
-    _warn_once(
-        "Models are stored without this user's seal, because no key for it can be "
-        f"kept ({'; '.join(reasons)}). Where it is not known what they were made from, "
-        f"rendering will need {TRUST_VARIABLE}=1."
-    )
-    return None
+    if wanted:
+        _warn_once(
+            "The models of these recordings count as a stranger's, because no list of "
+            f"this user's models can be kept ({'; '.join(reasons)}). Where it is not "
+            f"known what they were made from, rendering will need {TRUST_VARIABLE}=1."
+        )
 
 
-def environ_with_key() -> dict[str, str]:
-    """Return the variable that gives workers elsewhere this user's key.
-
-    It must come to nobody else. Where there is no key it is made; where none can be
-    kept, nothing is returned.
-    """
-    key = _given_key()
-    for directory in _directories() if key is None else ():
-        with contextlib.suppress(_NoKey, OSError):
-            key = _made_key(directory)
-            break
-    return {} if key is None else {_KEY_VARIABLE: key.hex()}
+@contextlib.contextmanager
+def noting_models() -> Iterator[list[str]]:
+    """Yield a list that gets the hashes of all models that are stored in the block."""
+    noted: list[str] = []
+    token = _noting.set(noted)
+    try:
+        yield noted
+    finally:
+        _noting.reset(token)
 
 
-def is_sealed(seal: object, digest: object) -> bool:
-    """Tell whether `seal` is this user's seal of a model.
+def is_stored(digest: object) -> bool:
+    """Tell whether this user has stored a model.
 
     Args:
-        seal: what a file says; anything.
-        digest: the sha256 of the compiled model, as the file says; anything.
+        digest: the sha256 of the compiled model, as a file says; anything.
     """
-    if not isinstance(seal, str) or not isinstance(digest, str):
+    if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
         return False
-    given = seal.encode(errors="replace")
-    # The home directory may have been writable only at one time of two.
-    return any(
-        hmac.compare_digest(_seal(key, digest).encode(), given) for key in _keys()
-    )
+    return any(f"\n{digest}\n" in f"\n{content}" for content in _lists())
+
+
+def stored_models(directories: Iterable[Path]) -> list[str]:
+    """Return the hashes of this user's models in some directories.
+
+    Args:
+        directories: of recordings; each may be missing.
+    """
+    pattern = f"{FILE_PREFIX}.model.*.mjb.gz"
+    paths = (path for directory in directories for path in directory.glob(pattern))
+    found = {path.name.split(".")[2] for path in paths}
+    listed = {digest for content in _lists() for digest in content.split()}
+    return sorted(digest for digest in listed if digest[:_DIGITS_IN_NAME] in found)
 
 
 def is_trusted(digest: object) -> bool:
@@ -167,8 +181,8 @@ def _saying(value: str) -> Iterator[None]:
             os.environ[TRUST_VARIABLE] = before
 
 
-class _NoKey(Exception):
-    """What stands in a key's place is none that is used."""
+class _Refused(Exception):
+    """What stands in a list's place is not used."""
 
 
 @functools.cache
@@ -176,29 +190,21 @@ def _warn_once(message: str) -> None:
     logger.warning(message)
 
 
-def _seal(key: bytes, digest: str) -> str:
-    content = _PURPOSE + digest.encode(errors="replace")
-    return hmac.new(key, content, hashlib.sha256).hexdigest()
-
-
-def _given_key() -> bytes | None:
-    with contextlib.suppress(ValueError):
-        key = bytes.fromhex(os.environ.get(_KEY_VARIABLE, ""))
-        return key if len(key) == _KEY_SIZE else None
-    return None
-
-
-def _keys() -> Iterator[bytes]:
-    given = _given_key()
-    if given is not None:
-        yield given
+def _lists() -> Iterator[str]:
+    """Yield what this user's lists hold."""
+    # The home directory may have been writable only at one time of two.
     for directory in _directories():
-        with contextlib.suppress(_NoKey, OSError):
-            yield _read_key(directory)
+        try:
+            with _opened(directory, os.O_RDONLY) as descriptor:
+                yield _content(descriptor)
+        except _Refused as error:
+            _warn_once(str(error))
+        except OSError:
+            continue
 
 
 def _directories() -> Iterator[Path]:
-    """Yield where a key may be, the best place first."""
+    """Yield where a list may be, the best place first."""
     state = _state_directory()
     if state is not None:
         yield state / "mjrec"
@@ -222,30 +228,55 @@ def _state_directory() -> Path | None:
     return Path(home, ".local", "state") if os.access(home, os.F_OK) else None
 
 
-def _made_key(directory: Path) -> bytes:
-    """Return the key in a directory, made where there is none.
+def _add(directory: Path, digests: Iterable[str]) -> None:
+    """Add to the list in a directory, made where there is none.
 
     Raises:
-        _NoKey: something else stands there.
-        OSError: it cannot be made.
+        _Refused: something else stands there, or others can open it.
+        OSError: it cannot be written.
     """
-    with contextlib.suppress(FileNotFoundError):
-        return _read_key(directory)
-    _make_directory(directory)
+    if not directory.exists():
+        _make_directory(directory)
     objection = _objection_to(directory)
     if objection is not None:
+        if (directory / _LIST_NAME).exists():
+            raise _refused(objection)
         # Some file systems know no owners and no modes.
         raise PermissionError(objection)
-    path = directory / _KEY_NAME
-    temporary = temporary_path(path)
+    # Also where appending is atomic: another process may be forgetting the oldest.
+    lock = wait_for_lock(directory / _LOCK_NAME, "")
     try:
-        _write_key(temporary)
-        # Not renamed: of two processes at once, the second takes the first one's key.
-        with contextlib.suppress(FileExistsError):
-            os.link(temporary, path)
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND
+        with _opened(directory, flags) as descriptor:
+            content = _content(descriptor)
+            listed = content.split()
+            new = sorted(set(digests).difference(listed))
+            if len(listed) + len(new) > 2 * _KEPT:
+                _write_newest(directory / _LIST_NAME, [*listed, *new])
+            elif new:
+                # After a full disk cut a line off.
+                start = "" if content[-1:] in ("", "\n") else "\n"
+                _write(descriptor, start + _lines(new))
     finally:
-        temporary.unlink(missing_ok=True)
-    return _read_key(directory)
+        lock.let_go()
+
+
+def _write_newest(path: Path, digests: list[str]) -> None:
+    with replacing(path) as temporary:
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            _write(descriptor, _lines(digests[-_KEPT:]))
+        finally:
+            os.close(descriptor)
+
+
+def _lines(digests: Iterable[str]) -> str:
+    return "".join(f"{digest}\n" for digest in digests)
+
+
+def _write(descriptor: int, text: str) -> None:
+    if os.write(descriptor, text.encode()) < len(text):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _make_directory(directory: Path) -> None:
@@ -261,37 +292,28 @@ def _make_directory(directory: Path) -> None:
             path.mkdir(mode=0o700)
 
 
-def _write_key(path: Path) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    try:
-        os.write(descriptor, secrets.token_bytes(_KEY_SIZE))
-        # Else a machine that fails now leaves an empty one, for good.
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _read_key(directory: Path) -> bytes:
-    """Return the key in a directory.
+@contextlib.contextmanager
+def _opened(directory: Path, flags: int) -> Iterator[int]:
+    """Yield the descriptor of the list in a directory.
 
     Raises:
-        FileNotFoundError: there is none.
-        _NoKey: something else stands there, or others can read it.
-        OSError: it cannot be opened.
+        _Refused: something else stands there, or others can open it.
+        OSError: it cannot be opened, or there is none.
     """
-    path = directory / _KEY_NAME
+    path = directory / _LIST_NAME
     # Not waiting, should it be a pipe.
-    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
-    descriptor = os.open(path, flags)
+    careful = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
     try:
-        objection = _objection_to(directory) or _objection_to_key(path, descriptor)
+        descriptor = os.open(path, flags | careful, 0o600)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise _refused(f"{path} is a link") from error
+        raise
+    try:
+        objection = _objection_to(directory) or _objection_to_list(path, descriptor)
         if objection is not None:
-            raise _NoKey(
-                f"The key of this user's recordings is not used: {objection}. If "
-                "nobody else knows it, mend that; else remove it: then there will be a "
-                "new one, and models that were stored before count as a stranger's."
-            )
-        return os.read(descriptor, _KEY_SIZE)
+            raise _refused(objection)
+        yield descriptor
     finally:
         os.close(descriptor)
 
@@ -305,12 +327,23 @@ def _objection_to(directory: Path) -> str | None:
     return None
 
 
-def _objection_to_key(path: Path, descriptor: int) -> str | None:
+def _objection_to_list(path: Path, descriptor: int) -> str | None:
     facts = os.fstat(descriptor)
     if not stat.S_ISREG(facts.st_mode) or facts.st_uid != os.geteuid():
         return f"{path} is not a file of this user's"
     if facts.st_mode & _OTHERS:
-        return f"{path} can be read by others (chmod 600 {path})"
-    if facts.st_size != _KEY_SIZE:
-        return f"{path} has {facts.st_size} bytes, and a key has {_KEY_SIZE}"
+        return f"{path} is open to others (chmod 600 {path})"
     return None
+
+
+def _refused(objection: str) -> _Refused:
+    return _Refused(
+        f"The list of this user's models is not used: {objection}. If nobody else has "
+        "written there, mend that; else remove it: models that were stored before then "
+        "count as a stranger's."
+    )
+
+
+def _content(descriptor: int) -> str:
+    with open(descriptor, encoding="utf-8", errors="replace", closefd=False) as file:
+        return file.read()

@@ -127,9 +127,6 @@ class _Texts:
     def _member(self, key: str, value: Any) -> Any:
         if key == "surroundings" and isinstance(value, dict):
             return self.value(_general_surroundings(value))
-        if key == "model" and isinstance(value, dict):
-            # All recordings of one user have the same key.
-            value = {**value, "seal": None} if "seal" in value else value
         if key == "gl_device" and isinstance(value, dict):
             value = {k: v for k, v in value.items() if k not in ("uuid", "file")}
         return self.value(value)
