@@ -258,6 +258,8 @@ def test_seed_that_was_drawn_is_said(mjrec: Any, tmp_path: Path) -> None:
         (["HalfCheetah-v5", "--env-kwargs", "[1]"], ["JSON object", "[1]"]),
         (["HalfCheetah-v5", "--env-kwargs", "{"], ["JSON object"]),
         (["HalfCheetah-v5", "--env-kwargs", '{"no": 1}'], ["HalfCheetah-v5", "no"]),
+        (["HalfCheetah-v5", "--env-kwargs", '{"no": 1, "no": 2}'], ["'no'", "twice"]),
+        (["HalfCheetah-v5", "--env-kwargs", '{"no": [NaN]}'], ["'no'", "NaN"]),
         (["no_such.xml"], ["no_such.xml"]),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
+import math
 import os
 import random
 import signal
@@ -673,7 +674,9 @@ WRONG: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"quality": "low"}, UnknownName, "draft"),
     ({"height": 0}, InvalidArgument, "height"),
     ({"max_fps": -1}, InvalidArgument, "max_fps"),
-    ({"env_kwargs": {"f": print}}, InvalidArgument, "JSON"),
+    ({"env_kwargs": {"f": print}}, InvalidArgument, "JSON.* 'f' "),
+    ({"env_kwargs": {"a": 1, "f": [math.nan]}}, InvalidArgument, "'f'.*nan"),
+    ({"env_kwargs": {"f": {1: 0, "1": 2}}}, InvalidArgument, "'f'.*'1' is there twice"),
     ({"env_kwargs": {"no_such": 1}}, mjrec.EnvironmentNotMade, "no_such"),
     ({"score_ranges": {"Ant-v5": (0, 1)}}, UnknownName, PENDULUM),
     ({"score_ranges": {PENDULUM: (1, 1)}}, InvalidArgument, "higher"),

@@ -282,6 +282,22 @@ def test_any_value_can_be_written_and_read(value: Any) -> None:
     assert dumps(loads(dumps(value))) == dumps(value)
 
 
+@pytest.mark.parametrize(
+    "value",
+    [{1: "a", "1": "b"}, {"a": [{None: 1, "null": 2}]}, {np.int64(3): 1, "3": 4}],
+)
+def test_keys_that_would_be_written_as_the_same_come_back(value: Any) -> None:
+    """Shown as Python shows them: a text with a key twice would be refused."""
+    assert "repr" in dumps(value)
+    assert dumps(loads(dumps(value))) == dumps(value)
+
+
+def test_keys_that_are_no_texts_become_texts() -> None:
+    """As JSON writes them."""
+    value = {0: {None: 2}, True: 3, np.int64(4): 5, Path("a"): 6}
+    assert loads(dumps(value)) == {"0": {"null": 2}, "true": 3, "4": 5, "a": 6}
+
+
 # --- the log of a trajectory ---------------------------------------------------------
 
 

@@ -30,14 +30,19 @@ _DEEPEST = 100
 # statistics of four million episodes are as many.
 _MOST_VALUES = 1 << 24
 
+_FLAT = {str, int, float, bool, type(None)}
+
 
 def dumps(value: object, *, indent: int | None = None) -> str:
     """Return `value` as JSON text.
 
-    Objects that JSON does not know (a path, an environment's own option type) are
-    written as `{"repr": ...}`: what is recorded for people must never stop a run.
+    Objects that JSON does not know (a path, an environment's own option type, an object
+    with the keys 1 and "1") are written as `{"repr": ...}`: what is recorded for people
+    must never stop a run.
     """
     try:
+        if not _has_plain_keys(value):
+            return _dumps_any(value, indent=indent)
         # Nearly everything is plain, and this is many times as fast.
         text = _encoder(indent).encode(value)
         # What is written is what `loads` will accept.
@@ -91,6 +96,30 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
+def has_nan(value: object) -> bool:
+    """Tell whether NaN, which comes back as `null`, is anywhere in a value of JSON."""
+    match value:
+        case float():
+            return math.isnan(value)
+        case dict():
+            return any(map(has_nan, value.values()))
+        case list() | tuple():
+            return any(map(has_nan, value))
+    return False
+
+
+def _has_plain_keys(value: object) -> bool:
+    """Tell whether all keys are texts, of which no two are written as the same."""
+    if isinstance(value, dict):
+        if not {str}.issuperset(map(type, value)):
+            return False
+        value = value.values()
+    elif not isinstance(value, list | tuple):
+        return True
+    # Statistics are long lists of numbers.
+    return _FLAT.issuperset(map(type, value)) or all(map(_has_plain_keys, value))
+
+
 def _check_depth(value: Any) -> None:
     level = [value]
     for _ in range(_DEEPEST):
@@ -135,12 +164,18 @@ def _plain(value: object, mark: str, outer: tuple[int, ...]) -> Any:
             return _plain_float(float(value), mark)
         case np.ndarray():
             return _plain(value.tolist(), mark, outer)
-        case dict() if not is_too_deep:
-            return {str(key): _plain(item, mark, inside) for key, item in value.items()}
+        case dict() if not is_too_deep and len(set(map(_key, value))) == len(value):
+            return {_key(k): _plain(item, mark, inside) for k, item in value.items()}
         case list() | tuple() | set() | frozenset() if not is_too_deep:
             return [_plain(item, mark, inside) for item in value]
         case _:
             return {"repr": _shown(value)}
+
+
+def _key(key: object) -> str:
+    if key is None or isinstance(key, bool | int | float):
+        return json.dumps(key)
+    return str(key)
 
 
 def _shown(value: object) -> str:

@@ -3,24 +3,30 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from ..errors import InvalidArgument
+from ..json_text import has_nan, loads
 
 
 def kwargs_of(text: str) -> dict[str, Any]:
     """Return the arguments that `--env-kwargs` names.
 
     Raises:
-        InvalidArgument: it is no JSON object.
+        InvalidArgument: it is no JSON object, or has a key twice, or NaN.
     """
     try:
-        kwargs = json.loads(text)
+        kwargs = loads(text)
     except ValueError as error:
         raise InvalidArgument(
             f"--env-kwargs must be a JSON object, got {text!r}: {error}."
         ) from None
     if not isinstance(kwargs, dict):
         raise InvalidArgument(f"--env-kwargs must be a JSON object, got {text!r}.")
+    for name, value in kwargs.items():
+        if has_nan(value):
+            raise InvalidArgument(
+                f"--env-kwargs must be a JSON object, and {name!r} holds NaN, which "
+                "JSON has no number for."
+            )
     return kwargs

@@ -15,6 +15,7 @@ from ..environments.names import MjcfName, parse_environment_name
 from ..environments.options import EnvironmentOptions
 from ..errors import InvalidArgument, UnknownName
 from ..frames import check_quality
+from ..json_text import loads
 from ..rates import to_rate
 from .kept_episodes import keep_rule
 from .plan import SEEDED, SUITE, EvaluatedTask, EvaluationPlan
@@ -153,14 +154,17 @@ def _positive(name: str, value: object) -> int:
 
 def _json_of(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """Return arguments as they come out of JSON, which is how they reach a worker."""
-    try:
-        kwargs = json.loads(json.dumps(dict(env_kwargs), allow_nan=False))
-    except (TypeError, ValueError) as error:
-        raise InvalidArgument(
-            "env_kwargs go to other processes, and into a file, as JSON (texts, "
-            f"numbers, lists and objects of them), and {env_kwargs!r} cannot: {error}."
-        ) from error
-    return dict(kwargs)
+    kwargs = {}
+    for name, value in env_kwargs.items():
+        try:
+            kwargs[name] = loads(json.dumps(value, allow_nan=False))
+        except (TypeError, ValueError, RecursionError) as error:
+            raise InvalidArgument(
+                "env_kwargs go to other processes, and into a file, as JSON (texts, "
+                f"numbers, lists and objects of them), and {name!r} cannot, which is "
+                f"{value!r}: {error}."
+            ) from error
+    return kwargs
 
 
 def _with_folders(
