@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from mjrec.engines.work import AGAIN
+from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.plan_json import plan_to_json
 from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.trajectory_file import open_trajectory
 
@@ -36,7 +36,7 @@ def worker_of(
     directory: Path, plan: EvaluationPlan, payload: bytes | None = None
 ) -> EvaluationWorker:
     """Return a worker of an evaluation, given its plan as it travels."""
-    values = json.loads(json.dumps(plan_to_json(plan)))
+    values = json.loads(json.dumps(to_json(plan)))
     return EvaluationWorker({"directory": str(directory), "plan": values}, payload)
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 import mjrec
+from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.plan_json import plan_to_json
 from mjrec.evaluation.result_columns import ResultVideo
 from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.results_files import ChosenEpisode, write_results
@@ -126,7 +126,7 @@ def write_evaluation(
         ]
         write_journal(directory / task.folder, infix, task.name, entries)
     if not finished:
-        content = {"format_version": 1, "plan": plan_to_json(plan)}
+        content = {"format_version": 1, "plan": to_json(plan)}
         (directory / "evaluation.json").write_text(dumps(content))
         return
     shown = videos or {}

@@ -18,9 +18,9 @@ from recordings import videos_in
 import mjrec
 from evaluated import FOLDER, PENDULUM, facts_of, plan_of, run_job, worker_of
 from mjrec.evaluation import settling
+from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.ledger import read_ledgers
-from mjrec.evaluation.plan_json import plan_to_json
 from mjrec.evaluation.settling import settle, unsettled_monitors
 from mjrec.evidence.verification import Verdict
 from mjrec.formats.trajectory_file import finish_trajectory
@@ -247,7 +247,7 @@ EvaluationWorker(settings, cloudpickle.dumps(Deadly()))(job)
 def test_after_a_kill_nothing_finished_is_repeated_or_lost(tmp_path: Path) -> None:
     """What the killed worker had done counts; what it was at is run again."""
     plan = plan_of(seeds=(0,), policy="zero", is_object=True)
-    settings = {"directory": str(tmp_path), "plan": plan_to_json(plan)}
+    settings = {"directory": str(tmp_path), "plan": to_json(plan)}
     arguments = map(json.dumps, (settings, run_job(plan, 0)))
     command = [sys.executable, "-c", _KILLED, *arguments]
     killed = subprocess.run(command, check=False, capture_output=True)

@@ -20,10 +20,10 @@ import tyro
 
 from .. import json_text
 from ..errors import InvalidArgument, UnknownName
+from ..evaluation.dataclass_json import to_json
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation, EvaluationProgress
 from ..evaluation.summaries import Interval, TaskSummary
-from ..evaluation.summaries_json import summary_to_json
 from ..evaluation.task_sets import tasks_from
 from .counted import counted
 from .engine_options import NO_ENGINE, EngineOptions
@@ -395,8 +395,8 @@ def _fields(evaluation: Evaluation, short: Sequence[_Shortfall]) -> dict[str, An
         "directory": str(evaluation.directory.absolute()),
         "episodes": len(evaluation.results),
         "failed": len(evaluation.failed),
-        "tasks": [summary_to_json(each) for each in evaluation.summaries],
-        "across": summary_to_json(evaluation.across),
+        "tasks": [to_json(each) for each in evaluation.summaries],
+        "across": to_json(evaluation.across),
         "videos": [str(path) for path in evaluation.videos],
         "pending": {str(path): why for path, why in evaluation.pending.items()},
         "below": {each.task: each.reason for each in short},

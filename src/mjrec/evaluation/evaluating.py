@@ -32,6 +32,7 @@ from ..rendering.on_engine import given_engine
 from ..rendering.video_jobs import environ_for_drawing
 from ..simulation.model_trust import stored_models
 from .chosen_videos import ChosenVideos, drawn_by_workers, render_chosen
+from .dataclass_json import to_json
 from .episode_results import EpisodeResult
 from .evaluation import Evaluation, EvaluationProgress
 from .following import TaskRun, check_tasks, run_tasks
@@ -39,7 +40,6 @@ from .kept_episodes import keep_rule
 from .ledger import read_ledgers
 from .plan import SEEDED, EvaluationPlan
 from .plan_file import check_continues, read_plan, write_plan
-from .plan_json import plan_to_json
 from .planning import check_score_ranges, plan_from
 from .policy_objects import SentPolicy, sent_policy
 from .recorded_files import RecordedFiles
@@ -274,7 +274,7 @@ def _run(
         entry=_WORKER,
         settings={
             "directory": str(directory.absolute()),
-            "plan": plan_to_json(plan),
+            "plan": to_json(plan),
             # What works here may not work where an engine has its workers.
             "chooses_gl": draws,
             # Of what was recorded before; their homes may be others.

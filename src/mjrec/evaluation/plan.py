@@ -5,11 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
+
+from ..formats.json_fields import base_name, one_of, positive
+from ..frames import QUALITIES
 
 Protocol: TypeAlias = Literal["seeded", "suite"]
 SEEDED: Protocol = "seeded"
 SUITE: Protocol = "suite"
+
+_Positive: TypeAlias = Annotated[int, positive]
 
 
 @dataclass(frozen=True)
@@ -22,12 +27,15 @@ class EvaluatedTask:
     """
 
     name: str
-    folder: str
+    folder: Annotated[str, base_name]
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationPlan:
     """What is to be evaluated, checked. It stands in `evaluation.json`.
+
+    What it means (whether there are such tasks, such a rule) is not checked when it is
+    read back.
 
     Attributes:
         tasks: in the order of the results.
@@ -53,15 +61,15 @@ class EvaluationPlan:
     policy: str
     is_object: bool = False
     seeds: tuple[int, ...]
-    episodes: int
+    episodes: _Positive
     protocol: Protocol = SEEDED
     keep: str = "best,median,worst"
-    max_steps: int | None = None
+    max_steps: _Positive | None = None
     camera: str | int | None = None
-    height: int | None = None
-    width: int | None = None
+    height: _Positive | None = None
+    width: _Positive | None = None
     max_fps: float | None = 60
-    quality: str = "full"
+    quality: Annotated[str, one_of(*QUALITIES)] = "full"
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
 
 

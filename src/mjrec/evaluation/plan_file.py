@@ -8,10 +8,10 @@ from typing import Any
 
 from .. import atomic_files
 from ..errors import DifferentEvaluation, UnreadableFile
-from ..formats.json_fields import field, integer, mapping, read_object, unreadable
+from ..formats.json_fields import field, integer, read_object, unreadable
 from ..json_text import dumps
+from .dataclass_json import from_json, to_json
 from .plan import SUITE, EvaluationPlan
-from .plan_json import plan_from_json, plan_to_json
 from .results_files import FORMAT_VERSION, PLAN_NAME
 
 # What may be asked for anew: each task, seed and episode stands for itself.
@@ -24,7 +24,7 @@ def write_plan(directory: Path, plan: EvaluationPlan) -> None:
     Raises:
         FileNotWritten: the disk is full, or the directory is gone or read-only.
     """
-    value = {"format_version": FORMAT_VERSION, "plan": plan_to_json(plan)}
+    value = {"format_version": FORMAT_VERSION, "plan": to_json(plan)}
     atomic_files.write_text(directory / PLAN_NAME, dumps(value, indent=2) + "\n")
 
 
@@ -44,7 +44,7 @@ def read_plan(directory: Path) -> EvaluationPlan:
                 f"its format is version {version}, and this mjrec reads "
                 f"{FORMAT_VERSION}",
             )
-        return field(value, "plan", lambda plan: plan_from_json(mapping(plan)))
+        return field(value, "plan", lambda plan: from_json(EvaluationPlan, plan))
 
 
 def check_continues(
@@ -59,7 +59,7 @@ def check_continues(
     Raises:
         DifferentEvaluation: it does not.
     """
-    was, now = plan_to_json(begun), plan_to_json(asked)
+    was, now = to_json(begun), to_json(asked)
     differences = {
         name: (was[name], now[name])
         for name in now

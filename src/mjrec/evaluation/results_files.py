@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -35,9 +36,9 @@ from ..formats.json_fields import (
     unreadable,
 )
 from ..json_text import dumps
+from .dataclass_json import from_json, to_json
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
-from .plan_json import plan_from_json, plan_to_json
 from .result_columns import ResultColumns
 from .result_tables import (
     EpisodeFiles,
@@ -46,7 +47,6 @@ from .result_tables import (
     write_timing_table,
 )
 from .summaries import AcrossTasks, Bootstrap, TaskSummary
-from .summaries_json import summary_from_json, summary_to_json
 
 FORMAT_VERSION = 1
 PLAN_NAME = "evaluation.json"
@@ -143,7 +143,7 @@ def write_results(
     """
     value = {
         "format_version": FORMAT_VERSION,
-        "plan": plan_to_json(plan),
+        "plan": to_json(plan),
         "selection": {
             "rule": plan.keep,
             "by_task": {
@@ -151,9 +151,9 @@ def write_results(
                 for task, chosen in selection.items()
             },
         },
-        "bootstrap": summary_to_json(bootstrap),
-        "tasks": [summary_to_json(each) for each in summaries],
-        "across": None if across is None else summary_to_json(across),
+        "bootstrap": to_json(bootstrap),
+        "tasks": [to_json(each) for each in summaries],
+        "across": None if across is None else to_json(across),
         "versions": dict(versions),
     }
     (directory / RESULTS_NAME).unlink(missing_ok=True)
@@ -204,11 +204,11 @@ def read_summaries(directory: Path) -> ReadResults:
             )
         plan = field(value, "plan", _plan)
         tasks = [each.name for each in plan.tasks]
-        summaries = field(value, "tasks", list_of(_summary))
+        summaries = field(value, "tasks", list_of(partial(from_json, TaskSummary)))
         if [each.task for each in summaries] != tasks:
             raise ValueError("its summaries are not those of the tasks of its plan")
-        across = field(value, "across", optional(_across))
-        bootstrap = field(value, "bootstrap", _bootstrap)
+        across = field(value, "across", optional(partial(from_json, AcrossTasks)))
+        bootstrap = field(value, "bootstrap", partial(from_json, Bootstrap))
         selection = field(value, "selection", _selection)
         versions = field(value, "versions", _versions)
     return ReadResults(
@@ -244,7 +244,7 @@ def _why_missing(directory: Path) -> str:
 
 
 def _plan(value: Any) -> EvaluationPlan:
-    plan = plan_from_json(mapping(value))
+    plan = from_json(EvaluationPlan, value)
     for what, values in (
         ("task", [each.name for each in plan.tasks]),
         ("folder", [each.folder for each in plan.tasks]),
@@ -253,18 +253,6 @@ def _plan(value: Any) -> EvaluationPlan:
         if len(set(values)) < len(values):
             raise ValueError(f"a {what} is there twice")
     return plan
-
-
-def _summary(value: Any) -> TaskSummary:
-    return summary_from_json(TaskSummary, value)
-
-
-def _across(value: Any) -> AcrossTasks:
-    return summary_from_json(AcrossTasks, value)
-
-
-def _bootstrap(value: Any) -> Bootstrap:
-    return summary_from_json(Bootstrap, value)
 
 
 def _versions(value: Any) -> Mapping[str, str]:

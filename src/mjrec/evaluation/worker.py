@@ -40,8 +40,8 @@ from ..gl import use_gl
 from ..recorder.options import DEFERRED
 from ..simulation.inside import simulation_in
 from ..simulation.model_trust import note_models, noting_models
-from .plan import Batch
-from .plan_json import plan_from_json
+from .dataclass_json import from_json
+from .plan import Batch, EvaluationPlan
 from .running import Evaluation, make_acting, rendering_of, run_batch
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class EvaluationWorker:
     def __init__(self, settings: Mapping[str, Any], payload: bytes | None) -> None:
         self._evaluation = Evaluation(
             directory=Path(settings["directory"]),
-            plan=plan_from_json(settings["plan"]),
+            plan=from_json(EvaluationPlan, settings["plan"]),
             policy=payload,
         )
         self._by_kind: Mapping[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {

@@ -104,6 +104,17 @@ def list_of(convert: Callable[[Any], T]) -> Callable[[Any], tuple[T, ...]]:
     return convert_items
 
 
+def one_of(*known: str) -> Callable[[Any], str]:
+    """Return a conversion that takes nothing but these texts."""
+
+    def convert(value: Any) -> str:
+        if value not in known:
+            raise ValueError(f"{value!r:.80} is not one of {', '.join(known)}")
+        return str(value)
+
+    return convert
+
+
 def mapping(value: Any) -> Mapping[str, Any]:
     """Return an object as it is."""
     return _checked(value, dict)
@@ -145,6 +156,14 @@ def integer(value: Any) -> int:
     if abs(_checked(value, int)) > _LARGEST_INTEGER:
         raise ValueError("it is larger than any count")
     return int(value)
+
+
+def positive(value: Any) -> int:
+    """Return a whole number that is 1 or more."""
+    count = integer(value)
+    if count < 1:
+        raise ValueError(f"{count} is not 1 or more")
+    return count
 
 
 def number(value: Any) -> float:

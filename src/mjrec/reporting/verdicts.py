@@ -12,6 +12,7 @@ from ..formats.json_fields import (
     field,
     integer,
     mapping,
+    one_of,
     read_object,
     text,
     unreadable,
@@ -45,7 +46,7 @@ def read_verdict(path: Path) -> Verdict:
             source=f"{field(said, 'path', text)} ({path})",
             passed=passed,
             counts=counts,
-            level=field(said, "level", _level),
+            level=field(said, "level", one_of(*_LEVELS)),
         )
 
 
@@ -54,9 +55,3 @@ def _counts(value: Any) -> Mapping[str, int]:
     if min(counts.values()) < 0:
         raise ValueError("a count is negative")
     return counts
-
-
-def _level(value: Any) -> str:
-    if value not in _LEVELS:
-        raise ValueError(f"it is none of {', '.join(_LEVELS)}")
-    return str(value)

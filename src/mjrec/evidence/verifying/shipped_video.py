@@ -20,7 +20,9 @@ from ...formats.json_fields import (
     integer,
     list_of,
     mapping,
+    one_of,
     optional,
+    positive,
     rate,
     read_object,
     text,
@@ -125,7 +127,7 @@ def read_shipped_video(path: Path) -> ShippedVideo:
             fps=field(said, "fps", rate),
             frame_count=field(said, "frame_count", _frame_count),
             frame_steps=field(said, "frame_steps", list_of(list_of(integer))),
-            stride=field(said, "stride", _stride, default=1),
+            stride=field(said, "stride", positive, default=1),
             decoded_sha256=field(said, "decoded_sha256", _sha256),
             pixel_format=field(said, "pixel_format", text),
             is_live=field(said, "recording", text, default="live") != "deferred",
@@ -134,7 +136,7 @@ def read_shipped_video(path: Path) -> ShippedVideo:
             camera=_camera(said.get("camera")),
             first_camera=_camera(_first(said.get("camera"))),
             is_clip="first_step" in said,
-            quality=field(said, "quality", _quality, default="full"),
+            quality=field(said, "quality", one_of(*QUALITIES), default="full"),
             pillow=_pillow(field(said, "annotated", optional(mapping), default=None)),
             ffmpeg_sha256=field(said, "ffmpeg_sha256", optional(_sha256), default=None),
             encoder_arguments=field(encoder, "cmdline", list_of(text))[1:],
@@ -183,22 +185,9 @@ def _frame_count(value: Any) -> int:
     return count
 
 
-def _stride(value: Any) -> int:
-    stride = integer(value)
-    if stride < 1:
-        raise ValueError(f"{stride!r:.80} is no number of steps")
-    return stride
-
-
 def _sha256(value: Any) -> str:
     if not _SHA256.fullmatch(text(value)):
         raise ValueError(f"{value!r:.80} is no sha256")
-    return str(value)
-
-
-def _quality(value: Any) -> str:
-    if text(value) not in QUALITIES:
-        raise ValueError(f"{value!r:.80} is not one of {', '.join(QUALITIES)}")
     return str(value)
 
 

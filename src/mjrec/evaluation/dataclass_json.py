@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Dataclasses as JSON, and back: each is an object with the names of its fields."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from ..formats.json_fields import (
+    boolean,
+    field,
+    integer,
+    list_of,
+    mapping,
+    number,
+    one_of,
+    optional,
+    text,
+)
+
+D = TypeVar("D")
+
+_Read = Callable[[Any], Any]
+
+_PLAIN: dict[object, _Read] = {
+    Any: lambda value: value,
+    bool: boolean,
+    float: number,
+    int: integer,
+    str: text,
+}
+
+
+def to_json(instance: Any) -> dict[str, Any]:
+    """Return a dataclass as what `json_text` writes; what is NaN becomes null there."""
+    return dataclasses.asdict(instance)
+
+
+def from_json(kind: type[D], value: Any) -> D:
+    """Return what `to_json` wrote.
+
+    Keys that this version does not know are ignored, and of those that are missing the
+    defaults are taken. A field that is annotated with `Annotated[kind, read]` is what
+    `read` makes of its value.
+
+    Raises:
+        ValueError: it is no such object.
+    """
+    values = mapping(value)
+    fields, hints = _fields_and_hints(typing.cast(Any, kind))
+    given = {}
+    for each in fields:
+        if each.name in values or _is_needed(each):
+            given[each.name] = field(values, each.name, _reader(hints[each.name]))
+    return kind(**given)
+
+
+@functools.cache
+def _fields_and_hints(
+    kind: Any,
+) -> tuple[tuple[dataclasses.Field[Any], ...], dict[str, Any]]:
+    return dataclasses.fields(kind), typing.get_type_hints(kind, include_extras=True)
+
+
+def _is_needed(each: dataclasses.Field[Any]) -> bool:
+    missing = dataclasses.MISSING
+    return each.default is missing and each.default_factory is missing
+
+
+def _reader(hint: Any) -> _Read:
+    """Return what reads a field that is annotated so."""
+    if hint in _PLAIN:
+        return _PLAIN[hint]
+    if dataclasses.is_dataclass(hint):
+        return functools.partial(from_json, typing.cast(type, hint))
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        return typing.cast(_Read, hint.__metadata__[0])
+    if origin is typing.Literal:
+        return one_of(*inner)
+    if origin in (types.UnionType, typing.Union):
+        return optional(
+            _any_of([_reader(each) for each in inner if each is not types.NoneType])
+        )
+    if origin is tuple:
+        return _tuple(inner)
+    return _values(_reader(inner[1]))
+
+
+def _any_of(readers: list[_Read]) -> _Read:
+    def read(value: Any) -> Any:
+        for each in readers[:-1]:
+            try:
+                return each(value)
+            except ValueError:
+                continue
+        return readers[-1](value)
+
+    return read
+
+
+def _tuple(inner: tuple[Any, ...]) -> Callable[[Any], tuple[Any, ...]]:
+    read = list_of(_reader(inner[0]))
+    if inner[1] is Ellipsis:
+        return read
+
+    def read_so_many(value: Any) -> tuple[Any, ...]:
+        items = read(value)
+        if len(items) != len(inner):
+            raise ValueError(f"{len(inner)} values belong there, not {len(items)}")
+        return items
+
+    return read_so_many
+
+
+def _values(read: _Read) -> Callable[[Any], Mapping[str, Any]]:
+    def read_values(value: Any) -> Mapping[str, Any]:
+        return {text(key): read(item) for key, item in mapping(value).items()}
+
+    return read_values
