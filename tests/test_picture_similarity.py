@@ -3,16 +3,14 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from mjrec.evidence.verifying.decoded_video import DecodedVideo
-from mjrec.evidence.verifying.difference_picture import difference_picture, png
+from mjrec.evidence.verifying.difference_picture import difference_picture
 from mjrec.evidence.verifying.likeness import OTHER_ENCODER, OTHER_RENDERER, Likeness
 from mjrec.evidence.verifying.picture_similarity import (
     but_for_shadows,
@@ -130,12 +128,6 @@ def test_a_difference_is_shown_beside_both_pictures() -> None:
     assert same.shape == (8, 3 * 8 + 2 * 4, 3)
     assert (same[:, -8:] == 128).all()
     assert (other[:, -8:] > 190).all()
-
-
-def test_a_png_is_read_by_others() -> None:
-    """Pillow reads what was written, pixel by pixel."""
-    frame = noise(33, 47)
-    assert np.array_equal(np.array(Image.open(io.BytesIO(png(frame)))), frame)
 
 
 def test_a_shadow_is_taken_away_whichever_picture_it_is_in() -> None:

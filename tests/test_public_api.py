@@ -44,6 +44,7 @@ CONFINED = {
     "gymnasium": {"environments", "monitors"},
     "dm_env": {"environments", "monitors"},
     "dm_control": {"environments"},
+    "imageio": {"evidence", "reporting"},
     "imageio_ffmpeg": {"formats"},
     "h5py": {"formats"},
     "tyro": {"commands"},
@@ -56,7 +57,7 @@ CONFINED = {
 
 HEAVY = (
     *("mujoco", "gymnasium", "dm_control", "dm_env", "OpenGL", "imageio_ffmpeg"),
-    *("h5py", "ray", "submitit"),
+    *("h5py", "imageio", "ray", "submitit"),
 )
 
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from imageio.v3 import imwrite
 
 from mjrec.evidence.verification import Check, Level, Verdict, Verification
-from mjrec.evidence.verifying.difference_picture import png
 from mjrec.evidence.verifying.verification_report import write_verification_report
 
 HOSTILE = (
@@ -123,7 +123,7 @@ def test_the_page_is_whole_and_loads_nothing(tmp_path: Path) -> None:
     """Its elements close, and no attribute leads anywhere."""
     pictures = tmp_path / "pictures"
     pictures.mkdir()
-    (pictures / "worst-000000.png").write_bytes(png(np.zeros((4, 4, 3), np.uint8)))
+    imwrite(pictures / "worst-000000.png", np.zeros((4, 4, 3), np.uint8))
     figures = {"picture": "worst-000000.png", "worst_frame": 3, "psnr": 44.0}
     text = page(tmp_path, check(figures=figures), pictures=pictures)
     elements = Elements(text)
@@ -169,7 +169,7 @@ def test_only_pictures_of_the_folder_are_shown(tmp_path: Path, name: Any) -> Non
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     secret = tmp_path / "secret.png"
-    secret.write_bytes(png(np.zeros((4, 4, 3), np.uint8)))
+    imwrite(secret, np.zeros((4, 4, 3), np.uint8))
     (pictures / "link.png").symlink_to(secret)
     text = page(tmp_path, check(figures={"picture": name}), pictures=pictures)
     assert "<img" not in text

@@ -9,7 +9,6 @@ strip is made.
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
 import math
 import os
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from imageio.v3 import imwrite
 from numpy.typing import NDArray
 
 from ..annotation import check_annotation
@@ -119,24 +119,19 @@ def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
         InvalidArgument: the name does not end in `.png`.
         FileNotWritten: the disk is full, or there is no such directory.
     """
-    # Here, because it is an extra.
-    from PIL import Image
-
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise InvalidArgument(
             f"A film strip is a PNG, and {path} is called otherwise: name it "
             f"{path.with_suffix('.png')}."
         )
-    buffer = io.BytesIO()
     dpi = (_DOTS_PER_INCH, _DOTS_PER_INCH)
-    Image.fromarray(strip).save(buffer, format="PNG", optimize=True, dpi=dpi)
     try:
         with replacing(path) as temporary:
-            temporary.write_bytes(buffer.getvalue())
+            imwrite(temporary, strip, extension=".png", optimize=True, dpi=dpi)
     except OSError as error:
         raise FileNotWritten(
-            path, error.strerror, then="the same command writes it again"
+            path, error.strerror or error, then="the same command writes it again"
         ) from error
 
 

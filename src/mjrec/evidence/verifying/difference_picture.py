@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from typing import Final
 
 import numpy as np
@@ -30,29 +28,3 @@ def difference_picture(drawn: Planes, shipped: Planes) -> Frame:
     gap = np.full((height, _GAP, 3), 255, np.uint8)
     shown = np.clip(difference, 0, 255).astype(np.uint8)
     return np.concatenate([one, gap, other, gap, shown], axis=1)
-
-
-def png(frame: Frame) -> bytes:
-    """Return a picture as a PNG file."""
-    height, width = frame.shape[:2]
-    # Before each row stands which filter it has: none.
-    rows = np.zeros((height, 1 + 3 * width), np.uint8)
-    rows[:, 1:] = frame.reshape(height, 3 * width)
-    # Eight bits of red, green and blue; nothing else is ever otherwise.
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        (
-            _chunk(b"IHDR", header),
-            _chunk(b"IDAT", zlib.compress(rows.tobytes(), 9)),
-            _chunk(b"IEND", b""),
-        )
-    )
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return (
-        struct.pack(">I", len(data))
-        + kind
-        + data
-        + struct.pack(">I", zlib.crc32(kind + data))
-    )

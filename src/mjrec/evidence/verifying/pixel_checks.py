@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from imageio.v3 import imwrite
 
 from ...annotation import annotated, pillow_version
 from ...errors import Error, GLError, MissingDependency, UnreadableFile
@@ -42,7 +43,7 @@ from ...rendering.workers import DrawingWorkers
 from ...simulation.model_trust import trusting_models
 from ..verification import Check, Level, Verdict
 from .decoded_video import DecodedVideo
-from .difference_picture import difference_picture, png
+from .difference_picture import difference_picture
 from .drawing_plan import DoesNotFit, DrawingPlan, NotDrawable, plan_drawing
 from .encoded_again import OLD_RATE, EncodedAgain
 from .frame_times import UnevenTimes, rate_of_frames
@@ -448,8 +449,7 @@ class _Studio:
             return {}
         drawn, shipped = found.pictures
         name = f"worst-{next(self._pictures):06d}.png"
-        picture = png(difference_picture(drawn, shipped))
-        (self._task.pictures / name).write_bytes(picture)
+        imwrite(self._task.pictures / name, difference_picture(drawn, shipped))
         return {"picture": name}
 
 
