@@ -28,7 +28,7 @@ from vector_environments import (
 
 import mjrec
 from mjrec import InvalidArgument, NoPictures
-from mjrec.frame_grid import grid_frame
+from mjrec.frames import grid_frame
 
 LENGTHS = (2, 3, 2)
 

@@ -14,6 +14,12 @@ from typing import Any
 from . import errors
 from .errors import Error
 
+_KINDS: Mapping[str, type[Error]] = {
+    name: kind
+    for name, kind in vars(errors).items()
+    if isinstance(kind, type) and issubclass(kind, Error)
+}
+
 
 def carried(error: BaseException) -> dict[str, Any]:
     """Return what `unpacked` makes an error like `error` of, in plain JSON."""
@@ -26,7 +32,7 @@ def carried(error: BaseException) -> dict[str, Any]:
     # One that a module made of its own is known by the nearest that everybody knows.
     kinds = (kind.__name__ for kind in type(error).__mro__)
     return {
-        "type": next(name for name in kinds if name in errors.__all__),
+        "type": next(name for name in kinds if name in _KINDS),
         "message": str(error),
         "facts": {k: _plain(v) for k, v in vars(error).items() if _is_plain(v)},
     }
@@ -38,8 +44,7 @@ def unpacked(plain: Mapping[str, Any]) -> Error:
     It has the class, the message and, of the attributes, numbers, texts, lists of them
     and paths.
     """
-    name = plain["type"]
-    kind: type[Error] = getattr(errors, name) if name in errors.__all__ else Error
+    kind = _KINDS.get(plain["type"], Error)
     error = kind.__new__(kind)
     error.args = (plain["message"],)
     for key, value in plain.get("facts", {}).items():

@@ -47,41 +47,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "ArchiveError",
-    "ArchiveTooLarge",
-    "BlankVideo",
-    "ClosedError",
-    "DifferentEnvironment",
-    "DifferentEvaluation",
-    "DirectoryInUse",
-    "DirectoryNotWritable",
-    "EncoderError",
-    "EnvironmentNotMade",
-    "Error",
-    "ExistingRecordings",
-    "FileNotWritten",
-    "FrameCountError",
-    "GLError",
-    "IdentityLeft",
-    "InvalidArgument",
-    "InvalidFrame",
-    "MissingDependency",
-    "NoPictures",
-    "NotPicklable",
-    "PackError",
-    "PicturesDiffer",
-    "PolicyError",
-    "RenderError",
-    "ResetNeeded",
-    "ResetNotAllowed",
-    "UnfinishedRecordings",
-    "UnknownName",
-    "UnreadableArchive",
-    "UnreadableFile",
-    "UntrustedModel",
-]
-
 
 class Error(Exception):
     """Base of every error that mjrec raises on purpose."""

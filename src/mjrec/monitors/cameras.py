@@ -11,8 +11,7 @@ import numpy as np
 
 from ..errors import InvalidArgument
 from ..formats.video_names import further_parts
-from ..frame_grid import grid_frame, grid_shape
-from ..frames import Frame
+from ..frames import Frame, grid_frame, grid_shape
 from ..recorder.subject import EpisodePictures
 from ..rendering.views import plain_camera
 

@@ -9,8 +9,7 @@ from typing import Any
 import gymnasium
 
 from ..errors import InvalidArgument
-from ..frame_grid import grid_frame, grid_shape
-from ..frames import Frame, check_frame
+from ..frames import Frame, check_frame, grid_frame, grid_shape
 from ..recorder.subject import EpisodePictures
 
 _RGB_ARRAY = "rgb_array"

@@ -13,8 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..errors import InvalidArgument
-from ..frame_grid import grid_frame, grid_shape
-from ..frames import Frame
+from ..frames import Frame, grid_frame, grid_shape
 from ..simulation.cameras import Camera, camera_from_members
 from ..simulation.eyes import Eye
 from ..simulation.given_states import GivenStates

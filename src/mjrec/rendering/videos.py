@@ -41,8 +41,7 @@ from ..formats.video_metadata import (
 )
 from ..formats.video_names import further_parts, second_name_of, with_part
 from ..formats.video_writer import VideoWriter
-from ..frame_grid import grid_shape
-from ..frames import Frame
+from ..frames import Frame, grid_shape
 from ..rates import to_rate
 from ..recorder.endings import KILLED
 from ..recorder.versions import versions

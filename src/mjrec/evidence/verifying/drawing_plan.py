@@ -25,7 +25,7 @@ from ...formats.monitor_directory import (
 from ...formats.trajectory_reader import TrajectoryReader
 from ...formats.video_metadata import StepRuns
 from ...formats.video_names import view_of
-from ...frame_grid import grid_shape
+from ...frames import grid_shape
 from ...rendering.captions import Captions
 from ...rendering.recorded_facts import open_for_rendering
 from ...rendering.recorded_pictures import ChosenFrames, check_has_pictures

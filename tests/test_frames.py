@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from mjrec.errors import InvalidArgument
-from mjrec.frame_grid import grid_frame, grid_shape
-from mjrec.frames import Frame
+from mjrec.frames import Frame, grid_frame, grid_shape
 
 
 def plain(value: int, *, height: int = 2, width: int = 3) -> Frame:
