@@ -400,7 +400,7 @@ def test_a_strangers_sources_are_compiled(
     forbid_compiled_models(monkeypatch, directory)
     assert load_model(directory, facts).ngeom == 1
     (directory / facts["xml"]).write_bytes(b"no zip")
-    with pytest.raises(UntrustedModel, match="it is no zip file") as error:
+    with pytest.raises(UntrustedModel, match="not a zip file") as error:
         load_model(directory, facts)
     assert "--trust-models" in str(error.value)
     assert "move this one away" not in str(error.value)

@@ -20,7 +20,7 @@ ROWS = (
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
         *("annotation", "file_digests", "fingerprint", "surroundings"),
-        *("carried_errors", "child_python", "installed_packages"),
+        *("carried_errors", "child_python", "installed_packages", "sandbox"),
     },
     {"engines"},
     {"formats"},

@@ -22,9 +22,10 @@ from processes import children
 
 import mjrec
 from mjrec.evidence.verification import Check, Level, Verdict
-from mjrec.evidence.verifying.level_process import LIMITS, checks_of
+from mjrec.evidence.verifying.level_process import checks_of
 from mjrec.evidence.verifying.task import Task
 from mjrec.formats.locks import Lock
+from mjrec.sandbox import LIMITS
 
 
 @pytest.fixture(scope="module")

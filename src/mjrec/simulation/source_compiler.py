@@ -3,30 +3,24 @@
 
 A line of MJCF can ask for anything: a body replicated a thousand million times, a
 texture of ten gigabytes, an object that takes days to compile. So it is done in a
-process of its own, which has a limit of memory and is ended when it takes too long, and
-whose death is an error and not this process's end too. Half a second is what that
-costs; it is needed only where the compiled model cannot be used.
+sandbox. Half a second is what that costs; it is needed only where the compiled model
+cannot be used.
 """
 
 from __future__ import annotations
 
-import os
-import resource
-import signal
-import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
 
-from ..child_python import environment_of_child, python_command
 from ..errors import UnreadableFile
+from ..sandbox import LIMITS, Sandbox, enter
 from .authored_model import read_authored
 
-_MODEL = "model.mjb"
-_REASON = "reason.txt"
+_MODULE = "mjrec.simulation.source_compiler"
+_COMPILED = "model.mjb"
 _LONGEST_REASON = 2000
 
 # The largest robots and rooms of the field compile in seconds.
@@ -53,62 +47,40 @@ def compile_within(
             more time or memory than that.
     """
     memory = _BASE_MEMORY + _MEMORY_FACTOR * compiled_size
+    limits = {**LIMITS, "RLIMIT_AS": memory, "RLIMIT_DATA": memory}
+    request = {"path": str(path.absolute()), "limit": limit}
     with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
         place = Path(directory)
-        arguments = [str(path.absolute()), directory, str(limit), str(memory)]
-        try:
-            done = subprocess.run(
-                [*python_command("mjrec.simulation.source_compiler"), *arguments],
-                # Where what it leaves behind is removed, MuJoCo's own log included.
-                cwd=directory,
-                env=environment_of_child({**os.environ, "TMPDIR": directory}),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                timeout=seconds,
-                check=False,
+        with Sandbox(_MODULE, request, place=place, limits=limits) as sandbox:
+            for said in sandbox.said(seconds):
+                if said is None:
+                    raise UnreadableFile(
+                        path, f"compiling it takes longer than {seconds:g} seconds"
+                    )
+                if "reason" in said:
+                    raise UnreadableFile(path, str(said["reason"]))
+                if "compiled" in said:
+                    model = place / str(said["compiled"])
+                    return mujoco.MjModel.from_binary_path(str(model))
+            raise UnreadableFile(
+                path,
+                f"the process that compiled it {sandbox.what_became_of_it()} (it may "
+                f"use {memory / 2**30:.1f} GiB of memory)",
             )
-        except subprocess.TimeoutExpired as error:
-            raise UnreadableFile(
-                path, f"compiling it takes longer than {seconds:g} seconds"
-            ) from error
-        except OSError as error:
-            raise UnreadableFile(
-                path, f"no process could be started that compiles it ({error})"
-            ) from error
-        if done.returncode:
-            raise UnreadableFile(
-                path, _reason(place / _REASON, done.returncode, memory)
-            )
-        return mujoco.MjModel.from_binary_path(str(place / _MODEL))
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Compile a zip; the model, or the reason why there is none, becomes a file."""
-    path, place = Path(arguments[0]), Path(arguments[1])
-    limit, memory = int(arguments[2]), int(arguments[3])
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    allowed = memory if most == resource.RLIM_INFINITY else min(memory, most)
-    resource.setrlimit(resource.RLIMIT_AS, (allowed, most))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+def main() -> int:
+    """Compile the zip that the parent names."""
+    request, say = enter()
     try:
-        model = read_authored(path, limit=limit)
-        mujoco.mj_saveModel(model, str(place / _MODEL))
+        model = read_authored(Path(request["path"]), limit=request["limit"])
+        mujoco.mj_saveModel(model, _COMPILED)
     except UnreadableFile as error:
-        (place / _REASON).write_text(error.reason[:_LONGEST_REASON], encoding="utf-8")
+        say(reason=error.reason[:_LONGEST_REASON])
         return 1
+    say(compiled=_COMPILED)
     return 0
 
 
-def _reason(said: Path, returncode: int, memory: int) -> str:
-    if said.exists():
-        return said.read_text(encoding="utf-8")
-    how = signal.Signals(-returncode).name if returncode < 0 else f"status {returncode}"
-    return (
-        f"the process that compiled it ended ({how}); it may use "
-        f"{memory / 2**30:.1f} GiB of memory"
-    )
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

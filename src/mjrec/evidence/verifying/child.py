@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that checks what may be anybody's, within limits; run by its parent.
+"""The process that checks what may be anybody's, in a sandbox; run by its parent.
 
-Whatever a hostile file does to HDF5's, MuJoCo's, OpenGL's or ffmpeg's code, it does it
-here. The request is a line of JSON on the standard input, whose end is the order to
-end. What is found is said on what was the standard output, a line of JSON each:
+What it says:
 
 - `{"level": L}`: this level's checks begin;
 - `{"check": {...}}`: one is done;
@@ -14,26 +12,16 @@ end. What is found is said on what was the standard output, a line of JSON each:
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib
 import itertools
 import logging
-import os
-import resource
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from ... import json_text
-from ...child_python import (
-    say_stacks_when_asked,
-    take_standard_output,
-)
+from ...sandbox import enter
 from ..verification import Level
 from .carried_checks import check_to_json, task_from_json
 from .file_checks import check_files
@@ -47,13 +35,8 @@ _MOST_CHECKS = 100_000
 
 
 def main() -> int:
-    """Do what the standard input asks for."""
-    answers = take_standard_output()
-    say_stacks_when_asked()
-    request = json_text.loads(sys.stdin.buffer.readline())
-    _set_limits(request["limits"])
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    say = functools.partial(_say, answers)
+    """Do what the parent asks for."""
+    request, say = enter()
     bag = request["bag"]
     task = task_from_json(request["task"])
     # What physics has made again, pixels may be drawn from.
@@ -106,28 +89,6 @@ class _Counter:
         if done >= total or now - self._said_at > _SECONDS_BETWEEN_COUNTS:
             self._said_at = now
             self._say(count=[int(done), int(total)])
-
-
-def _say(answers: int, **said: Any) -> None:
-    line = json_text.dumps(said).encode() + b"\n"
-    while line:
-        line = line[os.write(answers, line) :]
-
-
-def _set_limits(limits: Mapping[str, int]) -> None:
-    """Set the limits of this process and of all that it starts."""
-    for name, wanted in limits.items():
-        kind = getattr(resource, name)
-        _, most = resource.getrlimit(kind)
-        allowed = wanted if most == resource.RLIM_INFINITY else min(wanted, most)
-        resource.setrlimit(kind, (allowed, allowed))
-
-
-def _end_with_parent() -> None:
-    """End this process and those of its group when the parent is gone."""
-    with contextlib.suppress(OSError, ValueError):
-        sys.stdin.buffer.read()
-    os.killpg(0, signal.SIGKILL)
 
 
 if __name__ == "__main__":
