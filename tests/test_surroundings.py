@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import mjrec
-from mjrec.fingerprint import machine_fingerprint
+from mjrec.machine import machine_fingerprint
 from mjrec.surroundings import Surroundings
 
 PROGRAM = """

@@ -11,14 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from . import errors
-from .errors import Error
-
-_KINDS: Mapping[str, type[Error]] = {
-    name: kind
-    for name, kind in vars(errors).items()
-    if isinstance(kind, type) and issubclass(kind, Error)
-}
+from .errors import KINDS, Error
 
 
 def carried(error: BaseException) -> dict[str, Any]:
@@ -32,7 +25,7 @@ def carried(error: BaseException) -> dict[str, Any]:
     # One that a module made of its own is known by the nearest that everybody knows.
     kinds = (kind.__name__ for kind in type(error).__mro__)
     return {
-        "type": next(name for name in kinds if name in _KINDS),
+        "type": next(name for name in kinds if name in KINDS),
         "message": str(error),
         "facts": {k: _plain(v) for k, v in vars(error).items() if _is_plain(v)},
     }
@@ -44,7 +37,7 @@ def unpacked(plain: Mapping[str, Any]) -> Error:
     It has the class, the message and, of the attributes, numbers, texts, lists of them
     and paths.
     """
-    kind = _KINDS.get(plain["type"], Error)
+    kind = KINDS.get(plain["type"], Error)
     error = kind.__new__(kind)
     error.args = (plain["message"],)
     for key, value in plain.get("facts", {}).items():

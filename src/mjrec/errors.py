@@ -445,3 +445,10 @@ class MissingDependency(Error, ImportError):
         super().__init__(
             f"{purpose} needs {package}, which is not installed. Run: {install}"
         )
+
+
+KINDS: Mapping[str, type[Error]] = {
+    name: kind
+    for name, kind in list(globals().items())
+    if isinstance(kind, type) and issubclass(kind, Error)
+}

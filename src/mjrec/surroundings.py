@@ -19,9 +19,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .fingerprint import cpu_flags, cpu_model, machine_fingerprint
 from .installed_packages import installed_packages
-from .machine import usable_cpus
+from .machine import cpu_flags, cpu_model, machine_fingerprint, usable_cpus
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +82,7 @@ class Surroundings:
             None if it is not there yet, or could not be found. Else `command`,
             `working_directory`, `packages` (names to `version` and `record_sha256`,
             the sha256 of what the wheel's own list of its files says, or None),
-            `machine` (see `fingerprint`), `cpu` (`model`, `flags`, `usable`),
+            `machine` (see `machine_fingerprint`), `cpu` (`model`, `flags`, `usable`),
             `system`, `python`, `variables`, and `code` (`root`, `commit`, `dirty`,
             `remote`) or None where the user's code is in no git repository, or git
             has not answered yet.

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..fingerprint import machine_fingerprint
+from ..machine import machine_fingerprint
 from ..simulation.state_source import EpisodeStart
 from .begun_episode import BegunEpisode
 from .options import LIVE

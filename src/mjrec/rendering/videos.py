@@ -21,7 +21,6 @@ from ..annotation import Caption, annotated, check_annotation, pillow_version
 from ..atomic_files import write_text
 from ..blank_frames import BlankFrames
 from ..errors import EncoderError, NoPictures, UnreadableFile
-from ..fingerprint import machine_fingerprint
 from ..formats.monitor_directory import (
     ClipPart,
     Infix,
@@ -42,6 +41,7 @@ from ..formats.video_metadata import (
 from ..formats.video_names import further_parts, second_name_of, with_part
 from ..formats.video_writer import VideoWriter
 from ..frames import Frame, grid_shape
+from ..machine import machine_fingerprint
 from ..rates import to_rate
 from ..recorder.endings import KILLED
 from ..recorder.versions import versions

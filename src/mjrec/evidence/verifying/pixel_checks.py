@@ -33,11 +33,10 @@ from imageio.v3 import imwrite
 
 from ...annotation import annotated, pillow_version
 from ...errors import Error, GLError, MissingDependency, UnreadableFile
-from ...fingerprint import machine_fingerprint
 from ...formats.json_fields import read_object
 from ...formats.monitor_directory import iter_monitor_files
 from ...frames import Frame
-from ...machine import usable_cpus
+from ...machine import machine_fingerprint, usable_cpus
 from ...recorder.versions import versions
 from ...rendering.workers import DrawingWorkers
 from ...simulation.model_trust import trusting_models

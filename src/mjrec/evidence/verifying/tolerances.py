@@ -24,7 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ...fingerprint import machine_fingerprint
+from ...machine import machine_fingerprint
 from ...recorder.versions import versions
 from ...simulation.compiled_models import has_jumping_contacts, turns_by_rk4
 

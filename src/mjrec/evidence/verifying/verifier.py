@@ -19,8 +19,8 @@ from ...errors import (
     UnknownName,
     UnreadableArchive,
 )
-from ...fingerprint import machine_fingerprint
 from ...formats.json_fields import read_object
+from ...machine import machine_fingerprint
 from ..layout import ENVIRONMENT
 from ..verification import Level, Verification
 from .archive import Archive, open_archive
