@@ -55,6 +55,7 @@ LIMITS: Final[Mapping[str, int]] = {
 # Says that a stranger's compiled models may be loaded.
 _TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 
+_STANDARD_INPUT = 0
 _SECONDS_TO_DIE = 5.0
 _LONGEST_LINE = 1 << 24
 _MOST_OF_STDERR = 20_000
@@ -191,6 +192,8 @@ def _say(answers: int, **said: Any) -> None:
 
 def _end_with_parent() -> None:
     """End this process and those of its group when the parent is gone."""
-    with contextlib.suppress(OSError, ValueError):
-        sys.stdin.buffer.read()
+    # Not through `sys.stdin`, whose lock the interpreter would want at its end.
+    with contextlib.suppress(OSError):
+        while os.read(_STANDARD_INPUT, 1 << 16):
+            pass
     os.killpg(0, signal.SIGKILL)

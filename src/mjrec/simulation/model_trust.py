@@ -51,7 +51,7 @@ _LIST_NAME = "models"
 _LOCK_NAME = ".models.lock"
 _DIGEST = re.compile("[0-9a-f]{64}")
 _DIGITS_IN_NAME = 16
-# A task may compile a model for each episode. So many are 4.3 MB, read in 2 ms.
+# A task may compile a model for each episode. So many are 4.3 MB, read in milliseconds.
 _KEPT = 1 << 16
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 

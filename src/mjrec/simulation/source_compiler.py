@@ -60,8 +60,7 @@ def compile_within(
                 if "reason" in said:
                     raise UnreadableFile(path, str(said["reason"]))
                 if "compiled" in said:
-                    model = place / str(said["compiled"])
-                    return mujoco.MjModel.from_binary_path(str(model))
+                    return mujoco.MjModel.from_binary_path(str(place / _COMPILED))
             raise UnreadableFile(
                 path,
                 f"the process that compiled it {sandbox.what_became_of_it()} (it may "
@@ -78,7 +77,7 @@ def main() -> int:
     except UnreadableFile as error:
         say(reason=error.reason[:_LONGEST_REASON])
         return 1
-    say(compiled=_COMPILED)
+    say(compiled=True)
     return 0
 
 

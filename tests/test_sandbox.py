@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is said by a process with limits, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+from processes import children
+from waiting import wait_until
+
+from mjrec.sandbox import Sandbox
+
+_COMPILER = "mjrec.simulation.source_compiler"
+_FOR_EVER = (
+    '<mujoco><worldbody><replicate count="100000000"><geom size="1"/></replicate>'
+    "</worldbody></mujoco>"
+)
+
+
+def sources(directory: Path, xml: str = "<mujoco/>") -> Path:
+    """Write what a model is compiled from."""
+    path = directory / "openaigym.model.0123456789abcdef.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("contents.json", '{"format": 1, "main": "main.xml"}')
+        archive.writestr("source/main.xml", xml)
+    return path
+
+
+def test_what_is_found_is_said_and_the_process_ends(tmp_path: Path) -> None:
+    """What it writes lies in its place."""
+    before = children()
+    request = {"path": str(sources(tmp_path)), "limit": 1 << 20}
+    with Sandbox(_COMPILER, request, place=tmp_path) as sandbox:
+        assert list(sandbox.said(60)) == [{"compiled": True}]
+        assert sandbox.what_became_of_it().startswith("ended with status 0")
+    assert (tmp_path / "model.mjb").exists()
+    assert children() == before
+
+
+def test_a_death_is_told_with_its_last_words(tmp_path: Path) -> None:
+    """Of a request that it does not understand, it dies."""
+    with Sandbox(_COMPILER, {}, place=tmp_path) as sandbox:
+        assert list(sandbox.said(60)) == []
+        said = sandbox.what_became_of_it()
+    assert said.startswith("ended with status 1")
+    assert "KeyError: 'path'" in said
+
+
+# Takes more than five seconds: MuJoCo is loaded, and two seconds of CPU time are used.
+def test_a_limit_of_cpu_time_ends_it(tmp_path: Path) -> None:
+    """In the midst of MuJoCo's code."""
+    request = {"path": str(sources(tmp_path, _FOR_EVER)), "limit": 1 << 20}
+    limits = {"RLIMIT_CPU": 2, "RLIMIT_CORE": 0}
+    with Sandbox(_COMPILER, request, place=tmp_path, limits=limits) as sandbox:
+        assert list(sandbox.said(60)) == []
+        assert "was killed by SIG" in sandbox.what_became_of_it()
+
+
+# Takes more than five seconds: until MuJoCo is at it for certain.
+def test_it_ends_with_its_parent_whatever_it_is_at(tmp_path: Path) -> None:
+    """Nobody would wait for it, or stop it, for days."""
+    path = sources(tmp_path, _FOR_EVER)
+    program = (
+        "from pathlib import Path\n"
+        "from mjrec.simulation.source_compiler import compile_within\n"
+        f"compile_within(Path({str(path)!r}), limit=1 << 20, compiled_size=1)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program]) as parent:
+        listing = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
+        wait_until(lambda: bool(listing.read_text()))
+        number = int(listing.read_text())
+        busy = Path(f"/proc/{number}/stat")
+        ticks = os.sysconf("SC_CLK_TCK")
+        wait_until(lambda: int(busy.read_text().split()[13]) > 3 * ticks)
+        child = os.pidfd_open(number)
+        parent.send_signal(signal.SIGKILL)
+    ended, _, _ = select.select([child], [], [], 30)
+    os.close(child)
+    assert ended
