@@ -86,11 +86,6 @@ class EncoderSettings:
     muxer: str
     encoding: tuple[str, ...]
 
-    @property
-    def decoded_format(self) -> str:
-        """The pixel format in which the finished file's frames are hashed."""
-        return "yuv420p" if self.pixel_format == "yuv420p" else "rgb24"
-
     def arguments(
         self, *, height: int, width: int, fps: Fraction, output: str
     ) -> list[str]:
@@ -247,13 +242,14 @@ def _pixel_format(codec: str, help_text: str) -> str:
 @functools.lru_cache
 def _encoder_help(executable: str, codec: str) -> str:
     """Return what ffmpeg says about an encoder; `executable` is a key of the cache."""
-    available = video_encoders()
-    if codec not in available:
+    shown = run_ffmpeg(["-hide_banner", "-h", f"encoder={codec}"])
+    text = shown.decode("utf-8", errors="replace")
+    # Of a codec's name it shows all encoders that there are for it.
+    if f"Encoder {codec} [" not in text:
         raise UnknownName(
             "video encoder",
             codec,
-            available,
+            video_encoders(),
             hint=f"They are those of {executable}, {ffmpeg_version()}.",
         )
-    shown = run_ffmpeg(["-hide_banner", "-h", f"encoder={codec}"]).stdout
-    return shown.decode("utf-8", errors="replace")
+    return text
