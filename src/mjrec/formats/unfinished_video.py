@@ -11,6 +11,7 @@ and by ffmpeg, which goes on to the end of its file when that process dies.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import re
 from collections.abc import Mapping
@@ -42,63 +43,24 @@ _LARGEST_SIDE = 1 << 16
 _LONGEST_NOTE = 1 << 24
 
 
-@dataclass(frozen=True)
-class VideoFile:
-    """A finished video.
+@dataclass(frozen=True, kw_only=True)
+class EncodedVideo:
+    """What is known of a video from its first frame on.
 
     Attributes:
-        path: the file.
-        frame_count: how many frames it holds, counted by decoding it.
+        path: the file, by its final name.
         height: of a frame as it was written, in pixels.
         width: of a frame as it was written, in pixels.
-        padded_height: the file's, even where the codec needs it.
-        padded_width: the file's, even where the codec needs it.
         fps: frames per second.
         codec: ffmpeg's name of the encoder.
         pixel_format: ffmpeg's name of the encoded pixels' format.
-        file_sha256: of the file's bytes.
-        decoded_sha256: of the decoded frames, one after the other: the planes Y, U, V
-            for yuv420p, else rgb24.
-        frame_hash_path: the `.framehash` file, if one was asked for.
         encoder: `ffmpeg` (the binary's base name), `version` (its first line),
-            `sha256` (the binary's) and `arguments` (all of them; the output file is
-            its base name, so that they stay true when the directory moves).
+            `sha256` (the binary's; None where it is not known yet) and `arguments`
+            (all of them; the output file is its base name, so that they stay true when
+            the directory moves).
     """
 
     path: Path
-    frame_count: int
-    height: int
-    width: int
-    padded_height: int
-    padded_width: int
-    fps: Fraction
-    codec: str
-    pixel_format: str
-    file_sha256: str
-    decoded_sha256: str
-    frame_hash_path: Path | None
-    encoder: dict[str, Any]
-
-
-@dataclass(frozen=True, kw_only=True)
-class UnfinishedVideo:
-    """A video that is being encoded, or was.
-
-    Attributes:
-        path: its final name.
-        temporary: the file now.
-        hashes: its frame hashes now; None where there are to be none.
-        height: of a frame, in pixels.
-        width: of a frame, in pixels.
-        fps: frames per second.
-        codec: ffmpeg's name of the encoder.
-        pixel_format: ffmpeg's name of the encoded pixels' format.
-        encoder: as `VideoFile` has it; `sha256` is None where it is not known yet.
-    """
-
-    path: Path
-    temporary: Path
-    hashes: Path | None
     height: int
     width: int
     fps: Fraction
@@ -107,9 +69,45 @@ class UnfinishedVideo:
     encoder: Mapping[str, Any]
 
     @property
-    def padded(self) -> tuple[int, int]:
-        """Height and width in the file."""
-        return self.height + self.height % 2, self.width + self.width % 2
+    def padded_height(self) -> int:
+        """The file's, even where the codec needs it."""
+        return self.height + self.height % 2
+
+    @property
+    def padded_width(self) -> int:
+        """The file's, even where the codec needs it."""
+        return self.width + self.width % 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoFile(EncodedVideo):
+    """A finished video.
+
+    Attributes:
+        frame_count: how many frames it holds, counted by decoding it.
+        file_sha256: of the file's bytes.
+        decoded_sha256: of the decoded frames, one after the other: the planes Y, U, V
+            for yuv420p, else rgb24.
+        frame_hash_path: the `.framehash` file, if one was asked for.
+    """
+
+    frame_count: int
+    file_sha256: str
+    decoded_sha256: str
+    frame_hash_path: Path | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnfinishedVideo(EncodedVideo):
+    """A video that is being encoded, or was.
+
+    Attributes:
+        temporary: the file now.
+        hashes: its frame hashes now; None where there are to be none.
+    """
+
+    temporary: Path
+    hashes: Path | None
 
     def check(self) -> VideoFile:
         """Return what the file holds, as if it had its final name already.
@@ -120,19 +118,11 @@ class UnfinishedVideo:
         source = self.temporary if self.temporary.exists() else self.path
         frame_count, digest = self._decode(source)
         return VideoFile(
-            path=self.path,
+            **{f.name: getattr(self, f.name) for f in dataclasses.fields(EncodedVideo)},
             frame_count=frame_count,
-            height=self.height,
-            width=self.width,
-            padded_height=self.padded[0],
-            padded_width=self.padded[1],
-            fps=self.fps,
-            codec=self.codec,
-            pixel_format=self.pixel_format,
             file_sha256=file_sha256(source),
             decoded_sha256=digest,
             frame_hash_path=None if self.hashes is None else frame_hash_path(self.path),
-            encoder=dict(self.encoder),
         )
 
     def rename(self, file: VideoFile, *, cut: bool = False) -> None:
@@ -173,8 +163,8 @@ class UnfinishedVideo:
 
     def _decode(self, source: Path) -> tuple[int, str]:
         """Return how many frames the file holds and the sha256 of all of them."""
-        height, width = self.padded
-        pixel_format, frame_bytes = "rgb24", height * width * 3
+        pixel_format = "rgb24"
+        frame_bytes = 3 * self.padded_height * self.padded_width
         if self.pixel_format == "yuv420p":
             pixel_format, frame_bytes = "yuv420p", frame_bytes // 2
         arguments = [

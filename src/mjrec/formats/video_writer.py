@@ -296,7 +296,6 @@ class _Encoding:
         self._input_ended = False
         self._result: VideoFile | None = None
         self._hashes: FrameHashFile | None = None
-        height, width = video.padded
         with contextlib.ExitStack() as on_failure:
             # First of all: what is not locked may be swept up.
             self._lock = _locked(video)
@@ -319,9 +318,7 @@ class _Encoding:
             on_failure.callback(self._end_process)
             self.worker = WorkerThread[Frame](
                 self._encode,
-                capacity=min(
-                    _MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // (height * width * 3))
-                ),
+                capacity=_capacity(3 * video.height * video.width),
                 name=f"encoder of {video.path.name}",
                 finish=self._end_input,
             )
@@ -336,11 +333,9 @@ class _Encoding:
         self.worker.close()
         if not self._input_ended:
             return None
-        # While ffmpeg is still at its last frames.
-        sha256 = ffmpeg_sha256()
         self._process.wait()
         if self._result is None:
-            self._result = self._checked(sha256)
+            self._result = self._checked()
         if self._hashes is not None:
             self._hashes.close()
         self._video.rename(self._result)
@@ -363,6 +358,9 @@ class _Encoding:
         self._lock.let_go()
 
     def _encode(self, frame: Frame) -> None:
+        if not self._encoded:
+            # It is remembered, and the next frames are still being drawn.
+            ffmpeg_sha256()
         if self._hashes is not None:
             self._hashes.add(frame)
         self._process.write(pad_to_even(frame))
@@ -379,7 +377,7 @@ class _Encoding:
         self.temporary.unlink(missing_ok=True)
         self._lock.release()
 
-    def _checked(self, sha256: str) -> VideoFile:
+    def _checked(self) -> VideoFile:
         file = self._video.check()
         if file.frame_count != self._encoded:
             raise FrameCountError(
@@ -389,7 +387,13 @@ class _Encoding:
                 returncode=0,
                 stderr="",
             )
-        return dataclasses.replace(file, encoder={**file.encoder, "sha256": sha256})
+        encoder = {**file.encoder, "sha256": ffmpeg_sha256()}
+        return dataclasses.replace(file, encoder=encoder)
+
+
+def _capacity(frame_bytes: int) -> int:
+    """Return how many frames may wait."""
+    return min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes))
 
 
 def _locked(video: UnfinishedVideo) -> Lock:
