@@ -14,6 +14,7 @@ from ..formats.video_names import further_parts
 from ..frame_grid import grid_frame, grid_shape
 from ..frames import Frame
 from ..recorder.subject import EpisodePictures
+from ..recorder.video_recorder import can_give_pictures
 from ..rendering.views import plain_camera
 
 
@@ -65,6 +66,12 @@ def camera_pictures(
         return CameraPictures(camera=cameras[0], pictures=pictures_from(cameras[0]))
     plain = [None if each is None else plain_camera(each) for each in cameras]
     sources = [pictures_from(each) for each in cameras]
+    without = [source for source in sources if not can_give_pictures(source)]
+    if without:
+        # All are drawn by workers, or none is.
+        return CameraPictures(
+            camera=cameras[0], pictures=without[0], cameras=tuple(plain)
+        )
     if tiled:
         return CameraPictures(
             camera=cameras[0], pictures=_Grid(sources), cameras=tuple(plain)
@@ -106,22 +113,13 @@ class _Grid:
     def render(self) -> Frame:
         return grid_frame([np.asarray(source.render()) for source in self._sources])
 
-    def begin_episode(self) -> None:
-        for source in self._sources:
-            source.begin_episode()
-
     def facts(self) -> dict[str, Any]:
         all_facts = [source.facts() for source in self._sources]
         rows, columns = grid_shape(len(self._sources))
         return {
             **all_facts[0],
-            "pictures": "scene",
             "camera": [facts.get("camera") for facts in all_facts],
             "tiled": True,
             "rows": rows,
             "columns": columns,
         }
-
-    def close(self) -> None:
-        for source in self._sources:
-            source.close()

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -81,15 +81,9 @@ class OutsidePictures:
         """Return the picture of this moment, or the list of those since the last."""
         return self._frames.of(self._index)
 
-    def begin_episode(self) -> None:
-        """Do nothing: what draws knows of every reset."""
-
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         return {"pictures": "env.render", "quality": "full"}
-
-    def close(self) -> None:
-        """Do nothing: the environment closes what it draws with."""
 
 
 class TilePictures:
@@ -122,10 +116,6 @@ class TilePictures:
         """
         return grid_frame([check_frame(source.render()) for source in self._sources])
 
-    def begin_episode(self) -> None:
-        """Look for what resets may have changed in any of them."""
-        self._each(lambda source: source.begin_episode())
-
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         rows, columns = self.shape
@@ -135,11 +125,3 @@ class TilePictures:
             "rows": rows,
             "columns": columns,
         }
-
-    def close(self) -> None:
-        """Free what was acquired; idempotent."""
-        self._each(lambda source: source.close())
-
-    def _each(self, call: Callable[[EpisodePictures], None]) -> None:
-        for source in self._sources:
-            call(source)

@@ -98,7 +98,6 @@ class ClipMaker:
             recorder.metadata.update(first_step=total_steps, last_episode_id=episode_id)
         return LiveClip(
             recorders,
-            self._live.pictures,
             on_end=self._add_live,
             tolerates=self._tolerates,
         )

@@ -34,11 +34,6 @@ class LiveVideoMaker:
     facts: Callable[[], Mapping[str, Any]]
     caption: Callable[[], Caption]
 
-    @property
-    def pictures(self) -> tuple[EpisodePictures, ...]:
-        """Where the pictures come from, of the first camera and of the others."""
-        return (self.subject.pictures, *self.subject.further_pictures.values())
-
     def at(
         self, path: Path, *, second_name: Mapping[str, str], enabled: bool = True
     ) -> tuple[VideoRecorder, ...]:
@@ -91,7 +86,6 @@ class LiveVideos:
 
     Args:
         recorders: what records them, one or more; the first camera's comes first.
-        pictures: where they come from.
         tolerates: tells whether to go on after an error.
         on_picture_error: called with one that is not tolerated while a picture of a
             step is taken: it may be the environment's own.
@@ -100,21 +94,16 @@ class LiveVideos:
     def __init__(
         self,
         recorders: Sequence[VideoRecorder],
-        pictures: Sequence[EpisodePictures],
         *,
         tolerates: Callable[[Exception], bool],
         on_picture_error: Callable[[Exception], object] = lambda _: None,
     ) -> None:
         self._recorders = recorders
-        self._pictures = pictures
         self._tolerates = tolerates
         self._on_picture_error = on_picture_error
 
     def begin(self) -> None:
         """Take the pictures of a reset."""
-        for pictures in self._pictures:
-            # Resets change textures and terrains.
-            pictures.begin_episode()
         for recorder in self._recorders:
             self._try(recorder, recorder.capture_frame)
 
@@ -226,7 +215,6 @@ class LiveClip:
 
     Args:
         recorders: what records it, of one camera or of each.
-        pictures: where the pictures come from.
         on_end: called with the recorders when they are closed.
         tolerates: tells whether to go on after an error.
     """
@@ -234,13 +222,12 @@ class LiveClip:
     def __init__(
         self,
         recorders: Sequence[VideoRecorder],
-        pictures: Sequence[EpisodePictures],
         *,
         on_end: Callable[[Sequence[VideoRecorder]], object],
         tolerates: Callable[[Exception], bool],
     ) -> None:
         self._recorders = recorders
-        self._videos = LiveVideos(recorders, pictures, tolerates=tolerates)
+        self._videos = LiveVideos(recorders, tolerates=tolerates)
         self._on_end = on_end
 
     def begin(self) -> None:

@@ -603,7 +603,6 @@ class Recorder:
             return
         self._live_videos = LiveVideos(
             recorders,
-            self._live_maker.pictures,
             tolerates=functools.partial(self._tolerates, "video"),
             on_picture_error=self.note_error,
         )
