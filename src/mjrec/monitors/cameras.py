@@ -7,15 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from ..errors import InvalidArgument
 from ..formats.video_names import further_parts
-from ..frame_grid import grid_frame, grid_shape
-from ..frames import Frame
 from ..recorder.subject import EpisodePictures
 from ..recorder.video_recorder import can_give_pictures
 from ..rendering.views import plain_camera
+from .vector_pictures import TilePictures
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +71,7 @@ def camera_pictures(
         )
     if tiled:
         return CameraPictures(
-            camera=cameras[0], pictures=_Grid(sources), cameras=tuple(plain)
+            camera=cameras[0], pictures=_CameraTiles(sources), cameras=tuple(plain)
         )
     parts = further_parts(plain)
     return CameraPictures(
@@ -102,24 +99,9 @@ def _check(cameras: list[Any]) -> None:
         raise InvalidArgument(f"The camera {twice[0]!r} is there twice in {cameras!r}.")
 
 
-class _Grid:
+class _CameraTiles(TilePictures):
     """The pictures of several cameras side by side."""
 
-    render_mode = "rgb_array"
-
-    def __init__(self, sources: Sequence[EpisodePictures]) -> None:
-        self._sources = sources
-
-    def render(self) -> Frame:
-        return grid_frame([np.asarray(source.render()) for source in self._sources])
-
     def facts(self) -> dict[str, Any]:
-        all_facts = [source.facts() for source in self._sources]
-        rows, columns = grid_shape(len(self._sources))
-        return {
-            **all_facts[0],
-            "camera": [facts.get("camera") for facts in all_facts],
-            "tiled": True,
-            "rows": rows,
-            "columns": columns,
-        }
+        cameras = [source.facts().get("camera") for source in self.sources]
+        return {**super().facts(), "camera": cameras}

@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
-
-import gymnasium
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidArgument
 from ..frame_grid import grid_frame, grid_shape
 from ..frames import Frame, check_frame
 from ..recorder.subject import EpisodePictures
+
+if TYPE_CHECKING:
+    import gymnasium
 
 _RGB_ARRAY = "rgb_array"
 
@@ -93,19 +94,20 @@ class TilePictures:
         sources: of the pictures, one for each sub-environment.
 
     Attributes:
+        sources: the same.
         count: how many there are.
         shape: rows and columns of the grid.
     """
 
     def __init__(self, sources: Sequence[EpisodePictures]) -> None:
-        self._sources = sources
+        self.sources = sources
         self.count = len(sources)
         self.shape = grid_shape(self.count)
 
     @property
     def render_mode(self) -> str | None:
         """`rgb_array` where all sources have it; None else."""
-        modes = {source.render_mode for source in self._sources}
+        modes = {source.render_mode for source in self.sources}
         return _RGB_ARRAY if modes == {_RGB_ARRAY} else None
 
     def render(self) -> Frame:
@@ -114,13 +116,13 @@ class TilePictures:
         Raises:
             InvalidArgument: the pictures are not of one size, or one is none.
         """
-        return grid_frame([check_frame(source.render()) for source in self._sources])
+        return grid_frame([check_frame(source.render()) for source in self.sources])
 
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         rows, columns = self.shape
         return {
-            **self._sources[0].facts(),
+            **self.sources[0].facts(),
             "tiled": True,
             "rows": rows,
             "columns": columns,
