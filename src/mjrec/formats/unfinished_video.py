@@ -169,8 +169,8 @@ class UnfinishedVideo(EncodedVideo):
             pixel_format, frame_bytes = "yuv420p", frame_bytes // 2
         arguments = [
             *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
-            # As many as there are CPUs would cost more than they save.
-            *("-threads", "2", "-filter_threads", "1"),
+            # More would take a third more of the CPUs, which others are drawing with.
+            *("-threads", "1", "-filter_threads", "1"),
             *("-i", as_file(source), "-map", "0:v:0", *every_frame_arguments()),
             *("-f", "rawvideo", "-pix_fmt", pixel_format, "pipe:1"),
         ]
