@@ -9,6 +9,7 @@ import pytest
 
 from mjrec.errors import InvalidArgument, UnknownName
 from mjrec.simulation.cameras import (
+    camera_label,
     camera_names,
     raw_data,
     raw_model,
@@ -174,3 +175,20 @@ def test_a_nameless_camera_that_follows_is_a_number() -> None:
 
     assert tracking_camera(model) == 3
     assert resolve_camera(model, 3).fixedcamid == 3
+
+
+def test_labels_of_cameras() -> None:
+    """A name where there is one, else a number, else where a free camera is."""
+    model = model_with('<camera name="above"/>')
+    free = mujoco.MjvCamera()
+    free.distance = 3
+    fixed = mujoco.MjvCamera()
+    fixed.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    fixed.fixedcamid = 0
+    assert camera_label(model, "above") == "above"
+    assert camera_label(model, 0) == "above"
+    assert camera_label(model, -1) == -1
+    assert camera_label(model, fixed) == "above"
+    label = camera_label(model, free)
+    assert isinstance(label, dict)
+    assert label["distance"] == 3

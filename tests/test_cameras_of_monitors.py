@@ -10,21 +10,34 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
-from parts import parametrize
 from recordings import frames_of, manifest_of
 
 import mjrec
 
 SIZE = {"height": 48, "width": 64}
 
+# Of which several can be drawn live: those of `physics.render()`.
+WAYS = ["deferred", pytest.param("live", marks=pytest.mark.dm_control)]
+CAMERAS = {"deferred": ["track", -1], "live": ["side", "back"]}
 
-def record(directory: Path, steps: int = 3, **options: Any) -> dict[str, str]:
+
+def record(
+    directory: Path, steps: int = 3, render: str = "deferred", **options: Any
+) -> dict[str, str]:
     """Record an episode; return the frame hashes of each video, by its name's end."""
-    made = gymnasium.make("HalfCheetah-v5", max_episode_steps=steps)
-    with mjrec.Monitor(made, directory, **{**SIZE, **options}) as env:
-        env.reset(seed=0)
+    made: Any
+    if render == "live":
+        from dm_control import suite
+
+        made = suite.load("cheetah", "run", task_kwargs={"random": 0})
+        options["env_id"] = "dm_control/cheetah-run"
+    else:
+        made = gymnasium.make("HalfCheetah-v5", max_episode_steps=steps)
+    with mjrec.Monitor(made, directory, render=render, **{**SIZE, **options}) as env:
+        env.reset(**({} if render == "live" else {"seed": 0}))
         for _ in range(steps):
             env.step(np.full(6, 0.5, np.float32))
     return {
@@ -38,22 +51,24 @@ def _hashes(path: Path) -> str:
     return "\n".join(line for line in lines if not line.startswith("#"))
 
 
-# Takes more than five seconds: a monitor with renderers of its own for each camera.
-@parametrize("render", ["deferred", "live"])
+# Takes more than five seconds: a monitor with workers of its own for each camera.
+@pytest.mark.parametrize("render", WAYS)
 def test_each_camera_has_a_video_as_if_it_were_the_only_one(
     tmp_path: Path, render: str
 ) -> None:
     """Frame by frame, whichever stands first, drawn live or later."""
-    both = record(tmp_path / "both", camera=["track", -1], render=render)
-    track = record(tmp_path / "track", camera="track", render=render)
-    free = record(tmp_path / "free", camera=-1, render=render)
-    assert both == {"": track[""], ".-1": free[""]}
+    first, second = CAMERAS[render]
+    both = record(tmp_path / "both", camera=[first, second], render=render)
+    one = record(tmp_path / "first", camera=first, render=render)
+    other = record(tmp_path / "second", camera=second, render=render)
+    assert both == {"": one[""], f".{second}": other[""]}
+    assert one[""] != other[""]
 
 
-@parametrize("render", ["live", "deferred"])
+@pytest.mark.parametrize("render", WAYS)
 def test_manifest_and_metadata_name_all_videos(tmp_path: Path, render: str) -> None:
     """Each video has its metadata, with its camera, and is in the index."""
-    record(tmp_path, camera=["track", -1], render=render)
+    record(tmp_path, camera=CAMERAS[render], render=render)
     names = [video for video, _ in manifest_of(tmp_path)["videos"]]
     assert sorted(names) == sorted(path.name for path in tmp_path.glob("*.mp4"))
     cameras = [
@@ -62,17 +77,17 @@ def test_manifest_and_metadata_name_all_videos(tmp_path: Path, render: str) -> N
         ]
         for name in sorted(names, key=len)
     ]
-    assert cameras[0] == "track"
+    assert cameras[0] == CAMERAS[render][0]
     assert len(cameras) == 2
-    assert cameras[1] != "track"
+    assert cameras[1] != cameras[0]
 
 
-@parametrize("render", ["live", "deferred"])
+@pytest.mark.parametrize("render", WAYS)
 def test_further_videos_name_the_first_and_their_second_name(
     tmp_path: Path, render: str
 ) -> None:
     """Whoever has one file finds the others."""
-    record(tmp_path, camera=["track", -1], render=render, name_prefix="rl")
+    record(tmp_path, camera=CAMERAS[render], render=render, name_prefix="rl")
     [first, further] = sorted(
         tmp_path.glob("openaigym.*.mp4"), key=lambda p: len(str(p))
     )
@@ -81,15 +96,17 @@ def test_further_videos_name_the_first_and_their_second_name(
     assert (tmp_path / about["also_named"]).samefile(further)
     about = json.loads(first.with_suffix(".meta.json").read_text())
     assert about["further_videos"] == [further.name]
+    assert (tmp_path / "rl-episode-0.mp4").samefile(first)
 
 
-@parametrize("render", ["live", "deferred"])
+@pytest.mark.parametrize("render", WAYS)
 def test_cameras_side_by_side_are_one_video(tmp_path: Path, render: str) -> None:
     """The grid has the very frames of both."""
-    record(tmp_path / "tiled", camera=["track", -1], tiled=True, render=render)
-    record(tmp_path / "track", camera="track", render=render)
+    cameras = CAMERAS[render]
+    record(tmp_path / "tiled", camera=cameras, tiled=True, render=render)
+    record(tmp_path / "single", camera=cameras[0], render=render)
     [video] = (tmp_path / "tiled").glob("*.mp4")
-    [single] = (tmp_path / "track").glob("*.mp4")
+    [single] = (tmp_path / "single").glob("*.mp4")
     wide, narrow = frames_of(video)[-1], frames_of(single)[-1]
     assert wide.shape == (48, 128, 3)
     difference = np.abs(wide[:, :64].astype(int) - narrow.astype(int))
@@ -101,19 +118,49 @@ def test_cameras_side_by_side_are_one_video(tmp_path: Path, render: str) -> None
 @pytest.mark.thorough
 def test_live_and_deferred_captions_are_the_same(tmp_path: Path) -> None:
     """They say the same of each frame, in the same letters."""
-    live = record(tmp_path / "live", camera="track", annotate=True, render="live")
-    later = record(tmp_path / "later", camera="track", annotate=True, render="deferred")
-    plain = record(tmp_path / "plain", camera="track", render="deferred")
+
+    def hashes(name: str, **options: Any) -> str:
+        made = gymnasium.make(
+            "HalfCheetah-v5", max_episode_steps=3, render_mode="rgb_array", **SIZE
+        )
+        with mjrec.Monitor(made, tmp_path / name, **options) as env:
+            env.reset(seed=0)
+            for _ in range(3):
+                env.step(np.full(6, 0.5, np.float32))
+        [path] = (tmp_path / name).glob("*.framehash")
+        return _hashes(path)
+
+    live = hashes("live", annotate=True, render="live")
+    later = hashes("later", annotate=True, render="deferred")
+    plain = hashes("plain", render="deferred")
     assert live == later
     assert live != plain
 
 
-@parametrize("render", ["live", "deferred"])
-def test_videos_have_gymnasiums_names_besides(tmp_path: Path, render: str) -> None:
-    """The same files, so nothing is stored twice."""
-    record(tmp_path, camera="track", name_prefix="rl-video", render=render)
-    [own] = tmp_path.glob("openaigym.*.mp4")
-    assert (tmp_path / "rl-video-episode-0.mp4").samefile(own)
+@pytest.mark.parametrize("options", [{"camera": "track"}, {"camera": [None, "track"]}])
+def test_another_picture_than_renders_own_is_never_live(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    """The error says what to do."""
+    made = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array")
+    with pytest.raises(mjrec.NoPictures, match=r"camera_name=.*leave render= out"):
+        mjrec.Monitor(made, tmp_path / "run", render="live", **options)
+    assert not (tmp_path / "run").exists()
+    made.close()
+
+
+@pytest.mark.dm_control
+@pytest.mark.parametrize("options", [{"height": 4000}, {"camera": mujoco.MjvCamera()}])
+def test_what_physics_does_not_draw_is_never_live(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    """A picture larger than the model's buffer, and a camera that it does not know."""
+    from dm_control import suite
+
+    made = suite.load("cheetah", "run")
+    with pytest.raises(mjrec.NoPictures, match="Leave render= out"):
+        mjrec.Monitor(made, tmp_path / "run", env_id="c", render="live", **options)
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.thorough

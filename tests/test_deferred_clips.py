@@ -133,7 +133,7 @@ def check_same(live: Path, deferred: Path) -> None:
 
 
 # Takes more than five seconds: the same run live and deferred.
-@parametrize("options", [{"camera": "track", "annotate": True, "max_fps": 50}, {}])
+@parametrize("options", [{"annotate": True, "max_fps": 50}, {}])
 def test_pictures_are_those_that_were_drawn_live(
     options: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -92,6 +92,34 @@ def test_a_run_without_faults_says_so(pendulum: Pendulum, tmp_path: Path) -> Non
     assert faults_of(tmp_path / "run") == []
 
 
+def test_a_schedule_that_raises_breaks_no_finished_video(tmp_path: Path) -> None:
+    """The episode before is over, and its video was whole."""
+
+    def schedule(episode: int) -> bool:
+        if episode == 1:
+            raise RuntimeError("no idea")
+        return True
+
+    env = gymnasium.make(
+        "InvertedPendulum-v5",
+        render_mode="rgb_array",
+        height=32,
+        width=48,
+        max_episode_steps=8,
+    )
+    run_path = tmp_path / "run"
+    with Monitor(env, run_path, schedule, render="live", on_error="warn") as monitor:
+        run(monitor)
+        first = monitor.video_recorder
+        run(monitor)
+        assert not first.broken
+        run(monitor)
+    assert [len(frames_in(run_path, episode)) for episode in (0, 2)] == [9, 9]
+    details = manifest_of(run_path)["mjrec"]
+    assert details["broken"] == []
+    assert [fault["reason"] for fault in details["faults"]] == ["no idea"]
+
+
 @pytest.mark.parametrize("value", ["ignore", None, True])
 def test_on_error_is_one_of_two(value: Any, pendulum: Pendulum) -> None:
     """Nothing else, and the message says what there is."""

@@ -16,6 +16,7 @@ import pytest
 from mjrec.errors import EncoderError, InvalidArgument, MissingDependency
 from mjrec.formats.ffmpeg import (
     FfmpegProcess,
+    every_frame_arguments,
     ffmpeg_executable,
     ffmpeg_sha256,
     ffmpeg_version,
@@ -49,6 +50,23 @@ def test_the_environment_variable_decides(
     assert ffmpeg_executable() == str(other)
     assert ffmpeg_version() == "ffmpeg version ours"
     assert ffmpeg_sha256() == hashlib.sha256(other.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("libavutil", "option"),
+    [
+        ("56. 70.100", "-vsync"),
+        ("57. 28.100", "-fps_mode"),
+        ("61.  1.102", "-fps_mode"),
+    ],
+)
+def test_an_old_ffmpeg_is_asked_in_its_own_words(
+    libavutil: str, option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """5.1 renamed the option that lets each frame pass, and 9 took the old one away."""
+    text = f"printf 'ffmpeg version x\\nlibavutil      {libavutil} / {libavutil}\\n'"
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(script(tmp_path / "other", text)))
+    assert every_frame_arguments() == (option, "passthrough")
 
 
 def test_a_program_that_is_not_there_is_named(

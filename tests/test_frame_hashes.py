@@ -39,16 +39,17 @@ def test_the_text_is_ffmpegs_own(
 ) -> None:
     """Odd and even sizes, whole and broken rates: byte for byte ffmpeg's output."""
     frames = noise(12, height, width)
-    file = FrameHashFile(tmp_path / "a.framehash", size=(height, width), fps=fps)
+    path = tmp_path / "a.framehash"
+    file = FrameHashFile(path, final=path, size=(height, width), fps=fps)
     for frame in frames:
         file.add(frame)
-    file.finish()
+    file.close()
     arguments = (
         f"-v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i - "
         "-fflags +bitexact -f framehash -"
     )
-    theirs = run_ffmpeg(arguments.split(), standard_input=frames.tobytes()).stdout
-    assert (tmp_path / "a.framehash").read_bytes() == theirs
+    theirs = run_ffmpeg(arguments.split(), standard_input=frames.tobytes())
+    assert path.read_bytes() == theirs
 
 
 def test_a_view_is_hashed_as_it_looks() -> None:
@@ -58,29 +59,29 @@ def test_a_view_is_hashed_as_it_looks() -> None:
     assert frame_hash_line(0, frame[::-1]) != frame_hash_line(0, frame)
 
 
-def test_it_has_its_name_only_when_finished(tmp_path: Path) -> None:
-    """Until finish there is nothing under the name; after abort nothing at all."""
-    path = frame_hash_path(tmp_path / "run.1.mp4")
-    assert path.name == "run.1.framehash"
-    file = FrameHashFile(path, size=(4, 6), fps=Fraction(1))
-    assert not path.exists()
-    file.abort()
-    assert list(tmp_path.iterdir()) == []
+def test_it_is_called_as_its_video() -> None:
+    """But for the ending."""
+    assert frame_hash_path(Path("run.1.mp4")) == Path("run.1.framehash")
 
 
 def test_a_disk_that_takes_nothing_is_one_error() -> None:
     """What the system says comes with the directory's name."""
     with pytest.raises(DirectoryNotWritable, match="/proc"):
-        FrameHashFile(Path("/proc/a.framehash"), size=(4, 6), fps=Fraction(1))
+        FrameHashFile(
+            Path("/proc/.part"),
+            final=Path("/proc/a.framehash"),
+            size=(4, 6),
+            fps=Fraction(1),
+        )
 
 
 def test_a_full_disk_is_named_with_the_file(tmp_path: Path) -> None:
     """And nothing is left of it."""
-    path = tmp_path / "run.framehash"
-    file = FrameHashFile(path, size=(4, 6), fps=Fraction(1))
-    with file_size_limit(100), pytest.raises(FileNotWritten, match=str(path)):
+    part, final = tmp_path / "part", tmp_path / "run.framehash"
+    file = FrameHashFile(part, final=final, size=(4, 6), fps=Fraction(1))
+    with file_size_limit(100), pytest.raises(FileNotWritten, match=str(final)):
         file.add(np.zeros((4, 6, 3), np.uint8))
     file.abort()
-    with file_size_limit(100), pytest.raises(FileNotWritten, match=str(path)):
-        FrameHashFile(path, size=(4, 6), fps=Fraction(1))
+    with file_size_limit(100), pytest.raises(FileNotWritten, match=str(final)):
+        FrameHashFile(part, final=final, size=(4, 6), fps=Fraction(1))
     assert list(tmp_path.iterdir()) == []

@@ -70,7 +70,7 @@ def run(env, steps=12, reset=True):
 
 def die(env=None):
     if env is not None:
-        drained(env.video_recorder._writer)
+        drained(env.video_recorder._sink._writer)
     os.kill(os.getpid(), signal.SIGKILL)
 
 """
@@ -342,7 +342,7 @@ def test_a_text_recording_that_was_cut_off_is_finished(
 def test_an_encoder_that_was_killed_too_is_told(killed: Callable[[str], Path]) -> None:
     """The video is not there, its metadata says why, and what there is is kept."""
     directory = killed(
-        "env = monitor()\nrun(env)\nrun(env, 7)\nw = env.video_recorder._writer\n"
+        "env = monitor()\nrun(env)\nrun(env, 7)\nw = env.video_recorder._sink._writer\n"
         "drained(w)\nos.kill(w._encoding._process.pid, signal.SIGKILL)\n"
         "w._encoding.temporary.write_bytes(b'ftyp' + bytes(900))\ndie()"
     )
@@ -367,8 +367,8 @@ def test_an_encoder_that_outlives_its_process_is_waited_for(
 ) -> None:
     """As long as was asked for; then it is told, and the next time it is done."""
     directory = killed(
-        "env = monitor()\nrun(env, 7)\ndrained(env.video_recorder._writer)\n"
-        "pid = env.video_recorder._writer._encoding._process.pid\n"
+        "env = monitor()\nrun(env, 7)\ndrained(env.video_recorder._sink._writer)\n"
+        "pid = env.video_recorder._sink._writer._encoding._process.pid\n"
         "os.kill(pid, signal.SIGSTOP)\n"
         "open(sys.argv[2], 'w').write(str(pid))\ndie()"
     )
@@ -392,7 +392,7 @@ def test_a_video_that_got_its_name_gets_its_metadata(
 ) -> None:
     """Its process was killed between the two."""
     directory = killed(
-        "import mjrec.recorder.video_recorder as v\nv.write_text = lambda *_: die()\n"
+        "import mjrec.formats.video_metadata as v\nv.write_text = lambda *_: die()\n"
         "env = monitor(max_fps=2)\nrun(env)\n"
     )
     assert videos_in(directory) == [0]

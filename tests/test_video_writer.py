@@ -604,7 +604,7 @@ def test_frame_hashes_are_of_the_frames_as_given(tmp_path: Path) -> None:
         "-fflags +bitexact -f framehash -"
     )
     raw = b"".join(frame.tobytes() for frame in originals)
-    theirs = run_ffmpeg(arguments.split(), standard_input=raw).stdout
+    theirs = run_ffmpeg(arguments.split(), standard_input=raw)
     assert result.frame_hash_path.read_bytes() == theirs
 
 
@@ -687,9 +687,13 @@ def close_interrupted_at(video: VideoWriter, point: int) -> bool:
     """Close with SIGINT at the end of a function; False if there are not as many."""
     returns = itertools.count()
     modules = ("video_writer", "worker_thread", "frame_hashes", "ffmpeg")
-    # After the one there is nothing to go on with, after the other nobody has the
+    # After the first there is nothing to go on with, after the others nobody has the
     # process yet.
-    left_out = (VideoWriter.close.__code__, FfmpegProcess.__init__.__code__)
+    left_out = (
+        VideoWriter.close.__code__,
+        FfmpegProcess.__init__.__code__,
+        FfmpegProcess.__enter__.__code__,
+    )
 
     def at_event(frame: FrameType, event: str, argument: object) -> None:
         ours = Path(frame.f_code.co_filename).stem in modules

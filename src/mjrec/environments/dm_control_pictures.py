@@ -6,13 +6,14 @@ from __future__ import annotations
 from typing import Any
 
 from ..frames import check_size
-from ..simulation.cameras import raw_model, resolve_camera
+from ..simulation.cameras import camera_label, raw_model, resolve_camera
 from ..simulation.gl_strings import current_gl_facts
-from ..simulation.scene_pictures import (
-    Look,
-    ScenePictures,
-    camera_label,
-    option_without_rangefinder,
+from .no_pictures import NoPictureSource
+
+_NOT_BY_PHYSICS = (
+    "physics.render() draws no picture from an MjvCamera, nor one that is larger than "
+    "the model's offscreen buffer; such pictures are drawn from recorded states and "
+    "never live. Leave render= out"
 )
 
 # The size of `physics.render()` where none is asked for.
@@ -25,7 +26,7 @@ def dm_control_pictures(
     camera: Any = None,
     height: int | None = None,
     width: int | None = None,
-) -> PhysicsPictures | ScenePictures:
+) -> PhysicsPictures | NoPictureSource:
     """Return the source of a dm_control environment's pictures.
 
     Args:
@@ -34,25 +35,19 @@ def dm_control_pictures(
         height: in pixels; None is 240, dm_control's default.
         width: in pixels; None is 320, likewise.
 
-    The pictures are those of `physics.render()`. A picture larger than the model's
-    offscreen buffer, which `physics.render()` refuses, and one from an `MjvCamera`,
-    which it does not know, is drawn by a renderer of our own.
+    The pictures are those of `physics.render()`. What that cannot draw is not drawn
+    live: a picture larger than the model's offscreen buffer, and one from an
+    `MjvCamera`.
 
     Raises:
         UnknownName: the model has no such camera.
         InvalidArgument: a number or a size that cannot be.
     """
     height, width = picture_size(height, width)
-    if not drawn_by_physics(env.physics, camera, height, width):
-        return ScenePictures(
-            lambda: (env.physics.model, env.physics.data),
-            look=lambda: Look(scene_option=option_without_rangefinder()),
-            camera=camera,
-            height=height,
-            width=width,
-        )
     if camera is not None:
         resolve_camera(raw_model(env.physics.model), camera)
+    if not drawn_by_physics(env.physics, camera, height, width):
+        return NoPictureSource(_NOT_BY_PHYSICS)
     return PhysicsPictures(env, camera=camera, height=height, width=width)
 
 
@@ -80,9 +75,6 @@ class PhysicsPictures:
             height=self._height, width=self._width, camera_id=self._camera
         )
 
-    def begin_episode(self) -> None:
-        """Do nothing: what draws knows of every reset."""
-
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         physics = self._env.physics
@@ -94,9 +86,6 @@ class PhysicsPictures:
         with physics.contexts.gl.make_current() as context:
             facts.update(context.call(current_gl_facts))
         return facts
-
-    def close(self) -> None:
-        """Do nothing: the environment closes what it draws with."""
 
 
 def picture_size(height: int | None, width: int | None) -> tuple[int, int]:

@@ -11,11 +11,19 @@ from typing import Any
 from dm_control.mujoco import wrapper
 
 from ..simulation.authored_model import AuthoredModel
-from ..simulation.cameras import FREE_CAMERA, raw_data, raw_model, resolve_camera
+from ..simulation.cameras import (
+    FREE_CAMERA,
+    camera_label,
+    raw_data,
+    raw_model,
+    resolve_camera,
+)
 from ..simulation.episode_states import EpisodeStates
-from ..simulation.scene_pictures import camera_label, option_without_rangefinder
 from ..simulation.scene_view import SceneView
-from ..simulation.viewer_settings import place_free_camera
+from ..simulation.viewer_settings import (
+    option_without_rangefinder,
+    place_free_camera,
+)
 from .dm_control_contexts import ContextsOnDemand
 from .dm_control_environments import arguments_of
 from .dm_control_pictures import drawn_by_physics, picture_size
@@ -35,7 +43,7 @@ _SUITE = "dm_control/"
 # Asked at every captured step. It is dm_control's own, which belongs to one model.
 _DATA = attrgetter("physics.data")
 
-# Of ScenePictures, which draws what `physics.render()` cannot.
+# Of pictures that `physics.render()` does not draw.
 _MAX_GEOM = 10000
 
 
@@ -58,7 +66,7 @@ def dm_control_scenes(
         env_id: `dm_control/<domain>-<task>`, of a task of the suite.
 
     The pictures are those of `physics.render()`, or where that draws no such picture
-    (see `dm_control_pictures`) those of the same scene.
+    (see `drawn_by_physics`) those of the same scene.
 
     Raises:
         UnknownName: the model has no such camera.

@@ -5,15 +5,19 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 
 from ..errors import InvalidArgument
 from ..simulation.inside import simulation_in
+from .no_pictures import NoPictureSource
 
-if TYPE_CHECKING:
-    from ..simulation.scene_pictures import ScenePictures
+_ANOTHER_VIEW = (
+    "camera, height and width ask for another picture than render() gives, which is "
+    "drawn from recorded states and never live. Make the environment with them "
+    "(camera_name=, height=, width=), or leave render= out"
+)
 
 
 def gymnasium_pictures(
@@ -22,8 +26,8 @@ def gymnasium_pictures(
     camera: Any = None,
     height: int | None = None,
     width: int | None = None,
-) -> EnvironmentPictures | ScenePictures:
-    """Return the source of an environment's pictures.
+) -> EnvironmentPictures | NoPictureSource:
+    """Return the source of an environment's live pictures, which is `env.render()`.
 
     Args:
         env: the environment as the user wrapped it.
@@ -32,11 +36,10 @@ def gymnasium_pictures(
         height: in pixels; None is the environment's own.
         width: likewise.
 
-    With none of the three the pictures are those of `env.render()`. With one of them
-    they are drawn from the live model and data by a renderer of our own; what wrappers
-    draw on top of `env.render()` is then not in them.
+    With one of the three there are no live pictures: workers draw from states.
 
     Raises:
+        UnknownName: the model has no such camera.
         InvalidArgument: camera, height or width for what is no MuJoCo environment.
     """
     if camera is None and height is None and width is None:
@@ -50,17 +53,13 @@ def gymnasium_pictures(
             f"environment, and {env} has no MuJoCo model and data. Make the "
             "environment itself with the camera and size that the videos are to have."
         )
-    # Loaded where there is a simulation, and so mujoco, already: importing mujoco
-    # settles its OpenGL backend, which is not ours to do for a CartPole.
-    from ..simulation.scene_pictures import Look, ScenePictures
+    if camera is not None:
+        # Loaded where there is a simulation, and so mujoco, already: importing mujoco
+        # settles its OpenGL backend, which is not ours to do for a CartPole.
+        from ..simulation.cameras import resolve_camera
 
-    return ScenePictures(
-        lambda: (simulated.model, simulated.data),
-        look=lambda: Look(**_look(simulated, env, camera=camera is None)),
-        camera=camera,
-        height=_own_size(simulated, env, "height") if height is None else height,
-        width=_own_size(simulated, env, "width") if width is None else width,
-    )
+        resolve_camera(simulated.model, camera)
+    return NoPictureSource(_ANOTHER_VIEW)
 
 
 class EnvironmentPictures:
@@ -88,9 +87,6 @@ class EnvironmentPictures:
             return self._new_ones(rendered)
         return rendered
 
-    def begin_episode(self) -> None:
-        """Do nothing: what draws knows of every reset."""
-
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         facts: dict[str, Any] = {"pictures": "env.render", "quality": "full"}
@@ -101,16 +97,13 @@ class EnvironmentPictures:
         simulated = simulation_in(self._env)
         viewer = getattr(_renderer(self._env), "viewer", None)
         if simulated is not None and viewer is not None:
+            from ..simulation.cameras import camera_label
             from ..simulation.gl_strings import current_gl_facts
-            from ..simulation.scene_pictures import camera_label
 
             facts["camera"] = camera_label(simulated.model, viewer.cam)
             with _own_context(self._env):
                 facts.update(current_gl_facts())
         return facts
-
-    def close(self) -> None:
-        """Do nothing: the environment closes what it draws with."""
 
     def _new_ones(self, frames: list[Any]) -> list[Any]:
         # A list that did not grow was emptied by a reset.
@@ -173,31 +166,3 @@ def _keeps_frames(env: gymnasium.Env[Any, Any]) -> bool:
     """Tell whether `render` gives all frames every time, old ones too."""
     # What gymnasium.wrappers.RenderCollection(pop_frames=False) does.
     return env.has_wrapper_attr("pop_frames") and not env.get_wrapper_attr("pop_frames")
-
-
-def _own_size(simulated: Any, env: gymnasium.Env[Any, Any], name: str) -> int:
-    # Gymnasium's default, for environments that do not say.
-    return int(getattr(simulated, name, getattr(env.unwrapped, name, 480)))
-
-
-def _look(
-    simulated: Any, env: gymnasium.Env[Any, Any], *, camera: bool
-) -> dict[str, Any]:
-    """Return how the environment itself shows its scene, as arguments of `Look`.
-
-    Args:
-        simulated: holds the model, the data and the renderer.
-        env: the same, with its wrappers.
-        camera: whether the environment's own camera is wanted. Gymnasium settles it
-            when it draws for the first time, and so it is made to.
-    """
-    renderer = getattr(simulated, "mujoco_renderer", None)
-    if renderer is None:
-        return {}
-    if camera and renderer.viewer is None and env.render_mode == "rgb_array":
-        env.render()
-    look = {"max_geom": renderer.max_geom}
-    viewer = renderer.viewer
-    if viewer is None:
-        return look
-    return {**look, "camera": viewer.cam, "scene_option": viewer.vopt}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands for the pictures of an environment that cannot be drawn."""
+"""What stands for the pictures of an environment that cannot be drawn live."""
 
 from __future__ import annotations
 
@@ -20,12 +20,6 @@ class NoPictureSource:
 
     def render(self) -> None:
         """Return None: there is no picture."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-    def begin_episode(self) -> None:
-        """Do nothing."""
 
     def facts(self) -> dict[str, Any]:
         """Return nothing: there is no video."""

@@ -11,8 +11,7 @@ from operator import attrgetter
 from typing import Any
 
 from ..frames import check_size
-from ..simulation.cameras import FREE_CAMERA, resolve_camera
-from ..simulation.scene_pictures import camera_label
+from ..simulation.cameras import FREE_CAMERA, camera_label, resolve_camera
 from ..simulation.scene_view import SceneView
 from ..simulation.viewer_settings import (
     copy_members,

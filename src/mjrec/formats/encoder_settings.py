@@ -38,7 +38,7 @@ MUXERS = {
     ".webm": "webm",
     ".avi": "avi",
 }
-_WITH_MOOV = ("mp4", "mov")
+_STANDARD_OUTPUT = "pipe:1"
 
 # Pixel formats that hold rgb24 without loss.
 _RGB_FORMATS = ("rgb24", "bgr24", "gbrp", "bgr0", "rgb0")
@@ -86,31 +86,14 @@ class EncoderSettings:
     muxer: str
     encoding: tuple[str, ...]
 
-    @property
-    def decoded_format(self) -> str:
-        """The pixel format in which the finished file's frames are hashed."""
-        return "yuv420p" if self.pixel_format == "yuv420p" else "rgb24"
-
     def arguments(
         self, *, height: int, width: int, fps: Fraction, output: str
     ) -> list[str]:
         """Return ffmpeg's arguments for rgb24 frames from standard input to a file."""
-        return [
-            *self._to_encode(height, width, fps),
-            *(("-movflags", "+faststart") if self.muxer in _WITH_MOOV else ()),
-            *("-f", self.muxer, output),
-        ]
-
-    def trial_arguments(self, *, height: int, width: int, fps: Fraction) -> list[str]:
-        """Return the same but for a pipe, whose beginning cannot be rewritten."""
-        fragmented = ("-movflags", "+frag_keyframe+empty_moov")
-        return [
-            *self._to_encode(height, width, fps),
-            *(fragmented if self.muxer in _WITH_MOOV else ()),
-            *("-f", self.muxer, "pipe:1"),
-        ]
-
-    def _to_encode(self, height: int, width: int, fps: Fraction) -> list[str]:
+        index = "+faststart"
+        if output == _STANDARD_OUTPUT:
+            # The beginning of a pipe cannot be rewritten.
+            index = "+frag_keyframe+empty_moov"
         return [
             *("-hide_banner", "-loglevel", "error", "-nostdin", "-y"),
             *("-f", "rawvideo", "-pixel_format", "rgb24"),
@@ -120,6 +103,8 @@ class EncoderSettings:
             *("-r", f"{fps.numerator}/{fps.denominator}"),
             *("-i", "pipe:0"),
             *self.encoding,
+            *(("-movflags", index) if self.muxer in ("mp4", "mov") else ()),
+            *("-f", self.muxer, output),
         ]
 
 
@@ -167,7 +152,7 @@ def try_encoding(executable: str, settings: EncoderSettings, fps: Fraction) -> N
     """
     side = 64
     run_ffmpeg(
-        settings.trial_arguments(height=side, width=side, fps=fps),
+        settings.arguments(height=side, width=side, fps=fps, output=_STANDARD_OUTPUT),
         standard_input=bytes([128]) * (side * side * 3),
         what=f"ffmpeg cannot encode {fps} frames per second with {settings.codec} "
         f"into a {settings.muxer} file: choose another codec, rate or kind of file.",
@@ -247,13 +232,14 @@ def _pixel_format(codec: str, help_text: str) -> str:
 @functools.lru_cache
 def _encoder_help(executable: str, codec: str) -> str:
     """Return what ffmpeg says about an encoder; `executable` is a key of the cache."""
-    available = video_encoders()
-    if codec not in available:
+    shown = run_ffmpeg(["-hide_banner", "-h", f"encoder={codec}"])
+    text = shown.decode("utf-8", errors="replace")
+    # Of a codec's name it shows all encoders that there are for it.
+    if f"Encoder {codec} [" not in text:
         raise UnknownName(
             "video encoder",
             codec,
-            available,
+            video_encoders(),
             hint=f"They are those of {executable}, {ffmpeg_version()}.",
         )
-    shown = run_ffmpeg(["-hide_banner", "-h", f"encoder={codec}"]).stdout
-    return shown.decode("utf-8", errors="replace")
+    return text

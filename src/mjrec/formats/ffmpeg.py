@@ -20,9 +20,10 @@ import signal
 import subprocess
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import IO, Protocol
+from types import TracebackType
+from typing import IO, Protocol, Self
 
 from ..errors import EncoderError, Error, InvalidArgument, MissingDependency
 from ..file_digests import file_sha256
@@ -34,6 +35,8 @@ _END_OF_STDERR = 2000
 _PIPE_SIZE = 1 << 20
 # An encoder that closed its input ends by itself; a wrapper script may not.
 _SECONDS_TO_DIE = 10.0
+# The libavutil of ffmpeg 5.1, which renamed an option; 9 took the old name away.
+_LIBAVUTIL_OF_FPS_MODE = (57, 28)
 
 
 def ffmpeg_executable() -> str:
@@ -61,17 +64,19 @@ def ffmpeg_executable() -> str:
 
 def ffmpeg_version() -> str:
     """Return the first line of `ffmpeg -version`."""
-    return _version(*_identity(ffmpeg_executable()))
+    return _version(*_identity()).partition("\n")[0].strip()
 
 
 def ffmpeg_sha256() -> str:
     """Return the sha256 of the ffmpeg binary, in hexadecimal; read once a process."""
-    return _sha256(*_identity(ffmpeg_executable()))
+    return _sha256(*_identity())
 
 
 def video_encoders() -> list[str]:
     """Return the names of the video encoders that this ffmpeg has."""
-    return list(_video_encoders(*_identity(ffmpeg_executable())))
+    listing = run_ffmpeg(["-hide_banner", "-encoders"]).decode()
+    _, _, table = listing.partition("------\n")
+    return re.findall(r"^ *V\S* +(\S+)", table, re.MULTILINE)
 
 
 def every_frame_arguments() -> tuple[str, ...]:
@@ -80,7 +85,15 @@ def every_frame_arguments() -> tuple[str, ...]:
     Left alone, ffmpeg fills gaps with copies and drops what comes too early, to make
     the rate even; in decoding, that hides what a file lacks or doubles.
     """
-    return _every_frame_arguments(*_identity(ffmpeg_executable()))
+    version = re.search(r"^libavutil +(\d+)\. *(\d+)", _version(*_identity()), re.M)
+    is_old = version and tuple(map(int, version.groups())) < _LIBAVUTIL_OF_FPS_MODE
+    return "-vsync" if is_old else "-fps_mode", "passthrough"
+
+
+def as_file(path: Path) -> str:
+    """Return a path as ffmpeg takes it for one, whatever is in it."""
+    # Without the prefix a colon in the name would make ffmpeg look for a protocol.
+    return f"file:{path}"
 
 
 def run_ffmpeg(
@@ -88,8 +101,8 @@ def run_ffmpeg(
     *,
     standard_input: bytes = b"",
     what: str = "ffmpeg failed.",
-) -> subprocess.CompletedProcess[bytes]:
-    """Run ffmpeg to its end and return what it wrote.
+) -> bytes:
+    """Run ffmpeg to its end and return what it wrote to its standard output.
 
     Args:
         arguments: those after the program's name.
@@ -100,33 +113,8 @@ def run_ffmpeg(
         EncoderError: its exit status is not 0, or it took longer than `patience_s`.
         Error: it could not be started, as `ffmpeg_executable` where that is its fault.
     """
-    command = [ffmpeg_executable(), *arguments]
-    patience = Patience()
-    try:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-            restore_signals=False,
-        )
-    except OSError as error:
-        raise _not_started(command[0], error) from error
-    with process:
-        try:
-            output, said = _communicate(process, standard_input, patience)
-        except BaseException:
-            _kill(process)
-            raise
-    if process.returncode != 0:
-        raise EncoderError(
-            _with_hanging(what, patience),
-            command=command,
-            returncode=process.returncode,
-            stderr=_text(said[-_END_OF_STDERR:]),
-        )
-    return subprocess.CompletedProcess(command, process.returncode, output, said)
+    with FfmpegProcess(arguments, what=what, reads=True, writes=True) as process:
+        return process.communicate(standard_input)
 
 
 class HasFileno(Protocol):
@@ -141,16 +129,20 @@ class FfmpegProcess:
 
     It runs in a session of its own: Ctrl-C in the terminal reaches only the parent,
     which decides. When the parent dies, ffmpeg sees the end of its input and finishes
-    its file by itself.
+    its file by itself. Leaving `with` ends it.
+
+    Each method that waits for it ends it when it has hung for `patience_s`: when it
+    takes no byte, gives none, or has all and does not write on in its file.
 
     Args:
         arguments: those after the program's name.
         what: what fails when it fails: the first sentence of the error.
         reads: whether it is fed through `write`.
         writes: whether it is read through `read`.
+        keeps: a file that it holds open.
 
-    Each method that waits for it ends it when it has hung for `patience_s`: when it
-    takes no byte, gives none, or has all and does not write on in its file.
+    Attributes:
+        command: the program and its arguments.
 
     Raises:
         Error: as `run_ffmpeg`, if it could not be started.
@@ -165,48 +157,40 @@ class FfmpegProcess:
         writes: bool = False,
         keeps: HasFileno | None = None,
     ) -> None:
+        self.command = [ffmpeg_executable(), *arguments]
         self._what = what
-        self._command = [ffmpeg_executable(), *arguments]
         self._patience = Patience()
-        # A file, not a pipe: nobody has to empty it while the process runs.
-        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  see release
-        try:
-            self._process = subprocess.Popen(
-                self._command,
-                stdin=subprocess.PIPE if reads else subprocess.DEVNULL,
-                stdout=subprocess.PIPE if writes else subprocess.DEVNULL,
-                stderr=self._stderr,
-                bufsize=0,
-                start_new_session=True,
-                # A file that would grow beyond a limit is an error that ffmpeg tells,
-                # not the end of it: Python ignores SIGXFSZ, and so does ffmpeg then.
-                restore_signals=False,
-                pass_fds=() if keeps is None else (keeps.fileno(),),
-            )
-        except BaseException as error:
-            self._stderr.close()
-            if isinstance(error, OSError):
-                raise _not_started(self._command[0], error) from error
-            raise
-        try:
-            self._enlarge_pipes()
-            if self._process.stdin is not None:
-                os.set_blocking(self._process.stdin.fileno(), False)
+        with contextlib.ExitStack() as on_failure:
+            try:
+                # A file, not a pipe: nobody has to empty it while the process runs.
+                self._stderr: IO[bytes] = on_failure.enter_context(
+                    tempfile.TemporaryFile()
+                )
+                self._process = subprocess.Popen(
+                    self.command,
+                    stdin=subprocess.PIPE if reads else subprocess.DEVNULL,
+                    stdout=subprocess.PIPE if writes else subprocess.DEVNULL,
+                    stderr=self._stderr,
+                    bufsize=0,
+                    start_new_session=True,
+                    # A file that would grow beyond a limit is an error that ffmpeg
+                    # tells, not the end of it: Python ignores SIGXFSZ, and so does
+                    # ffmpeg then.
+                    restore_signals=False,
+                    pass_fds=() if keeps is None else (keeps.fileno(),),
+                )
+            except OSError as error:
+                raise _not_started(self.command[0], error) from error
+            on_failure.callback(self.release)
+            on_failure.callback(self.kill)
+            self._prepare_pipes()
             _running.add(self)
-        except BaseException:
-            self.kill()
-            self.release()
-            raise
+            on_failure.pop_all()
 
     @property
     def pid(self) -> int:
         """The process's number."""
         return self._process.pid
-
-    @property
-    def command(self) -> list[str]:
-        """The program and its arguments."""
-        return list(self._command)
 
     def write(self, data: bytes | Frame) -> None:
         """Feed `data`, waiting until the pipe has taken all of it.
@@ -227,7 +211,8 @@ class FfmpegProcess:
                     self._wait_for(pipe, select.POLLOUT)
         except (OSError, ValueError) as error:
             # ValueError: the pipe was closed before.
-            raise self._died() from error
+            self._end_soon()
+            raise self._error() from error
 
     def read(self, size: int) -> bytes:
         """Return at most `size` bytes of output; none at its end.
@@ -240,6 +225,29 @@ class FfmpegProcess:
         self._wait_for(pipe, select.POLLIN)
         return pipe.read(size)
 
+    def communicate(self, data: bytes) -> bytes:
+        """Feed `data`, wait for the end, and return all output.
+
+        Raises:
+            EncoderError: the exit status is not 0, or it takes longer than
+                `patience_s`.
+        """
+        unsaid: bytes | None = data
+        output = b""
+
+        def has_ended(seconds: float) -> bool:
+            nonlocal unsaid, output
+            try:
+                output, _ = self._process.communicate(unsaid, timeout=seconds)
+            except subprocess.TimeoutExpired:
+                unsaid = None
+                return False
+            return True
+
+        self._wait_until(has_ended)
+        self.wait()
+        return output
+
     def end_input(self) -> None:
         """Say that nothing follows."""
         if self._process.stdin is not None:
@@ -251,25 +259,24 @@ class FfmpegProcess:
         Raises:
             EncoderError: the exit status is not 0, or it hangs.
         """
-        written = self._state_of_output()
-        self._patience.renew()
-        while not self._has_ended(self._patience.begin_slice()):
-            self._patience.end_slice()
-            if self._state_of_output() != written:
-                written = self._state_of_output()
-                self._patience.renew()
-            elif self._patience.is_over:
-                raise self._hung()
+        self._wait_until(self._has_ended, self._state_of_output)
         if self._process.returncode != 0:
             raise self._error()
 
     def kill(self) -> None:
-        """End the process at once, if it runs.
+        """End the process at once, with those that a wrapper script has started.
 
         The pipes stay open: a thread may be about to write, and the number of a closed
         one may be another file's by then.
         """
-        _kill(self._process)
+        if self._process.poll() is None:
+            # It leads a group of its own. Not more than the process may have ended.
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.pid, signal.SIGKILL)
+            self._process.kill()
+        # One whose disk does not answer cannot die.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_SECONDS_TO_DIE)
 
     def release(self) -> None:
         """Close the pipes of a process that has ended, once no thread uses them."""
@@ -286,25 +293,57 @@ class FfmpegProcess:
         for pipe in self._pipes():
             pipe.close()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.kill()
+        self.release()
+
     def _pipes(self) -> list[IO[bytes]]:
         return [pipe for pipe in (self._process.stdin, self._process.stdout) if pipe]
 
-    def _enlarge_pipes(self) -> None:
+    def _prepare_pipes(self) -> None:
         for pipe in self._pipes():
             # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More is
             # a favour that the kernel may refuse.
             with contextlib.suppress(OSError):
                 fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
+        if self._process.stdin is not None:
+            os.set_blocking(self._process.stdin.fileno(), False)
 
     def _wait_for(self, pipe: IO[bytes], event: int) -> None:
         """Wait until a pipe is ready, or closed at the other end."""
         poll = select.poll()
         poll.register(pipe, event)
+        self._wait_until(lambda seconds: bool(poll.poll(1000 * seconds)))
+
+    def _wait_until(
+        self,
+        is_ready: Callable[[float], bool],
+        state: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Wait, and end the process if there is no progress for too long.
+
+        Args:
+            is_ready: waits at most so many seconds for what is waited for.
+            state: returns what changes as long as there is progress.
+        """
+        last = state()
         self._patience.renew()
-        while not poll.poll(1000 * self._patience.begin_slice()):
+        while not is_ready(self._patience.begin_slice()):
             self._patience.end_slice()
-            if self._patience.is_over:
-                raise self._hung()
+            if (now := state()) != last:
+                last = now
+                self._patience.renew()
+            elif self._patience.is_over:
+                self.kill()
+                raise self._error()
 
     def _has_ended(self, seconds: float) -> bool:
         """Wait for the end, so long at most, and return whether it has come."""
@@ -313,8 +352,8 @@ class FfmpegProcess:
             descriptor = os.pidfd_open(self.pid)
         except OSError:
             # It was waited for before, or the system knows no such thing.
-            descriptor = None
-        if descriptor is not None:
+            pass
+        else:
             try:
                 select.select([descriptor], [], [], seconds)
             finally:
@@ -326,38 +365,35 @@ class FfmpegProcess:
 
     def _state_of_output(self) -> tuple[int, int]:
         """Return what changes while it writes its file; as one, where it has none."""
-        protocol, _, path = self._command[-1].partition(":")
-        if protocol != "file":
-            return 0, 0
-        try:
-            status = Path(path).stat()
-        except OSError:
-            return 0, 0
-        return status.st_size, status.st_mtime_ns
+        protocol, _, path = self.command[-1].partition(":")
+        if protocol == "file":
+            with contextlib.suppress(OSError):
+                status = Path(path).stat()
+                return status.st_size, status.st_mtime_ns
+        return 0, 0
 
-    def _hung(self) -> EncoderError:
-        _kill(self._process)
-        return self._error()
-
-    def _died(self) -> EncoderError:
+    def _end_soon(self) -> None:
+        """Wait for the end of a process that has closed its input."""
         try:
             self._process.wait(_SECONDS_TO_DIE)
         except subprocess.TimeoutExpired:
-            _kill(self._process)
-        return self._error()
+            self.kill()
 
     def _error(self) -> EncoderError:
-        return EncoderError(
-            _with_hanging(self._what, self._patience),
-            command=self._command,
-            returncode=self._process.returncode,
-            stderr=self._end_of_stderr(),
-        )
-
-    def _end_of_stderr(self) -> str:
+        what = self._what
+        if self._patience.is_over:
+            what += (
+                f" It made no progress for {self._patience.seconds:g} seconds, and was "
+                "ended."
+            )
         size = self._stderr.seek(0, os.SEEK_END)
         self._stderr.seek(max(0, size - _END_OF_STDERR))
-        return _text(self._stderr.read())
+        return EncoderError(
+            what,
+            command=self.command,
+            returncode=self._process.returncode,
+            stderr=_text(self._stderr.read()),
+        )
 
 
 _running: weakref.WeakSet[FfmpegProcess] = weakref.WeakSet()
@@ -371,51 +407,16 @@ def _close_pipes_after_fork() -> None:
 os.register_at_fork(after_in_child=_close_pipes_after_fork)
 
 
-def _communicate(
-    process: subprocess.Popen[bytes], standard_input: bytes, patience: Patience
-) -> tuple[bytes, bytes]:
-    """Return what a process writes and says, once it has ended or was ended."""
-    unsaid: bytes | None = standard_input
-    while not patience.is_over:
-        try:
-            return process.communicate(unsaid, timeout=patience.begin_slice())
-        except subprocess.TimeoutExpired:
-            unsaid = None
-            patience.end_slice()
-    _kill(process)
-    # What it has said before.
-    return process.communicate()
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End a process at once, with those that a wrapper script has started."""
-    if process.poll() is None:
-        # It leads a group of its own. Not more than the process may have ended.
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.kill()
-    # One whose disk does not answer cannot die.
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(_SECONDS_TO_DIE)
-
-
-def _with_hanging(what: str, patience: Patience) -> str:
-    if not patience.is_over:
-        return what
-    return (
-        f"{what} It made no progress for {patience.seconds:g} seconds, and was ended."
-    )
-
-
-def _identity(executable: str) -> tuple[str, int, int]:
+def _identity() -> tuple[str, int, int]:
     """Return what changes when the binary changes, as a key for the caches below."""
+    executable = ffmpeg_executable()
     status = Path(executable).stat()
     return executable, status.st_size, status.st_mtime_ns
 
 
 @functools.lru_cache
 def _version(executable: str, size: int, modified: int) -> str:
-    return _text(run_ffmpeg(["-version"]).stdout).partition("\n")[0].strip()
+    return _text(run_ffmpeg(["-version"]))
 
 
 @functools.lru_cache
@@ -423,27 +424,10 @@ def _sha256(executable: str, size: int, modified: int) -> str:
     return file_sha256(Path(executable))
 
 
-@functools.lru_cache
-def _video_encoders(executable: str, size: int, modified: int) -> tuple[str, ...]:
-    listing = _text(run_ffmpeg(["-hide_banner", "-encoders"]).stdout)
-    _, _, table = listing.partition("------\n")
-    return tuple(re.findall(r"^ *V\S* +(\S+)", table, re.MULTILINE))
-
-
-@functools.lru_cache
-def _every_frame_arguments(
-    executable: str, size: int, modified: int
-) -> tuple[str, ...]:
-    # 5.1 brought the first, 9 took the second away.
-    options = _text(run_ffmpeg(["-hide_banner", "-h", "long"]).stdout)
-    name = "-fps_mode" if "-fps_mode" in options else "-vsync"
-    return name, "passthrough"
-
-
 def _not_started(executable: str, error: OSError) -> Error:
-    # The name is there only where the program itself is to blame, and not a lack of
+    # Its name is there only where the program itself is to blame, and not a lack of
     # memory, processes or open files.
-    if error.filename is None:
+    if error.filename != executable:
         return Error(f"ffmpeg ({executable}) could not be started: {error}.")
     return _unusable(executable, error.strerror)
 

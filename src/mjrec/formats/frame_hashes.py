@@ -33,7 +33,7 @@ from typing import TextIO
 
 import numpy as np
 
-from ..atomic_files import replacing, temporary_path
+from ..atomic_files import replacing
 from ..errors import DirectoryNotWritable, FileNotWritten
 from ..frames import Frame
 
@@ -62,16 +62,16 @@ def frame_hash_line(number: int, frame: Frame) -> str:
 
 
 class FrameHashFile:
-    """A `.framehash` file in the making: complete, or not there.
+    """A `.framehash` file in the making, under a temporary name.
 
     A line is with the operating system before the next one: what of it a killed process
     leaves is true of the frames that its encoder had been given.
 
     Args:
-        path: its final name.
+        path: the temporary name.
+        final: the name that it will have, for errors.
         size: `(height, width)` of the frames.
         fps: frames per second.
-        temporary: its name until then; a new one, if None.
 
     Every method raises `FileNotWritten` when the disk is full, or a quota or a limit on
     files' sizes is reached, and `DirectoryNotWritable` when the file cannot be written
@@ -79,61 +79,46 @@ class FrameHashFile:
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        size: tuple[int, int],
-        fps: Fraction,
-        temporary: Path | None = None,
+        self, path: Path, *, final: Path, size: tuple[int, int], fps: Fraction
     ) -> None:
         self._path = path
-        self._temporary = temporary or temporary_path(path)
+        self._final = final
         self._frame_count = 0
-        with self._naming_the_directory():
-            self._file: TextIO = self._temporary.open(
-                "w", encoding="ascii", buffering=1
-            )
+        height, width = size
+        with self._naming_the_file():
+            self._file: TextIO = path.open("w", encoding="ascii", buffering=1)
             try:
-                self._file.write(
-                    frame_hash_header(height=size[0], width=size[1], fps=fps)
-                )
+                self._file.write(frame_hash_header(height=height, width=width, fps=fps))
             except BaseException:
                 self.abort()
                 raise
 
     def add(self, frame: Frame) -> None:
         """Write the next frame's line."""
-        with self._naming_the_directory():
+        with self._naming_the_file():
             self._file.write(frame_hash_line(self._frame_count, frame))
         self._frame_count += 1
 
     def close(self) -> None:
         """Close the file, which keeps its temporary name. May be called again."""
-        with self._naming_the_directory():
+        with self._naming_the_file():
             self._file.close()
-
-    def finish(self) -> None:
-        """Give the file its name. May be called again."""
-        self.close()
-        with self._naming_the_directory():
-            if self._temporary.exists():
-                self._temporary.replace(self._path)
 
     def abort(self) -> None:
         """Leave nothing."""
         # What cannot be written any more need not be.
         with contextlib.suppress(OSError):
             self._file.close()
-        self._temporary.unlink(missing_ok=True)
+        self._path.unlink(missing_ok=True)
 
     @contextlib.contextmanager
-    def _naming_the_directory(self) -> Iterator[None]:
+    def _naming_the_file(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
             if error.errno in _NO_ROOM:
-                raise FileNotWritten(self._path, error.strerror) from error
-            raise DirectoryNotWritable(self._path.parent, error) from error
+                raise FileNotWritten(self._final, error.strerror) from error
+            raise DirectoryNotWritable(self._final.parent, error) from error
 
 
 def cut_frame_hashes(path: Path, count: int) -> None:

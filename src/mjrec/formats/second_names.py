@@ -18,7 +18,7 @@ import itertools
 import logging
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ..atomic_files import temporary_path
@@ -123,23 +123,23 @@ def _link(file: Path, link: Path) -> None:
                 file.name,
             )
         return
-    try:
-        link.hardlink_to(file)
-    except FileExistsError:
-        # Somebody else was quicker.
-        return
-    except OSError:
-        _link_otherwise(file, link)
-
-
-def _link_otherwise(file: Path, link: Path) -> None:
-    """Make a symbolic link, or a copy where the file system knows no links at all."""
-    try:
-        link.symlink_to(file.name)
-    except FileExistsError:
-        return
-    except OSError:
-        _copy(file, link)
+    ways: tuple[Callable[[], object], ...] = (
+        lambda: link.hardlink_to(file),
+        lambda: link.symlink_to(file.name),
+        # Where the file system knows no links at all.
+        lambda: _copy(file, link),
+    )
+    for way in ways:
+        try:
+            way()
+        except FileExistsError:
+            # Somebody else was quicker.
+            return
+        except OSError as error:
+            failure = error
+        else:
+            return
+    raise failure
 
 
 def _copy(file: Path, link: Path) -> None:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A video under its temporary name: what it is, and how it gets its final one.
 
-Whoever encodes a video finishes it so; and whoever finds one that a dead process left
-does the same. What the finder needs to know stands in a note beside it, a hidden file
+The writer of a video finishes it so; and so does the finder of one that a dead process
+left. What the finder needs to know stands in a note beside it, a hidden file
 `.<name of the video>.note.part`, which is there before the video is.
 
-The hidden file is locked as long as somebody writes it: the process that feeds ffmpeg,
-or ffmpeg, which goes on to the end of its file when that process dies.
+The hidden video is locked as long as it is written: by the process that feeds ffmpeg,
+and by ffmpeg, which goes on to the end of its file when that process dies.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -24,7 +24,7 @@ from ..atomic_files import write_text
 from ..errors import DirectoryNotWritable
 from ..file_digests import file_sha256
 from ..json_text import dumps
-from .ffmpeg import FfmpegProcess, every_frame_arguments
+from .ffmpeg import FfmpegProcess, as_file, every_frame_arguments
 from .frame_hashes import cut_frame_hashes, frame_hash_path
 from .json_fields import (
     field,
@@ -43,63 +43,24 @@ _LARGEST_SIDE = 1 << 16
 _LONGEST_NOTE = 1 << 24
 
 
-@dataclass(frozen=True)
-class VideoFile:
-    """A finished video.
+@dataclass(frozen=True, kw_only=True)
+class EncodedVideo:
+    """What is known of a video from its first frame on.
 
     Attributes:
-        path: the file.
-        frame_count: how many frames it holds, counted by decoding it.
+        path: the file, by its final name.
         height: of a frame as it was written, in pixels.
         width: of a frame as it was written, in pixels.
-        padded_height: the file's, even where the codec needs it.
-        padded_width: the file's, even where the codec needs it.
         fps: frames per second.
         codec: ffmpeg's name of the encoder.
         pixel_format: ffmpeg's name of the encoded pixels' format.
-        file_sha256: of the file's bytes.
-        decoded_sha256: of the decoded frames, one after the other: the planes Y, U, V
-            for yuv420p, else rgb24.
-        frame_hash_path: the `.framehash` file, if one was asked for.
         encoder: `ffmpeg` (the binary's base name), `version` (its first line),
-            `sha256` (the binary's) and `arguments` (all of them; the output file is
-            its base name, so that they stay true when the directory moves).
+            `sha256` (the binary's; None where it is not known yet) and `arguments`
+            (all of them; the output file is its base name, so that they stay true when
+            the directory moves).
     """
 
     path: Path
-    frame_count: int
-    height: int
-    width: int
-    padded_height: int
-    padded_width: int
-    fps: Fraction
-    codec: str
-    pixel_format: str
-    file_sha256: str
-    decoded_sha256: str
-    frame_hash_path: Path | None
-    encoder: dict[str, Any]
-
-
-@dataclass(frozen=True, kw_only=True)
-class UnfinishedVideo:
-    """A video that is being encoded, or was.
-
-    Attributes:
-        path: its final name.
-        temporary: the file now.
-        hashes: its frame hashes now; None where there are to be none.
-        height: of a frame, in pixels.
-        width: of a frame, in pixels.
-        fps: frames per second.
-        codec: ffmpeg's name of the encoder.
-        pixel_format: ffmpeg's name of the encoded pixels' format.
-        encoder: as `VideoFile` has it; `sha256` is None where nobody knows it yet.
-    """
-
-    path: Path
-    temporary: Path
-    hashes: Path | None
     height: int
     width: int
     fps: Fraction
@@ -108,14 +69,45 @@ class UnfinishedVideo:
     encoder: Mapping[str, Any]
 
     @property
-    def padded(self) -> tuple[int, int]:
-        """Height and width in the file."""
-        return self.height + self.height % 2, self.width + self.width % 2
+    def padded_height(self) -> int:
+        """The file's, even where the codec needs it."""
+        return self.height + self.height % 2
 
     @property
-    def decoded_format(self) -> str:
-        """The pixel format in which the finished file's frames are hashed."""
-        return "yuv420p" if self.pixel_format == "yuv420p" else "rgb24"
+    def padded_width(self) -> int:
+        """The file's, even where the codec needs it."""
+        return self.width + self.width % 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoFile(EncodedVideo):
+    """A finished video.
+
+    Attributes:
+        frame_count: how many frames it holds, counted by decoding it.
+        file_sha256: of the file's bytes.
+        decoded_sha256: of the decoded frames, one after the other: the planes Y, U, V
+            for yuv420p, else rgb24.
+        frame_hash_path: the `.framehash` file, if one was asked for.
+    """
+
+    frame_count: int
+    file_sha256: str
+    decoded_sha256: str
+    frame_hash_path: Path | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnfinishedVideo(EncodedVideo):
+    """A video that is being encoded, or was.
+
+    Attributes:
+        temporary: the file now.
+        hashes: its frame hashes now; None where there are to be none.
+    """
+
+    temporary: Path
+    hashes: Path | None
 
     def check(self) -> VideoFile:
         """Return what the file holds, as if it had its final name already.
@@ -124,24 +116,13 @@ class UnfinishedVideo:
             EncoderError: it cannot be decoded to its end.
         """
         source = self.temporary if self.temporary.exists() else self.path
-        height, width = self.padded
-        frame_count, digest = _decode(
-            source, pixel_format=self.decoded_format, size=self.padded
-        )
+        frame_count, digest = self._decode(source)
         return VideoFile(
-            path=self.path,
+            **{f.name: getattr(self, f.name) for f in dataclasses.fields(EncodedVideo)},
             frame_count=frame_count,
-            height=self.height,
-            width=self.width,
-            padded_height=height,
-            padded_width=width,
-            fps=self.fps,
-            codec=self.codec,
-            pixel_format=self.pixel_format,
             file_sha256=file_sha256(source),
             decoded_sha256=digest,
             frame_hash_path=None if self.hashes is None else frame_hash_path(self.path),
-            encoder=dict(self.encoder),
         )
 
     def rename(self, file: VideoFile, *, cut: bool = False) -> None:
@@ -161,7 +142,12 @@ class UnfinishedVideo:
                 frame_hash_path(self.path).unlink(missing_ok=True)
             elif self.hashes is not None and self.hashes.exists():
                 self._rename_hashes(self.hashes, file.frame_count if cut else None)
-            self._replace(file)
+            try:
+                self.temporary.replace(self.path)
+            except FileNotFoundError:
+                # An earlier call may have been interrupted just after it had done this.
+                if file_sha256(self.path) != file.file_sha256:
+                    raise
         except OSError as error:
             raise DirectoryNotWritable(self.path.parent, error) from error
 
@@ -175,13 +161,27 @@ class UnfinishedVideo:
         else:
             hashes.replace(frame_hash_path(self.path))
 
-    def _replace(self, file: VideoFile) -> None:
-        try:
-            self.temporary.replace(self.path)
-        except FileNotFoundError:
-            # An earlier call may have been interrupted just after it had done this.
-            if file_sha256(self.path) != file.file_sha256:
-                raise
+    def _decode(self, source: Path) -> tuple[int, str]:
+        """Return how many frames the file holds and the sha256 of all of them."""
+        pixel_format = "rgb24"
+        frame_bytes = 3 * self.padded_height * self.padded_width
+        if self.pixel_format == "yuv420p":
+            pixel_format, frame_bytes = "yuv420p", frame_bytes // 2
+        arguments = [
+            *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
+            # More would take a third more of the CPUs, which others are drawing with.
+            *("-threads", "1", "-filter_threads", "1"),
+            *("-i", as_file(source), "-map", "0:v:0", *every_frame_arguments()),
+            *("-f", "rawvideo", "-pix_fmt", pixel_format, "pipe:1"),
+        ]
+        what = f"The finished video {source} cannot be decoded."
+        digest, total = hashlib.sha256(), 0
+        with FfmpegProcess(arguments, what=what, writes=True) as process:
+            while block := process.read(_READ_SIZE):
+                digest.update(block)
+                total += len(block)
+            process.wait()
+        return -(-total // frame_bytes), digest.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -214,17 +214,14 @@ def write_note(note: VideoNote) -> None:
         FileNotWritten: the disk is full, or the directory is gone.
     """
     video = {
-        f.name: getattr(note.video, f.name) for f in dataclasses.fields(note.video)
+        key: value.name if isinstance(value, Path) else value
+        for key, value in vars(note.video).items()
     }
-    for name in ("path", "temporary", "hashes"):
-        video[name] = None if video[name] is None else video[name].name
-    video["fps"] = str(note.video.fps)
-    video["encoder"] = dict(note.video.encoder)
+    timestep = note.timing["timestep"]
     content = {
-        "video": video,
-        "metadata": dict(note.metadata),
-        "timing": dict(note.timing),
-        "ffmpeg_size": note.ffmpeg_size,
+        **vars(note),
+        "video": {**video, "fps": str(note.video.fps)},
+        "timing": {**note.timing, "timestep": timestep and str(timestep)},
     }
     write_text(note_path(note.video.path), dumps(content))
 
@@ -239,114 +236,58 @@ def read_note(path: Path) -> VideoNote:
         if path.is_file() and path.stat().st_size > _LONGEST_NOTE:
             raise ValueError("it is too long for a note")
         values = read_object(path)
-        note = VideoNote(
+        timing = field(values, "timing", mapping)
+        return VideoNote(
             video=_video(path, field(values, "video", mapping)),
             metadata=field(values, "metadata", mapping),
-            timing=field(values, "timing", _timing),
+            timing={
+                "timestep": field(timing, "timestep", optional(rate)),
+                "stride": field(timing, "stride", _count),
+                "frames_per_step": field(timing, "frames_per_step", _count),
+            },
             ffmpeg_size=field(values, "ffmpeg_size", integer),
         )
-        if note_path(note.video.path) != path:
-            raise ValueError("it belongs to another video")
-        return note
 
 
 def _video(note: Path, values: Mapping[str, Any]) -> UnfinishedVideo:
-    name = field(values, "path", text)
-    hidden = _hidden_of(name)
-    hashes = field(values, "hashes", optional(_hidden_of(_hashes_of(name))))
+    path = note.with_name(field(values, "path", text))
+    if note_path(path) != note:
+        raise ValueError("it belongs to another video")
+    encoder = field(values, "encoder", mapping)
+    hashes = field(values, "hashes", optional(text))
     return UnfinishedVideo(
-        path=note.with_name(name),
-        temporary=note.with_name(field(values, "temporary", hidden)),
-        hashes=None if hashes is None else note.with_name(hashes),
+        path=path,
+        temporary=_hidden(path, field(values, "temporary", text)),
+        hashes=None if hashes is None else _hidden(frame_hash_path(path), hashes),
         height=field(values, "height", _side),
         width=field(values, "width", _side),
         fps=field(values, "fps", rate),
         codec=field(values, "codec", text),
         pixel_format=field(values, "pixel_format", text),
-        encoder=field(values, "encoder", _encoder),
+        encoder={
+            "ffmpeg": field(encoder, "ffmpeg", text),
+            "version": field(encoder, "version", text),
+            "sha256": field(encoder, "sha256", optional(text), default=None),
+            "arguments": list(field(encoder, "arguments", list_of(text))),
+        },
     )
 
 
-def _hashes_of(video: str) -> str:
-    return frame_hash_path(Path(video)).name
-
-
-def _hidden_of(final: str) -> Callable[[Any], str]:
-    pattern = re.compile(rf"\.{re.escape(final)}\.[0-9a-f]{{8}}\.part")
-
-    def hidden(value: Any) -> str:
-        if not pattern.fullmatch(text(value)):
-            raise ValueError(f"{value!r:.200} is no temporary name of {final!r:.200}")
-        return str(value)
-
-    return hidden
+def _hidden(final: Path, name: str) -> Path:
+    if not re.fullmatch(rf"\.{re.escape(final.name)}\.[0-9a-f]{{8}}\.part", name):
+        raise ValueError(f"{name!r:.200} is no temporary name of {final.name!r:.200}")
+    return final.with_name(name)
 
 
 def _side(value: Any) -> int:
-    side = integer(value)
-    if not 1 <= side <= _LARGEST_SIDE:
-        raise ValueError(f"{side!r:.80} is no number of pixels")
-    return side
-
-
-def _encoder(value: Any) -> Mapping[str, Any]:
-    values = mapping(value)
-    return {
-        "ffmpeg": field(values, "ffmpeg", text),
-        "version": field(values, "version", text),
-        "sha256": field(values, "sha256", optional(text), default=None),
-        "arguments": list(field(values, "arguments", list_of(text))),
-    }
-
-
-def _timing(value: Any) -> Mapping[str, Any]:
-    values = mapping(value)
-    return {
-        "timestep": field(values, "timestep", optional(rate)),
-        "stride": field(values, "stride", _count),
-        "frames_per_step": field(values, "frames_per_step", _count),
-    }
+    return _number(value, most=_LARGEST_SIDE)
 
 
 def _count(value: Any) -> int:
-    count = integer(value)
-    if not 1 <= count <= 1 << 40:
-        raise ValueError(f"{count!r:.80} is no count")
-    return count
+    return _number(value, most=1 << 40)
 
 
-def _decode(
-    video: Path, *, pixel_format: str, size: tuple[int, int]
-) -> tuple[int, str]:
-    """Return how many frames a file holds and the sha256 of all of them."""
-    process = FfmpegProcess(
-        [
-            *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
-            *("-i", as_file(video), "-map", "0:v:0", *every_frame_arguments()),
-            *("-f", "rawvideo", "-pix_fmt", pixel_format, "pipe:1"),
-        ],
-        what=f"The finished video {video} cannot be decoded.",
-        writes=True,
-    )
-    try:
-        digest = hashlib.sha256()
-        total = 0
-        while block := process.read(_READ_SIZE):
-            digest.update(block)
-            total += len(block)
-        process.wait()
-    finally:
-        process.kill()
-        process.release()
-    height, width = size
-    frame_bytes = height * width * 3
-    if pixel_format == "yuv420p":
-        frame_bytes //= 2
-    frame_count, rest = divmod(total, frame_bytes)
-    return frame_count + bool(rest), digest.hexdigest()
-
-
-def as_file(path: Path) -> str:
-    """Return a path as ffmpeg takes it for one, whatever is in it."""
-    # Without the prefix a colon in the name would make ffmpeg look for a protocol.
-    return f"file:{path}"
+def _number(value: Any, *, most: int) -> int:
+    if not 1 <= integer(value) <= most:
+        raise ValueError(f"{value!r:.80} is no number from 1 to {most}")
+    return int(value)

@@ -9,11 +9,13 @@ besides: of the episode, of the pictures, of what went wrong.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+from .. import json_text
+from ..atomic_files import write_text
 from .json_fields import read_object
 from .unfinished_video import VideoFile
 
@@ -112,6 +114,15 @@ def file_facts(file: VideoFile) -> dict[str, Any]:
 def metadata_path(video: Path) -> Path:
     """Return the name of the metadata file of a video."""
     return video.with_suffix(".meta.json")
+
+
+def write_metadata(video: Path, metadata: Mapping[str, Any]) -> None:
+    """Write the metadata file of a video.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone.
+    """
+    write_text(metadata_path(video), json_text.dumps(metadata))
 
 
 def finished_videos(video: Path) -> list[tuple[str, str]]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import enum
 import numbers
 import os
 import tempfile
@@ -19,7 +18,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -33,20 +32,17 @@ from ..errors import (
 from ..frames import Frame, check_frame, check_size, pad_to_even
 from ..rates import to_rate
 from ..worker_thread import WorkerThread
-from .encoder_settings import (
-    MUXERS,
-    encoder_settings,
-    try_encoding,
-)
+from .encoder_settings import MUXERS, encoder_settings, try_encoding
 from .ffmpeg import (
     FfmpegProcess,
+    as_file,
     ffmpeg_executable,
     ffmpeg_sha256,
     ffmpeg_version,
 )
 from .frame_hashes import FrameHashFile, frame_hash_path
 from .locks import Lock
-from .unfinished_video import UnfinishedVideo, VideoFile, as_file
+from .unfinished_video import UnfinishedVideo, VideoFile
 
 # ffmpeg takes no larger number, above or below, for a rate as a fraction: given one, it
 # silently takes the nearest fraction that fits.
@@ -54,14 +50,8 @@ _MAX_RATE_TERM = 10**6
 _QUEUED_BYTES = 32 << 20
 _MAX_QUEUED_FRAMES = 64
 
-
-class _State(enum.Enum):
-    """How far a video is; the two in the middle last only after an interruption."""
-
-    OPEN = "open"
-    FINISHING = "not finished"
-    ABORTING = "given up"
-    CLOSED = "closed"
+# How far a video is. The two in the middle last only after an interruption.
+_OPEN, _FINISHING, _GIVEN_UP, _CLOSED = "open", "not finished", "given up", "closed"
 
 
 class VideoWriter:
@@ -98,6 +88,7 @@ class VideoWriter:
     Attributes:
         path: the file.
         fps: as a `Fraction`.
+        frame_count: how many frames were written so far.
         result: what was written, once closed; None without frames.
 
     Raises:
@@ -118,9 +109,10 @@ class VideoWriter:
         frame_hashes: bool = False,
         encoder_arguments: Sequence[str] = (),
     ) -> None:
-        self._state = _State.CLOSED
+        self._state = _CLOSED
         self._encoding: _Encoding | None = None
         self.result: VideoFile | None = None
+        self.frame_count = 0
         self.path = _check_path(path)
         self.fps = _check_fps(fps)
         self._settings = encoder_settings(
@@ -130,23 +122,16 @@ class VideoWriter:
             encoder_arguments=encoder_arguments,
         )
         self._temporary = temporary_path(self.path)
-        self._temporary_hashes = (
-            temporary_path(frame_hash_path(self.path)) if frame_hashes else None
-        )
+        hashes = temporary_path(frame_hash_path(self.path))
+        self._temporary_hashes = hashes if frame_hashes else None
         try_encoding(ffmpeg_executable(), self._settings, self.fps)
-        self._frame_count = 0
         self._process_id = os.getpid()
-        self._state = _State.OPEN
-
-    @property
-    def frame_count(self) -> int:
-        """How many frames were written so far."""
-        return self._frame_count
+        self._state = _OPEN
 
     @property
     def closed(self) -> bool:
         """Whether the file is finished or given up."""
-        return self._state is _State.CLOSED
+        return self._state == _CLOSED
 
     def write(self, frame: Frame) -> None:
         """Add a frame, a `(height, width, 3) uint8` array; the first fixes the size.
@@ -156,30 +141,36 @@ class VideoWriter:
 
         Raises:
             InvalidFrame: it is no such array; the writer stays usable.
-            ClosedError: after `close` or `abort`.
+            ClosedError: after `close` or `abort`, or in a forked process.
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
         """
-        if self._state is not _State.OPEN:
+        if self._state != _OPEN:
             raise ClosedError(
-                f"The video {self.path} is {self._state.value} after "
-                f"{self._frame_count} frames; a file cannot be reopened: write another "
-                "one."
+                f"The video {self.path} is {self._state} after {self.frame_count} "
+                "frames; a file cannot be reopened: write another one."
             )
-        self._check_process()
-        started = self._encoding
-        checked = check_frame(frame, size=started.size if started else None)
+        if self._was_forked():
+            raise ClosedError(
+                f"The video {self.path} belongs to process {self._process_id}, from "
+                "which this one was forked: write it there, or another one here."
+            )
+        size = self._encoding.size if self._encoding else None
+        checked = check_frame(frame, size=size)
         check_size(*checked.shape[:2])
         try:
-            encoding = started or self._start(checked)
+            if self._encoding is None:
+                self._encoding = _Encoding(self.unfinished(*checked.shape[:2]))
             # A plain copy in rows from top to bottom, whatever the view was.
-            encoding.worker.put(np.array(checked, order="C", copy=True, subok=False))
+            frame = np.array(checked, order="C", copy=True, subok=False)
+            self._encoding.worker.put(frame)
         except BaseException as error:
             # Ctrl-C while it waits for room costs nothing. Where there is no thread it
             # may come in the midst of a frame, which costs the video.
-            if isinstance(error, Exception) or self._has_failed():
+            has_failed = self._encoding is not None and self._encoding.worker.failed
+            if isinstance(error, Exception) or has_failed:
                 self.abort()
             raise
-        self._frame_count += 1
+        self.frame_count += 1
 
     def unfinished(self, height: int, width: int) -> UnfinishedVideo:
         """Return what the file is until it is finished.
@@ -188,6 +179,12 @@ class VideoWriter:
             height: of a frame, in pixels.
             width: of a frame, in pixels.
         """
+        arguments = self._settings.arguments(
+            height=height + height % 2,
+            width=width + width % 2,
+            fps=self.fps,
+            output=self.path.name,
+        )
         return UnfinishedVideo(
             path=self.path,
             temporary=self._temporary,
@@ -197,7 +194,13 @@ class VideoWriter:
             fps=self.fps,
             codec=self._settings.codec,
             pixel_format=self._settings.pixel_format,
-            encoder=self._encoder(height, width),
+            encoder={
+                "ffmpeg": Path(ffmpeg_executable()).name,
+                "version": ffmpeg_version(),
+                # Reading the whole program takes a while, and is not for the beginning.
+                "sha256": None,
+                "arguments": arguments,
+            },
         )
 
     def close(self) -> None:
@@ -212,12 +215,12 @@ class VideoWriter:
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
             FrameCountError: the file does not hold the frames that were written.
         """
-        if self._state is _State.ABORTING:
+        if self._state == _GIVEN_UP:
             self.abort()
-        if self._state is _State.CLOSED:
+        if self._state == _CLOSED:
             return
         if self._encoding is not None and not self._was_forked():
-            self._state = _State.FINISHING
+            self._state = _FINISHING
             try:
                 self.result = self._encoding.finish()
             except Exception:
@@ -225,19 +228,19 @@ class VideoWriter:
                 raise
             if self.result is None:
                 return
-        self._state = _State.CLOSED
+        self._state = _CLOSED
 
     def abort(self) -> None:
         """Stop at once and leave nothing; an older file of that name stays.
 
         Idempotent; may be called again after Ctrl-C interrupted it.
         """
-        if self._state is _State.CLOSED:
+        if self._state == _CLOSED:
             return
-        self._state = _State.ABORTING
+        self._state = _GIVEN_UP
         if self._encoding is not None and not self._was_forked():
             self._encoding.abort()
-        self._state = _State.CLOSED
+        self._state = _CLOSED
 
     def __enter__(self) -> Self:
         return self
@@ -265,7 +268,7 @@ class VideoWriter:
         self._encoding.leave()
         warnings.warn(
             f"The VideoWriter of {self.path} was never closed; its frames are in "
-            f"{self._encoding.temporary}. Use it in a with statement.",
+            f"{self._temporary}. Use it in a with statement.",
             ResourceWarning,
             source=self,
             stacklevel=2,
@@ -274,69 +277,51 @@ class VideoWriter:
     def __repr__(self) -> str:
         return (
             f"<{type(self).__name__} {str(self.path)!r} fps={self.fps} "
-            f"codec={self._settings.codec} {self._state.value}, "
-            f"{self._frame_count} frames>"
+            f"codec={self._settings.codec} {self._state}, {self.frame_count} frames>"
         )
 
     def _was_forked(self) -> bool:
         """Tell whether this is a forked child's copy: the video is the parent's."""
         return os.getpid() != self._process_id
 
-    def _check_process(self) -> None:
-        if self._was_forked():
-            raise ClosedError(
-                f"The video {self.path} belongs to process {self._process_id}, from "
-                "which this one was forked: write it there, or another one here."
-            )
-
-    def _has_failed(self) -> bool:
-        return self._encoding is not None and self._encoding.worker.failed
-
-    def _start(self, first: Frame) -> _Encoding:
-        height, width = first.shape[:2]
-        unfinished = self.unfinished(height, width)
-        self._encoding = _Encoding(
-            unfinished, self._arguments(unfinished.padded, as_file(self._temporary))
-        )
-        return self._encoding
-
-    def _arguments(self, padded: tuple[int, int], output: str) -> list[str]:
-        height, width = padded
-        return self._settings.arguments(
-            height=height, width=width, fps=self.fps, output=output
-        )
-
-    def _encoder(self, height: int, width: int) -> dict[str, Any]:
-        padded = height + height % 2, width + width % 2
-        return {
-            "ffmpeg": Path(ffmpeg_executable()).name,
-            "version": ffmpeg_version(),
-            # Reading the whole program takes a while, and is not for the beginning.
-            "sha256": None,
-            "arguments": self._arguments(padded, self.path.name),
-        }
-
 
 class _Encoding:
     """A video in the making: ffmpeg, the thread that feeds it, temporary files."""
 
-    def __init__(self, unfinished: UnfinishedVideo, arguments: list[str]) -> None:
-        self.size = (unfinished.height, unfinished.width)
-        self.temporary = unfinished.temporary
-        self._unfinished = unfinished
-        self._path = unfinished.path
+    def __init__(self, video: UnfinishedVideo) -> None:
+        self.size = (video.height, video.width)
+        self.temporary = video.temporary
+        self._video = video
         self._encoded = 0
         self._input_ended = False
         self._result: VideoFile | None = None
+        self._hashes: FrameHashFile | None = None
         with contextlib.ExitStack() as on_failure:
-            # First of all: what is not held may be swept up.
-            self._hold = self._hold_file()
-            on_failure.callback(self._hold.release)
-            self._hashes = self._open_hashes()
-            on_failure.callback(self._abort_hashes)
-            self._process = self._start_ffmpeg(arguments)
+            # First of all: what is not locked may be swept up.
+            self._lock = _locked(video)
+            on_failure.callback(self._lock.release)
+            if video.hashes is not None:
+                self._hashes = FrameHashFile(
+                    video.hashes,
+                    final=frame_hash_path(video.path),
+                    size=self.size,
+                    fps=video.fps,
+                )
+                on_failure.callback(self._hashes.abort)
+            self._process = FfmpegProcess(
+                [*video.encoder["arguments"][:-1], as_file(video.temporary)],
+                what=f"The video {video.path} could not be encoded.",
+                reads=True,
+                # It shares the lock, which it holds to its own end when we die.
+                keeps=self._lock,
+            )
             on_failure.callback(self._end_process)
-            self.worker = self._start_worker()
+            self.worker = WorkerThread[Frame](
+                self._encode,
+                capacity=_capacity(3 * video.height * video.width),
+                name=f"encoder of {video.path.name}",
+                finish=self._end_input,
+            )
             on_failure.pop_all()
 
     def finish(self) -> VideoFile | None:
@@ -350,10 +335,12 @@ class _Encoding:
             return None
         self._process.wait()
         if self._result is None:
-            self._result = self._check()
-        self._rename(self._result)
+            self._result = self._checked()
+        if self._hashes is not None:
+            self._hashes.close()
+        self._video.rename(self._result)
         self._process.release()
-        self._hold.release()
+        self._lock.release()
         return self._result
 
     def abort(self) -> None:
@@ -362,59 +349,18 @@ class _Encoding:
         self._process.kill()
         self.worker.abort()
         self._end_process()
-        self._abort_hashes()
+        if self._hashes is not None:
+            self._hashes.abort()
 
     def leave(self) -> None:
         """Let the encoder go on to the end of what it was given, by itself."""
         self.worker.leave()
-        self._hold.let_go()
-
-    def _hold_file(self) -> Lock:
-        """Make the hidden file, locked: whoever finds it knows that it is in use."""
-        try:
-            # With the mode that a file gets from everybody else.
-            return Lock(self.temporary, "", mode=0o666)
-        except OSError as error:
-            raise DirectoryNotWritable(self._path.parent, error) from error
-
-    def _open_hashes(self) -> FrameHashFile | None:
-        hashes = self._unfinished.hashes
-        if hashes is None:
-            return None
-        return FrameHashFile(
-            frame_hash_path(self._path),
-            size=self.size,
-            fps=self._unfinished.fps,
-            temporary=hashes,
-        )
-
-    def _start_ffmpeg(self, arguments: list[str]) -> FfmpegProcess:
-        what = f"The video {self._path} could not be encoded."
-        # It shares the lock, which it holds to its own end when this process dies.
-        return FfmpegProcess(arguments, what=what, reads=True, keeps=self._hold)
-
-    def _start_worker(self) -> WorkerThread[Frame]:
-        height, width = self._unfinished.padded
-        frame_bytes = height * width * 3
-        return WorkerThread[Frame](
-            self._encode,
-            capacity=min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes)),
-            name=f"encoder of {self._path.name}",
-            finish=self._end_input,
-        )
-
-    def _end_process(self) -> None:
-        self._process.kill()
-        self._process.release()
-        # ffmpeg may have put another file in the place of the one that is held.
-        self.temporary.unlink(missing_ok=True)
-        self._hold.release()
-
-    def _abort_hashes(self) -> None:
-        if self._hashes is not None:
-            self._hashes.abort()
+        self._lock.let_go()
 
     def _encode(self, frame: Frame) -> None:
+        if not self._encoded:
+            # It is remembered, and the next frames are still being drawn.
+            ffmpeg_sha256()
         if self._hashes is not None:
             self._hashes.add(frame)
         self._process.write(pad_to_even(frame))
@@ -424,12 +370,18 @@ class _Encoding:
         self._process.end_input()
         self._input_ended = True
 
-    def _check(self) -> VideoFile:
-        """Return what the finished file holds."""
-        file = self._unfinished.check()
+    def _end_process(self) -> None:
+        self._process.kill()
+        self._process.release()
+        # ffmpeg may have put another file in the place of the one that is locked.
+        self.temporary.unlink(missing_ok=True)
+        self._lock.release()
+
+    def _checked(self) -> VideoFile:
+        file = self._video.check()
         if file.frame_count != self._encoded:
             raise FrameCountError(
-                f"{self._path} was to hold {self._encoded} frames, and decoding gives "
+                f"{file.path} was to hold {self._encoded} frames, and decoding gives "
                 f"{file.frame_count}. It was not kept.",
                 command=self._process.command,
                 returncode=0,
@@ -438,10 +390,19 @@ class _Encoding:
         encoder = {**file.encoder, "sha256": ffmpeg_sha256()}
         return dataclasses.replace(file, encoder=encoder)
 
-    def _rename(self, file: VideoFile) -> None:
-        if self._hashes is not None:
-            self._hashes.close()
-        self._unfinished.rename(file)
+
+def _capacity(frame_bytes: int) -> int:
+    """Return how many frames may wait."""
+    return min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes))
+
+
+def _locked(video: UnfinishedVideo) -> Lock:
+    """Make the hidden file, locked: who finds it knows that it is in use."""
+    try:
+        # With the mode that a new file gets from every program.
+        return Lock(video.temporary, "", mode=0o666)
+    except OSError as error:
+        raise DirectoryNotWritable(video.path.parent, error) from error
 
 
 def _check_path(path: str | os.PathLike[str]) -> Path:

@@ -7,13 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from ..errors import InvalidArgument
 from ..formats.video_names import further_parts
-from ..frames import Frame, grid_frame, grid_shape
 from ..recorder.subject import EpisodePictures
+from ..recorder.video_recorder import can_give_pictures
 from ..rendering.views import plain_camera
+from .vector_pictures import TilePictures
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,9 +63,15 @@ def camera_pictures(
         return CameraPictures(camera=cameras[0], pictures=pictures_from(cameras[0]))
     plain = [None if each is None else plain_camera(each) for each in cameras]
     sources = [pictures_from(each) for each in cameras]
+    without = [source for source in sources if not can_give_pictures(source)]
+    if without:
+        # All are drawn by workers, or none is.
+        return CameraPictures(
+            camera=cameras[0], pictures=without[0], cameras=tuple(plain)
+        )
     if tiled:
         return CameraPictures(
-            camera=cameras[0], pictures=_Grid(sources), cameras=tuple(plain)
+            camera=cameras[0], pictures=_CameraTiles(sources), cameras=tuple(plain)
         )
     parts = further_parts(plain)
     return CameraPictures(
@@ -94,33 +99,9 @@ def _check(cameras: list[Any]) -> None:
         raise InvalidArgument(f"The camera {twice[0]!r} is there twice in {cameras!r}.")
 
 
-class _Grid:
+class _CameraTiles(TilePictures):
     """The pictures of several cameras side by side."""
 
-    render_mode = "rgb_array"
-
-    def __init__(self, sources: Sequence[EpisodePictures]) -> None:
-        self._sources = sources
-
-    def render(self) -> Frame:
-        return grid_frame([np.asarray(source.render()) for source in self._sources])
-
-    def begin_episode(self) -> None:
-        for source in self._sources:
-            source.begin_episode()
-
     def facts(self) -> dict[str, Any]:
-        all_facts = [source.facts() for source in self._sources]
-        rows, columns = grid_shape(len(self._sources))
-        return {
-            **all_facts[0],
-            "pictures": "scene",
-            "camera": [facts.get("camera") for facts in all_facts],
-            "tiled": True,
-            "rows": rows,
-            "columns": columns,
-        }
-
-    def close(self) -> None:
-        for source in self._sources:
-            source.close()
+        cameras = [source.facts().get("camera") for source in self.sources]
+        return {**super().facts(), "camera": cameras}

@@ -103,7 +103,9 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
         camera: a name or number, or an `mujoco.MjvCamera`, of a MuJoCo environment;
             None is what the environment itself shows. A list of them gives a video
             each: `....video000027.mp4` of the first, `....video000027.<camera>.mp4`
-            of the others.
+            of the others. What is drawn live comes from the environment's own
+            `render()`: with `render="live"`, another camera or size than that gives is
+            an error.
         width: of the videos, in pixels; None is the environment's own.
         height: likewise.
         max_fps: the most frames per second of simulated time: steps 0, n, 2n ... with

@@ -219,10 +219,7 @@ class MonitorControls(MonitorLifetime):
             functools.partial(
                 _close,
                 self._recorder,
-                (
-                    *(subject.pictures, *subject.further_pictures.values()),
-                    *(subject.states, subject.clip_states),
-                ),
+                (subject.states, subject.clip_states),
                 close_environment,
             ),
             at_exit=functools.partial(_note_last_error, self._recorder),

@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
-
-import gymnasium
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidArgument
 from ..frames import Frame, check_frame, grid_frame, grid_shape
 from ..recorder.subject import EpisodePictures
+
+if TYPE_CHECKING:
+    import gymnasium
 
 _RGB_ARRAY = "rgb_array"
 
@@ -80,15 +81,9 @@ class OutsidePictures:
         """Return the picture of this moment, or the list of those since the last."""
         return self._frames.of(self._index)
 
-    def begin_episode(self) -> None:
-        """Do nothing: what draws knows of every reset."""
-
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         return {"pictures": "env.render", "quality": "full"}
-
-    def close(self) -> None:
-        """Do nothing: the environment closes what it draws with."""
 
 
 class TilePictures:
@@ -98,19 +93,20 @@ class TilePictures:
         sources: of the pictures, one for each sub-environment.
 
     Attributes:
+        sources: the same.
         count: how many there are.
         shape: rows and columns of the grid.
     """
 
     def __init__(self, sources: Sequence[EpisodePictures]) -> None:
-        self._sources = sources
+        self.sources = sources
         self.count = len(sources)
         self.shape = grid_shape(self.count)
 
     @property
     def render_mode(self) -> str | None:
         """`rgb_array` where all sources have it; None else."""
-        modes = {source.render_mode for source in self._sources}
+        modes = {source.render_mode for source in self.sources}
         return _RGB_ARRAY if modes == {_RGB_ARRAY} else None
 
     def render(self) -> Frame:
@@ -119,26 +115,14 @@ class TilePictures:
         Raises:
             InvalidArgument: the pictures are not of one size, or one is none.
         """
-        return grid_frame([check_frame(source.render()) for source in self._sources])
-
-    def begin_episode(self) -> None:
-        """Look for what resets may have changed in any of them."""
-        self._each(lambda source: source.begin_episode())
+        return grid_frame([check_frame(source.render()) for source in self.sources])
 
     def facts(self) -> dict[str, Any]:
         """Return what the metadata of a video says about its pictures."""
         rows, columns = self.shape
         return {
-            **self._sources[0].facts(),
+            **self.sources[0].facts(),
             "tiled": True,
             "rows": rows,
             "columns": columns,
         }
-
-    def close(self) -> None:
-        """Free what was acquired; idempotent."""
-        self._each(lambda source: source.close())
-
-    def _each(self, call: Callable[[EpisodePictures], None]) -> None:
-        for source in self._sources:
-            call(source)

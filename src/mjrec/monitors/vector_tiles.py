@@ -11,6 +11,7 @@ from typing import Any
 from ..errors import InvalidArgument, NoPictures
 from ..formats.monitor_directory import Infix, video_prefix
 from ..recorder.endings import CLOSE, RESET, ending
+from ..recorder.live_videos import LiveVideos
 from ..recorder.options import OFF, WARN, RecorderOptions
 from ..recorder.video_recorder import VideoRecorder
 from ..schedules import disable_videos, to_schedule
@@ -48,7 +49,7 @@ def check_tiled(pictures: TilePictures) -> None:
         raise NoPictures(
             "tiled=True was asked for, and a tiled video is drawn while the "
             "environments step, which needs pictures of each of them: make them with "
-            'render_mode="rgb_array".'
+            'render_mode="rgb_array", and with the camera and the size that are wanted.'
         )
 
 
@@ -93,7 +94,7 @@ class TiledVideo:
     def take_last(self) -> None:
         """Take the picture of the last step, if it was left out."""
         if self._video is not None and self._ending is None:
-            self._take(self._video.capture_last)
+            self._videos(self._video).take_last()
 
     def after_reset(self) -> None:
         """Follow the first sub-environment, which has just been reset."""
@@ -129,11 +130,8 @@ class TiledVideo:
             self._ending = ending(error)
 
     def close(self) -> None:
-        """Finish the running video, and free what draws. Idempotent."""
-        try:
-            self._end(self._incomplete(CLOSE))
-        finally:
-            self._pictures.close()
+        """Finish the running video. Idempotent."""
+        self._end(self._incomplete(CLOSE))
 
     def _begin(self, episode_id: int) -> None:
         self._episode_id = episode_id
@@ -161,8 +159,7 @@ class TiledVideo:
             facts=self._pictures.facts,
             strict=self._options.strict,
         )
-        self._take(self._pictures.begin_episode)
-        self._take(self._video.capture_frame)
+        self._videos(self._video).begin()
 
     def _step(self, video: VideoRecorder, is_over: bool, *, is_reset: bool) -> None:
         stats = self._first.stats_recorder
@@ -177,9 +174,7 @@ class TiledVideo:
             # The first tile shows the next episode already; the others are right.
             video.metadata["final_frame"] = "missing"
             self._warn_of_missing_frames()
-        self._take(video.capture_frame)
-        if is_over:
-            self._take(video.capture_last)
+        self._videos(video).take(is_there=True, last=is_over)
 
     def _warn_of_missing_frames(self) -> None:
         if self._has_warned:
@@ -192,34 +187,22 @@ class TiledVideo:
             "own videos are whole where they are objects in this process."
         )
 
-    def _take(self, take: Callable[[], None]) -> None:
-        """Take pictures, or do without them where that was asked for."""
-        assert self._video is not None
-        try:
-            take()
-        except Exception as error:
-            if self._options.on_error != WARN:
-                raise
-            self._video.give_up(str(error))
+    def _videos(self, video: VideoRecorder) -> LiveVideos:
+        return LiveVideos([video], tolerates=self._tolerates)
+
+    def _tolerates(self, error: Exception) -> bool:
+        if self._options.on_error != WARN or self._video is None:
+            return False
+        logger.warning("The tiled video %s: %s", self._video.path, error)
+        return True
 
     def _incomplete(self, reason: str) -> dict[str, Any]:
         return {"complete": False, **(self._ending or {"reason": reason})}
 
     def _end(self, facts: Mapping[str, Any]) -> None:
-        video = self._video
-        if video is None:
-            return
-        if "complete" not in video.metadata:
-            # Else an end that was interrupted is taken up again.
-            video.metadata.update(facts)
-        video.metadata.update(self._progress)
-        try:
-            video.close()
-        except Exception as error:
-            if self._options.on_error != WARN:
-                raise
-            logger.warning("The tiled video %s: %s", video.path, error)
-        finally:
-            if video.closed:
-                self._video = None
-                self._first._recorder.add_video(video)
+        if self._video is not None:
+            self._videos(self._video).end({**facts, **self._progress}, self._list)
+
+    def _list(self, video: VideoRecorder) -> None:
+        self._video = None
+        self._first._recorder.add_video(video)

@@ -11,8 +11,7 @@ from .clips import Clip
 from .deferred_clip import ClipLogs, DeferredClip
 from .ended_trajectories import EndedTrajectories
 from .episode_videos import EpisodeVideos
-from .live_clip import LiveClip
-from .live_videos import LiveVideoMaker, name_again
+from .live_videos import LiveClip, LiveVideoMaker
 from .options import DEFERRED
 from .subject import Subject
 from .trajectory_recorder import Pace
@@ -99,7 +98,6 @@ class ClipMaker:
             recorder.metadata.update(first_step=total_steps, last_episode_id=episode_id)
         return LiveClip(
             recorders,
-            self._live.pictures,
             on_end=self._add_live,
             tolerates=self._tolerates,
         )
@@ -107,7 +105,6 @@ class ClipMaker:
     def _add_live(self, recorders: Sequence[VideoRecorder]) -> None:
         for recorder in recorders:
             self._videos.add_live(recorder)
-        name_again(recorders[0])
 
     def _add_deferred(self, clip: DeferredClip) -> None:
         self._videos.add_deferred_clip(clip)

@@ -34,11 +34,6 @@ class LiveVideoMaker:
     facts: Callable[[], Mapping[str, Any]]
     caption: Callable[[], Caption]
 
-    @property
-    def pictures(self) -> tuple[EpisodePictures, ...]:
-        """Where the pictures come from, of the first camera and of the others."""
-        return (self.subject.pictures, *self.subject.further_pictures.values())
-
     def at(
         self, path: Path, *, second_name: Mapping[str, str], enabled: bool = True
     ) -> tuple[VideoRecorder, ...]:
@@ -91,31 +86,26 @@ class LiveVideos:
 
     Args:
         recorders: what records them, one or more; the first camera's comes first.
-        pictures: where they come from.
         tolerates: tells whether to go on after an error.
-        on_picture_error: called with one that is not tolerated while a picture is
-            taken: it may be the environment's own.
+        on_picture_error: called with one that is not tolerated while a picture of a
+            step is taken: it may be the environment's own.
     """
 
     def __init__(
         self,
         recorders: Sequence[VideoRecorder],
-        pictures: Sequence[EpisodePictures],
         *,
         tolerates: Callable[[Exception], bool],
-        on_picture_error: Callable[[Exception], object],
+        on_picture_error: Callable[[Exception], object] = lambda _: None,
     ) -> None:
         self._recorders = recorders
-        self._pictures = pictures
         self._tolerates = tolerates
         self._on_picture_error = on_picture_error
 
     def begin(self) -> None:
-        """Take the pictures of the reset."""
-        for pictures in self._pictures:
-            pictures.begin_episode()
+        """Take the pictures of a reset."""
         for recorder in self._recorders:
-            recorder.capture_frame()
+            self._try(recorder, recorder.capture_frame)
 
     def take(self, *, is_there: bool, last: bool) -> None:
         """Take the pictures of a step.
@@ -131,24 +121,17 @@ class LiveVideos:
                 recorder.metadata["final_frame"] = "missing"
                 continue
             try:
-                recorder.capture_frame()
+                self._try(recorder, recorder.capture_frame)
                 if last:
-                    recorder.capture_last()
+                    self._try(recorder, recorder.capture_last)
             except Exception as error:
-                if not self._tolerates(error):
-                    self._on_picture_error(error)
-                    raise
-                recorder.give_up(str(error))
+                self._on_picture_error(error)
+                raise
 
     def take_last(self) -> None:
         """Take the pictures of the last step, where they were left out."""
         for recorder in self._recorders:
-            try:
-                recorder.capture_last()
-            except Exception as error:
-                if not self._tolerates(error):
-                    raise
-                recorder.give_up(str(error))
+            self._try(recorder, recorder.capture_last)
 
     def give_up(self, reason: str) -> None:
         """Take no more pictures, and say why; those that were taken stay."""
@@ -161,20 +144,41 @@ class LiveVideos:
             recorder.discard()
 
     def end(
-        self, facts: Mapping[str, Any], on_closed: Callable[[VideoRecorder], object]
+        self,
+        facts: Mapping[str, Any],
+        on_closed: Callable[[VideoRecorder], object] = lambda _: None,
     ) -> None:
         """Finish the files. Where it was interrupted, the next call goes on.
+
+        The metadata of the first camera's video is the sign that all are there, and
+        names the others: it comes last, also where ending another one raises.
 
         Args:
             facts: what is known of the episode, for the metadata; of its end what the
                 first call says.
             on_closed: called with each that is closed.
         """
-        end_each(self._recorders, lambda each: self._end_one(each, facts, on_closed))
+        first, *others = self._recorders
+        with contextlib.ExitStack() as ends:
+            # Run from the last to the first.
+            ends.callback(self._end_one, first, facts, on_closed)
+            ends.callback(_name_further_videos, first, others)
+            for recorder in others:
+                ends.callback(self._end_one, recorder, facts, on_closed)
 
     def name_again(self) -> None:
         """Give the finished videos their second names, if they have any."""
-        name_again(self._recorders[0])
+        first = self._recorders[0]
+        if first.finished and first.path is not None and "also_named" in first.metadata:
+            give_second_names(Path(first.path))
+
+    def _try(self, recorder: VideoRecorder, capture: Callable[[], None]) -> None:
+        try:
+            capture()
+        except Exception as error:
+            if not self._tolerates(error):
+                raise
+            recorder.give_up(str(error))
 
     def _end_one(
         self,
@@ -184,14 +188,8 @@ class LiveVideos:
     ) -> None:
         if recorder.closed:
             return
-        is_told = "complete" in recorder.metadata
-        recorder.metadata.update(
-            {
-                key: value
-                for key, value in facts.items()
-                if not (is_told and key in _OF_THE_END)
-            }
-        )
+        said = _OF_THE_END if "complete" in recorder.metadata else ()
+        recorder.metadata.update({k: v for k, v in facts.items() if k not in said})
         try:
             recorder.close()
         except Error as error:
@@ -206,38 +204,56 @@ class LiveVideos:
 _OF_THE_END = ("complete", "reason", "exception", "terminated", "truncated")
 
 
-def end_each(
-    recorders: Sequence[VideoRecorder], end: Callable[[VideoRecorder], object]
-) -> None:
-    """End the videos of one moment, also where ending one of them raises.
-
-    The metadata of the first camera's video is the sign that all are there, and names
-    the others: it comes last.
-
-    Args:
-        recorders: what has recorded them; the first camera's comes first.
-        end: called with each.
-    """
-    first, *others = recorders
-    with contextlib.ExitStack() as ends:
-        # Run from the last to the first.
-        ends.callback(end, first)
-        ends.callback(_name_further_videos, first, others)
-        for recorder in others:
-            ends.callback(end, recorder)
-
-
 def _name_further_videos(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:
     names = [Path(v.path).name for v in others if v.finished and v.path is not None]
     if names:
         first.metadata["further_videos"] = names
 
 
-def name_again(first: VideoRecorder) -> None:
-    """Give a first camera's video and the others their second names, if there are any.
+class LiveClip:
+    """A video that is counted in steps, drawn while the simulation runs; a `Clip`.
 
     Args:
-        first: what has recorded it.
+        recorders: what records it, of one camera or of each.
+        on_end: called with the recorders when they are closed.
+        tolerates: tells whether to go on after an error.
     """
-    if first.finished and first.path is not None and "also_named" in first.metadata:
-        give_second_names(Path(first.path))
+
+    def __init__(
+        self,
+        recorders: Sequence[VideoRecorder],
+        *,
+        on_end: Callable[[Sequence[VideoRecorder]], object],
+        tolerates: Callable[[Exception], bool],
+    ) -> None:
+        self._recorders = recorders
+        self._videos = LiveVideos(recorders, tolerates=tolerates)
+        self._on_end = on_end
+
+    def begin(self) -> None:
+        """Take the picture of this moment."""
+        self._videos.begin()
+
+    def reset(self, episode_id: int) -> None:
+        """Take the picture of an episode that has just begun."""
+        for recorder in self._recorders:
+            recorder.metadata["last_episode_id"] = episode_id
+        self._videos.begin()
+
+    def step(
+        self, reward: float, *, terminated: bool, truncated: bool, is_there: bool
+    ) -> None:
+        """Take the picture of a step."""
+        del reward, terminated, truncated
+        self._videos.take(is_there=is_there, last=False)
+
+    def end(self, facts: Mapping[str, Any]) -> None:
+        """Finish the files. Where it was interrupted, the next call goes on."""
+        try:
+            try:
+                self._videos.take_last()
+            finally:
+                self._videos.end(facts)
+        finally:
+            self._on_end(self._recorders)
+            self._videos.name_again()

@@ -560,6 +560,8 @@ class Recorder:
         return self._episode
 
     def _begin_episode(self, episode: BegunEpisode, observation: Any) -> None:
+        # Those of the episode before are over, whatever the schedule raises.
+        self._trajectory = self._live_videos = self.video_recorder = None
         episode_id = episode.episode_id
         wanted = self._choice.decide(episode_id)
         if self._clips is not None:
@@ -574,7 +576,6 @@ class Recorder:
         if self._states is not None and (keeps or deferred):
             start = self._states.begin_episode()
             deferred = deferred and self._deferral.is_possible(start)
-        self._trajectory = self._live_videos = self.video_recorder = None
         if keeps or deferred:
             promise = None
             if wanted:
@@ -602,7 +603,6 @@ class Recorder:
             return
         self._live_videos = LiveVideos(
             recorders,
-            self._live_maker.pictures,
             tolerates=functools.partial(self._tolerates, "video"),
             on_picture_error=self.note_error,
         )

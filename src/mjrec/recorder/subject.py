@@ -15,16 +15,10 @@ from .video_recorder import PictureSource, can_give_pictures
 
 
 class EpisodePictures(PictureSource, Protocol):
-    """Where the pictures of a run come from, episode by episode."""
-
-    def begin_episode(self) -> None:
-        """Prepare for pictures of an episode; the environment has just been reset."""
+    """Where the live pictures of a run come from."""
 
     def facts(self) -> Mapping[str, Any]:
         """Return what the metadata of a video says about its pictures."""
-
-    def close(self) -> None:
-        """Free what was acquired; idempotent."""
 
 
 @dataclass(frozen=True, kw_only=True)

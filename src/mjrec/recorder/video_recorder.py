@@ -3,25 +3,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-from .. import json_text
-from ..annotation import Caption, annotated, check_annotation, pillow_version
-from ..atomic_files import write_text
-from ..blank_frames import BlankFrames
+from ..annotation import Caption, check_annotation
 from ..errors import InvalidArgument, InvalidFrame
-from ..formats.asciicast import AsciicastWriter, text_of_frame
-from ..formats.ffmpeg import ffmpeg_executable
-from ..formats.unfinished_video import VideoNote, note_path, write_note
-from ..formats.video_metadata import StepRuns, file_facts, timing_facts
-from ..formats.video_writer import VideoWriter
+from ..formats.asciicast import text_of_frame
+from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
+from ..formats.video_sink import VideoSink
 from ..frames import Frame, check_frame
 from ..rates import rate_from_timestep, stride_for, to_rate
 from ..simulation.inside import simulation_time
@@ -80,7 +76,7 @@ class VideoRecorder:
         frame_hashes: also write the `.framehash` of an image video.
         clock: returns the simulated time in seconds, or None where there is none.
         declared: returns the rate to take where there is no simulated time.
-        facts: returns more for the metadata, asked for once, after the last frame.
+        facts: returns more for the metadata, once there is a frame.
         strict: whether images that show nothing (all black, of one colour each, or all
             the same) are an error of `close`; else they are a warning.
         caption: returns what is written on the images of this moment; None where
@@ -98,6 +94,7 @@ class VideoRecorder:
         enabled: whether it records.
         broken: a bad frame, or an encoder that failed, ended the video early.
         finished: the video is there, under its name and whole; known after `close`.
+        closed: whether `close` or `discard` was called.
     """
 
     def __init__(
@@ -119,45 +116,41 @@ class VideoRecorder:
     ) -> None:
         if caption is not None:
             check_annotation()
-        self._caption = caption
         self.env = env
         self.enabled = bool(enabled) and can_give_pictures(env)
-        self.broken = False
-        self.finished = False
+        self.broken = self.finished = self.closed = False
         self.path: str | None = None
         self.metadata_path: str | None = None
         self.metadata = dict(metadata or {})
-        self.ansi_mode = getattr(env, "render_mode", None) in _TEXT_MODES
+        mode = getattr(env, "render_mode", None)
+        self.ansi_mode = mode in _TEXT_MODES
+        # Of one image a step, some need not be drawn.
+        self._may_leave_out = mode == "rgb_array"
+        self._caption = caption
         self._clock = clock or (lambda: simulation_time(env))
         self._declared = declared or (lambda: declared_rate(env))
-        self._facts = facts
+        self._facts = facts or dict
         self._strict = strict
-        self._blank_frames = BlankFrames()
         self._fps = None if fps is None else to_rate(fps)
         self._max_fps = None if max_fps is None else to_rate(max_fps, name="max_fps")
-        self._stride = 1
-        self._last_taken = -1
         self._frame_hashes = frame_hashes
-        self._take = text_of_frame if self.ansi_mode else self._checked_frame
+        self._sink: VideoSink | None = None
         self._size: tuple[int, int] | None = None
-        self._writer: VideoWriter | AsciicastWriter | None = None
-        self._is_noted = False
         # Frames wait here until the second capture tells the rate.
-        self._waiting: list[Any] = []
+        self._waiting: list[tuple[Frame | str, Caption | None]] = []
         self._captures = 0
         self._first: tuple[int, float | None] | None = None
-        self._measured = False
-        self._frames_per_capture = 1
+        self._last_taken = -1
+        self._steps = StepRuns()
+        self._stride = self._frames_per_step = 1
         self._timestep: Fraction | None = None
         self._rate: Fraction | None = None
-        self._steps = StepRuns()
-        self._closed = False
         if not self.enabled:
             if enabled:
                 logger.info(
                     "No video of %s: its render mode is %r.",
                     type(env).__name__,
-                    getattr(env, "render_mode", None),
+                    mode,
                 )
             return
         # Absolute, so that a later chdir does not part the video from its metadata.
@@ -182,11 +175,6 @@ class VideoRecorder:
         """The number of frames recorded so far."""
         return self._steps.total
 
-    @property
-    def closed(self) -> bool:
-        """Whether `close` or `discard` was called."""
-        return self._closed
-
     def capture_frame(self) -> None:
         """Record what `env.render()` gives now.
 
@@ -196,11 +184,13 @@ class VideoRecorder:
         Raises:
             EncoderError: ffmpeg failed; the recorder is broken from then on.
         """
-        if not self.functional or self._closed:
+        if not self.functional or self.closed:
             return
         # Counted also where `render` raises: frames belong to steps.
         step, self._captures = self._captures, self._captures + 1
-        self._settle_stride(step)
+        if self._may_leave_out:
+            with self._abandoning():
+                self._settle_rate(step, frames=1)
         if step % self._stride == 0:
             self._capture(step)
 
@@ -211,28 +201,21 @@ class VideoRecorder:
         what `capture_frame` raises.
         """
         step = self._captures - 1
-        if self.functional and not self._closed and step > self._last_taken >= 0:
+        if self.functional and not self.closed and step > self._last_taken >= 0:
             self._capture(step)
 
     def give_up(self, reason: str) -> None:
         """Take no more frames, and say why; those that were taken stay."""
-        if self.functional:
-            self._break(reason)
-
-    def _capture(self, step: int) -> None:
-        rendered = self.env.render()
-        self._last_taken = step
-        frames = rendered if isinstance(rendered, list) else [rendered]
-        try:
-            for frame in frames:
-                self._add(self._take(frame))
-                self._steps.add(step)
-            self._settle_rate(step, len(frames))
-        except InvalidFrame as error:
-            self._break(str(error))
-        except Exception as error:
-            self._abandon(error)
-            raise
+        if not self.functional:
+            return
+        self.broken = True
+        self.metadata["broken_reason"] = reason
+        logger.warning(
+            "The video %s ends after %d frames, because the next one was bad: %s",
+            self.path,
+            self.frame_count,
+            reason,
+        )
 
     def close(self) -> None:
         """Finish the video and write its metadata. A second call does nothing.
@@ -244,20 +227,26 @@ class VideoRecorder:
             EncoderError: ffmpeg failed; the metadata is written all the same.
             BlankVideo: with `strict`; the video and its metadata are there.
         """
-        if self._closed:
+        if self.closed:
             return
         if self.enabled:
             try:
-                self._finish_writer()
-            except Exception as error:
-                self._abandon(error)
-                self._write_metadata()
-                self._closed = True
+                with self._abandoning():
+                    self._finish()
+            except Exception:
+                self._describe()
+                self.closed = True
                 raise
-            self._write_metadata()
-        self._closed = True
-        if self.finished and self.path is not None:
-            self._blank_frames.judge(Path(self.path), strict=self._strict)
+            self._describe()
+        self.closed = True
+        if self.finished and self._sink is not None:
+            self._sink.blank.judge(self._sink.path, strict=self._strict)
+
+    def discard(self) -> None:
+        """End without a video and without metadata."""
+        if not self.closed:
+            self.closed = True
+            self._drop_frames()
 
     def __enter__(self) -> Self:
         return self
@@ -269,14 +258,6 @@ class VideoRecorder:
         traceback: TracebackType | None,
     ) -> None:
         self.close()
-
-    def discard(self) -> None:
-        """End without a video and without metadata."""
-        self._closed = True
-        self._waiting.clear()
-        if self._writer is not None:
-            self._writer.abort()
-        self._forget_note()
 
     def _path_of(
         self,
@@ -300,166 +281,128 @@ class VideoRecorder:
             )
         return os.fspath(path)
 
-    def _checked_frame(self, frame: object) -> Frame:
-        checked = check_frame(frame, size=self._size)
-        self._size = (checked.shape[0], checked.shape[1])
-        self._blank_frames.add(checked)
-        return checked if self._caption is None else annotated(checked, self._caption())
+    def _capture(self, step: int) -> None:
+        rendered = self.env.render()
+        self._last_taken = step
+        frames = rendered if isinstance(rendered, list) else [rendered]
+        with self._abandoning():
+            for frame in frames:
+                self._add(frame)
+                self._steps.add(step)
+            self._settle_rate(step, len(frames))
+            if self._first is None:
+                self._first = (step, self._clock())
 
-    def _add(self, frame: Any) -> None:
-        if self._writer is not None:
-            self._write(self._writer, frame)
-        elif self.ansi_mode:
-            self._waiting.append(frame)
+    def _add(self, frame: object) -> None:
+        taken: Frame | str
+        caption = None
+        if self.ansi_mode:
+            taken = text_of_frame(frame)
+        else:
+            taken = check_frame(frame, size=self._size)
+            self._size = (taken.shape[0], taken.shape[1])
+            caption = None if self._caption is None else self._caption()
+        if self._sink is not None:
+            self._sink.write(taken, caption)
         else:
             # The environment may draw the next picture into the same array.
-            self._waiting.append(frame.copy())
-
-    def _settle_stride(self, step: int) -> None:
-        """Choose every how many-th picture is taken, once a step has been timed."""
-        if self._max_fps is None or self._measured or self._first is None:
-            return
-        if getattr(self.env, "render_mode", None) != "rgb_array":
-            return
-        timestep = _time_of_a_step(self._first, (step, self._clock()))
-        rate = 1 / timestep if timestep is not None else self._declared()
-        self._stride = stride_for(rate, self._max_fps)
-        if self._stride > 1:
-            self._measured = True
-            self._timestep = timestep
-            self._steps = StepRuns([self._first[0]], stride=self._stride)
-            if self._writer is None:
-                self._open_writer(rate / self._stride)
-            self._note_rest()
+            taken = taken if isinstance(taken, str) else taken.copy()
+            self._waiting.append((taken, caption))
 
     def _settle_rate(self, step: int, frames: int) -> None:
-        """Measure the time of a step, from the first two pictures that there are."""
-        if self._writer is None and self._fps is not None:
-            self._open_writer(self._fps)
-        if self._first is None:
-            self._first = (step, self._clock())
-        elif not self._measured:
-            self._measured = True
-            # That of the reset may be another one.
-            self._frames_per_capture = max(frames, 1)
-            self._timestep = _time_of_a_step(self._first, (step, self._clock()))
-            if self._writer is None:
-                self._open_writer(self._real_time(frames))
-            self._note_rest()
+        """Open the video, once there are pictures of two steps to time it by."""
+        if self._sink is not None or self._first is None:
+            return
+        self._timestep = _time_of_a_step(self._first, (step, self._clock()))
+        self._frames_per_step = max(frames, 1)
+        fps = self._fps
+        leaves_out = self._may_leave_out and self._max_fps is not None
+        if fps is None or leaves_out:
+            rate = self._real_time(frames)
+            if leaves_out:
+                self._stride = stride_for(rate, self._max_fps)
+            fps = fps or rate / self._stride
+        if self._stride > 1:
+            self._steps = StepRuns([self._first[0]], stride=self._stride)
+        self._open(fps)
 
     def _real_time(self, frames: int) -> Fraction:
         if self._timestep is not None and frames:
             return rate_from_timestep(float(self._timestep / frames))
         return self._declared()
 
-    def _thinned(self, rate: Fraction) -> Fraction:
-        return rate / stride_for(rate, self._max_fps)
-
-    def _open_writer(self, rate: Fraction) -> None:
+    def _open(self, fps: Fraction) -> None:
         assert self.path is not None
-        self._rate = rate
-        if self.ansi_mode:
-            self._writer = AsciicastWriter(Path(self.path), rate=rate)
-        else:
-            self._writer = VideoWriter(
-                self.path, fps=rate, frame_hashes=self._frame_hashes
-            )
-        for frame in self._waiting:
-            self._write(self._writer, frame)
+        self._rate = fps
+        self._sink = VideoSink(
+            Path(self.path),
+            fps=fps,
+            frame_hashes=self._frame_hashes,
+            note=self._note,
+        )
+        for frame, caption in self._waiting:
+            self._sink.write(frame, caption)
         self._waiting.clear()
 
-    def _write(self, writer: VideoWriter | AsciicastWriter, frame: Any) -> None:
-        # The note is there before the file that it is about.
-        if not self._is_noted and isinstance(writer, VideoWriter):
-            self._note(writer, {})
-        writer.write(frame)
+    def _note(self) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+        """Return what an unfinished file is, for whoever finds it."""
+        timing = {
+            "timestep": self._timestep,
+            "stride": self._stride,
+            "frames_per_step": self._frames_per_step,
+        }
+        return {**self.metadata, **self._facts()}, timing
 
-    def _note(self, writer: VideoWriter, facts: Mapping[str, Any]) -> None:
-        """Write down what the unfinished file is, for whoever finds it."""
-        assert self._size is not None
-        self._is_noted = True
-        timestep = self._timestep
-        write_note(
-            VideoNote(
-                video=writer.unfinished(*self._size),
-                metadata={**self.metadata, **facts},
-                timing={
-                    "timestep": None if timestep is None else str(timestep),
-                    "stride": self._stride,
-                    "frames_per_step": self._frames_per_capture,
-                },
-                ffmpeg_size=Path(ffmpeg_executable()).stat().st_size,
-            )
-        )
+    @contextlib.contextmanager
+    def _abandoning(self) -> Iterator[None]:
+        """End the video at a bad frame; leave none of it where its encoder fails."""
+        try:
+            yield
+        except InvalidFrame as error:
+            self.give_up(str(error))
+        except Exception as error:
+            self.broken = True
+            self.metadata["broken_reason"] = str(error)
+            self._steps = StepRuns()
+            self._drop_frames()
+            raise
 
-    def _note_rest(self) -> None:
-        """Complete the note by what the second picture has told."""
-        if not isinstance(self._writer, VideoWriter) or self._writer.frame_count == 0:
-            return
-        # What they raise is raised: caught here, the exception of a signal's handler
-        # would be lost, and the metadata needs them in the end.
-        self._note(self._writer, self._facts() if self._facts else {})
-
-    def _forget_note(self) -> None:
-        if self._is_noted and self.path is not None:
-            note_path(Path(self.path)).unlink(missing_ok=True)
-
-    def _break(self, reason: str) -> None:
-        self.broken = True
-        self.metadata["broken_reason"] = reason
-        logger.warning(
-            "The video %s ends after %d frames, because the next one was bad: %s",
-            self.path,
-            self.frame_count,
-            reason,
-        )
-
-    def _abandon(self, error: Exception) -> None:
-        """Give the video up: its encoder failed, and no part of it is to be trusted."""
-        self.broken = True
-        self.finished = False
-        self.metadata["broken_reason"] = str(error)
+    def _drop_frames(self) -> None:
         self._waiting.clear()
-        self._steps = StepRuns()
-        if self._writer is not None:
-            self._writer.abort()
+        if self._sink is not None:
+            self._sink.discard()
+            self._sink = None
 
-    def _finish_writer(self) -> None:
+    def _finish(self) -> None:
         if self._waiting:
-            self._open_writer(self._fps or self._thinned(self._declared()))
-        if self._writer is not None:
-            self._writer.close()
+            rate = self._fps
+            if rate is None:
+                declared = self._declared()
+                rate = declared / stride_for(declared, self._max_fps)
+            self._open(rate)
+        if self._sink is not None:
+            self._sink.finish()
             self.finished = True
 
-    def _write_metadata(self) -> None:
-        if self.finished:
-            self.metadata.update(self._description())
-            self.metadata.update(self._facts() if self._facts else {})
-        else:
-            self.metadata["empty"] = True
+    def _describe(self) -> None:
+        """Write the metadata."""
+        assert self.path is not None
         if self.broken:
             self.metadata["broken"] = True
-        assert self.metadata_path is not None
-        write_text(Path(self.metadata_path), json_text.dumps(self.metadata))
-        self._forget_note()
-
-    def _description(self) -> dict[str, Any]:
-        description = timing_facts(
+        if self._sink is None:
+            self.metadata["empty"] = True
+            write_metadata(Path(self.path), self.metadata)
+            return
+        timing = timing_facts(
             self._steps,
             fps=self._rate,
             timestep=self._timestep,
             stride=self._stride,
-            frames_per_step=self._frames_per_capture,
+            frames_per_step=self._frames_per_step,
         )
-        if isinstance(self._writer, AsciicastWriter):
-            encoder = {"backend": "TextEncoder", "version": 1}
-            return {"encoder_version": encoder, **description}
-        if isinstance(self._writer, VideoWriter) and self._writer.result is not None:
-            facts = {**file_facts(self._writer.result), **self._blank_frames.facts()}
-            if self._caption is not None:
-                facts["annotated"] = {"pillow": pillow_version()}
-            return {**description, **facts}
-        return description
+        self.metadata = self._sink.describe(
+            {**self.metadata, **timing, **self._facts()}
+        )
 
 
 def _time_of_a_step(

@@ -4,13 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from .. import json_text
-from ..atomic_files import write_text
 from ..errors import UnreadableFile
-from ..formats.video_metadata import metadata_path
 from .known_episodes import KnownEpisodes
 
 
@@ -46,8 +42,3 @@ def facts_of(episode_id: int | None, known: KnownEpisodes) -> Mapping[str, Any]:
     except UnreadableFile:
         # Its trajectory is damaged, which is told elsewhere.
         return {}
-
-
-def write_metadata(video: Path, metadata: Mapping[str, Any]) -> None:
-    """Write the metadata file of a video."""
-    write_text(metadata_path(video), json_text.dumps(metadata))

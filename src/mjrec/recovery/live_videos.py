@@ -26,8 +26,9 @@ from ..formats.video_metadata import (
     further_live_videos,
     metadata_path,
     timing_facts,
+    write_metadata,
 )
-from .cut_off import how_it_ended, sums_of, write_metadata
+from .cut_off import how_it_ended, sums_of
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
 

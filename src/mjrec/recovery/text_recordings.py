@@ -13,8 +13,13 @@ from typing import Any
 
 from ..formats.asciicast import AsciicastWriter, unfinished_recording
 from ..formats.monitor_directory import episode_of, video_prefix
-from ..formats.video_metadata import StepRuns, metadata_path, timing_facts
-from .cut_off import facts_of, how_it_ended, sums_of, write_metadata
+from ..formats.video_metadata import (
+    StepRuns,
+    metadata_path,
+    timing_facts,
+    write_metadata,
+)
+from .cut_off import facts_of, how_it_ended, sums_of
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
 

@@ -16,10 +16,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from .. import json_text
-from ..annotation import Caption, annotated, check_annotation, pillow_version
-from ..atomic_files import write_text
-from ..blank_frames import BlankFrames
+from ..annotation import Caption, check_annotation
 from ..errors import EncoderError, NoPictures, UnreadableFile
 from ..formats.monitor_directory import (
     ClipPart,
@@ -32,14 +29,9 @@ from ..formats.monitor_directory import (
 from ..formats.second_names import give_second_names, take_second_names
 from ..formats.trajectory_reader import TrajectoryReader, added_up
 from ..formats.unfinished_video import VideoFile
-from ..formats.video_metadata import (
-    StepRuns,
-    file_facts,
-    metadata_path,
-    timing_facts,
-)
+from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
 from ..formats.video_names import further_parts, second_name_of, with_part
-from ..formats.video_writer import VideoWriter
+from ..formats.video_sink import VideoSink
 from ..frames import Frame, grid_shape
 from ..machine import machine_fingerprint
 from ..rates import to_rate
@@ -102,14 +94,6 @@ class Footage:
     timestep: str | None
     fps: Fraction
     captions: Iterable[Caption] | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Written:
-    """A video that is there, and what its frames looked like."""
-
-    file: VideoFile
-    blank: BlankFrames
 
 
 def render_video(
@@ -218,33 +202,22 @@ def render_footage(
         "pictures": "scene",
         "quality": view.quality or _recorded(footage.facts).get("quality", "full"),
     }
-    if footage.captions is not None:
-        said["annotated"] = {"pillow": pillow_version()}
 
-    def render(shot: _Shot) -> _Written:
-        file, blank = _write_video(
-            shot.path,
+    def render(shot: _Shot) -> VideoSink:
+        return _render_shot(
+            shot,
+            footage,
             lambda: _drawn(workers, footage.runs, shot),
-            captions=footage.captions,
-            fps=footage.fps,
+            lambda: {**footage.metadata, **said, **shot.facts, **workers.gl_facts},
             on_frame=on_frame,
         )
-        metadata = {
-            **footage.metadata,
-            **said,
-            **file_facts(file),
-            **blank.facts(),
-            **shot.facts,
-            **workers.gl_facts,
-        }
-        _complete(file, metadata)
-        return _Written(file=file, blank=blank)
 
-    written = _all_or_none(map(render, shots))
+    videos = _all_or_none(map(render, shots))
     if out is None:
         give_second_names(shots[-1].path)
-    _judge(written, strict=strict)
-    return written[-1].file
+    _judge(videos, strict=strict)
+    assert videos[-1].file is not None
+    return videos[-1].file
 
 
 def further_video_paths(trajectory: Path, facts: Mapping[str, Any]) -> list[Path]:
@@ -380,26 +353,26 @@ def _run(
     return workers.frames(trajectory, indices, shot.view, cameras=shot.cameras)
 
 
-def _all_or_none(videos: Iterable[_Written]) -> list[_Written]:
+def _all_or_none(videos: Iterable[VideoSink]) -> list[VideoSink]:
     """Return the videos as they come; after a failure none of them stays."""
-    written: list[_Written] = []
+    written: list[VideoSink] = []
     try:
         for video in videos:
             written.append(video)
     except BaseException:
         for video in written:
-            _remove(video.file)
+            video.discard()
         raise
     return written
 
 
-def _judge(videos: Iterable[_Written], *, strict: bool) -> None:
+def _judge(videos: Iterable[VideoSink], *, strict: bool) -> None:
     """Warn of those that show nothing; with `strict` the first of them is an error."""
     suspects = [video for video in videos if video.blank.suspicion() is not None]
     for video in suspects[1:] if strict else suspects:
-        video.blank.judge(video.file.path, strict=False)
+        video.blank.judge(video.path, strict=False)
     for video in suspects[:1] if strict else ():
-        video.blank.judge(video.file.path, strict=True)
+        video.blank.judge(video.path, strict=True)
 
 
 def usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:
@@ -409,81 +382,54 @@ def usual_fps(facts: Mapping[str, Any], chosen: ChosenFrames) -> Fraction:
     return (_RATE_OF_ONE_FRAME if rate is None else rate) / chosen.every
 
 
-def _write_video(
-    out: Path,
+def _render_shot(
+    shot: _Shot,
+    footage: Footage,
     draw: Callable[[], Iterable[Frame]],
+    metadata: Callable[[], Mapping[str, Any]],
     *,
-    captions: Iterable[Caption] | None,
-    fps: Fraction,
     on_frame: Callable[[], object],
-) -> tuple[VideoFile, BlankFrames]:
-    """Write the frames, a second time where the encoder was ended from outside."""
+) -> VideoSink:
+    """Write a video, a second time where the encoder was ended from outside.
+
+    Args:
+        shot: the video.
+        footage: what is drawn.
+        draw: draws it.
+        metadata: returns what is known of it, once it is drawn.
+        on_frame: called after every frame, once for each.
+    """
     most = 0
 
-    def tell(number: int) -> None:
+    def film() -> VideoSink:
         nonlocal most
-        if number > most:
-            most = number
-            on_frame()
-
-    try:
-        return _encode(out, draw(), captions=captions, fps=fps, tell=tell)
-    except EncoderError as error:
-        if not _was_ended(error):
+        sink = VideoSink(shot.path, fps=footage.fps)
+        try:
+            # As many captions as frames, or none at all.
+            captions: Iterable[Caption | None]
+            captions = footage.captions or itertools.repeat(None)
+            frames = zip(draw(), captions, strict=False)
+            for number, (frame, caption) in enumerate(frames, 1):
+                sink.write(frame, caption)
+                if number > most:
+                    most = number
+                    on_frame()
+            sink.finish()
+            sink.describe(metadata())
+        except BaseException:
+            # Half a video is of no use: all of it can be rendered again.
+            sink.discard()
             raise
-        logger.warning("The video %s is begun anew: %s", out.name, error)
-    return _encode(out, draw(), captions=captions, fps=fps, tell=tell)
+        return sink
 
-
-def _was_ended(error: EncoderError) -> bool:
-    """Tell whether ffmpeg was killed: by whoever lacked memory, or for hanging."""
-    return (error.returncode or 0) < 0
-
-
-def _encode(
-    out: Path,
-    frames: Iterable[Frame],
-    *,
-    captions: Iterable[Caption] | None,
-    fps: Fraction,
-    tell: Callable[[int], object],
-) -> tuple[VideoFile, BlankFrames]:
-    blank = BlankFrames()
-    writer = VideoWriter(out, fps=fps, frame_hashes=True)
     try:
-        # As many captions as frames, or none at all.
-        said: Iterable[Caption | None] = captions or itertools.repeat(None)
-        for number, (frame, caption) in enumerate(zip(frames, said, strict=False), 1):
-            writer.write(frame if caption is None else annotated(frame, caption))
-            # Without the caption: whatever is written on it, it may show nothing.
-            blank.add(frame)
-            tell(number)
-        # An older video's would not be true of this one.
-        metadata_path(out).unlink(missing_ok=True)
-        writer.close()
-    except BaseException:
-        # Half a video is of no use: all of it can be rendered again.
-        writer.abort()
-        raise
-    assert writer.result is not None
-    return writer.result, blank
-
-
-def _complete(file: VideoFile, metadata: Mapping[str, Any]) -> None:
-    """Write the metadata; without it there is no video, and nothing stays."""
-    try:
-        _write_metadata(file.path, metadata)
-    except BaseException:
-        if not metadata_path(file.path).exists():
-            _remove(file)
-        raise
-
-
-def _remove(file: VideoFile) -> None:
-    """Remove a video; its metadata first, without which there is none."""
-    for path in (metadata_path(file.path), file.path, file.frame_hash_path):
-        if path is not None:
-            path.unlink(missing_ok=True)
+        return film()
+    except EncoderError as error:
+        # Killed, by whoever lacked memory, or for hanging.
+        if (error.returncode or 0) >= 0:
+            raise
+        logger.warning("The video %s is begun anew: %s", shot.path.name, error)
+    return film()
 
 
 def _told(reader: TrajectoryReader) -> dict[str, Any]:
@@ -550,17 +496,13 @@ def _recorded(facts: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def write_that_it_broke(video: Path, metadata: Mapping[str, Any]) -> None:
     """Write the metadata of a video that there will never be."""
-    _write_metadata(video, {**metadata, "empty": True, "broken": True})
+    write_metadata(video, {**metadata, "empty": True, "broken": True})
 
 
 def _why_no_pictures(trajectory: Path, facts: Mapping[str, Any]) -> str:
     refusal = facts.get("refusal")
     why = f": {refusal}" if refusal else ""
     return f"{trajectory} holds states, and nothing that pictures can be made of{why}."
-
-
-def _write_metadata(video: Path, metadata: Mapping[str, Any]) -> None:
-    write_text(metadata_path(video), json_text.dumps(metadata))
 
 
 def _fraction(text: Any) -> Fraction | None:

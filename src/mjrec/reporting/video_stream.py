@@ -18,10 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UnreadableFile
-from ..formats.ffmpeg import FfmpegProcess, every_frame_arguments, run_ffmpeg
+from ..formats.ffmpeg import (
+    FfmpegProcess,
+    as_file,
+    every_frame_arguments,
+    run_ffmpeg,
+)
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, regular_path
-from ..formats.unfinished_video import as_file
 from ..frames import Frame
 
 _BEGIN: Final = 12
@@ -83,7 +87,7 @@ def read_stream(path: Path) -> VideoStream:
         Error: ffmpeg cannot be started.
     """
     arguments = [*_reading(path), "-c", "copy", "-f", "framecrc", "pipe:1"]
-    output = run_ffmpeg(arguments, what=f"The video {path.name} cannot be read.").stdout
+    output = run_ffmpeg(arguments, what=f"The video {path.name} cannot be read.")
     headers: dict[bytes, tuple[int, int]] = {}
     packets: list[tuple[int, int]] = []
     for line in output.splitlines():
@@ -124,17 +128,14 @@ def stream_frames(
 
 def _decoded(stream: VideoStream, indices: Sequence[int]) -> Iterator[Frame]:
     wanted = "+".join(rf"eq(n\,{index})" for index in indices)
-    process = FfmpegProcess(
-        [
-            *_reading(stream.path),
-            *("-vf", f"select={wanted},format=rgb24", *every_frame_arguments()),
-            *("-frames:v", str(len(indices)), "-f", "rawvideo", "pipe:1"),
-        ],
-        what=f"The video {stream.path.name} cannot be decoded.",
-        writes=True,
-    )
+    arguments = [
+        *_reading(stream.path),
+        *("-vf", f"select={wanted},format=rgb24", *every_frame_arguments()),
+        *("-frames:v", str(len(indices)), "-f", "rawvideo", "pipe:1"),
+    ]
+    what = f"The video {stream.path.name} cannot be decoded."
     size = stream.height * stream.width * 3
-    try:
+    with FfmpegProcess(arguments, what=what, writes=True) as process:
         for _ in indices:
             data = _read(process, size)
             if len(data) < size:
@@ -144,9 +145,6 @@ def _decoded(stream: VideoStream, indices: Sequence[int]) -> Iterator[Frame]:
                 )
             frame = np.frombuffer(data, np.uint8)
             yield frame.reshape(stream.height, stream.width, 3)
-    finally:
-        process.kill()
-        process.release()
 
 
 def jpeg_at(stream: VideoStream, seconds: float, *, most_width: int) -> bytes:
@@ -173,7 +171,7 @@ def jpeg_at(stream: VideoStream, seconds: float, *, most_width: int) -> bytes:
             *("-f", "image2pipe", "pipe:1"),
         ],
         what=f"The video {stream.path.name} cannot be decoded.",
-    ).stdout
+    )
 
 
 def _reading(path: Path, *options: str) -> list[str]:

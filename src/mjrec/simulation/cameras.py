@@ -193,3 +193,32 @@ def _index_of_name(model: mujoco.MjModel, name: str) -> int:
             "camera", name, camera_names(model), hint="Or give -1, the free camera."
         )
     return int(index)
+
+
+def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, Any]:
+    """Return a camera as metadata says it: a name, a number, or a free camera's pose.
+
+    Args:
+        model: has the camera.
+        camera: a name, a number (-1 is the free camera) or an `mujoco.MjvCamera`.
+    """
+    if isinstance(camera, str):
+        return camera
+    if not isinstance(camera, mujoco.MjvCamera):
+        return _name_or_number(model, int(camera))
+    if int(camera.type) == int(mujoco.mjtCamera.mjCAMERA_FIXED):
+        return _name_or_number(model, camera.fixedcamid)
+    return {
+        "type": mujoco.mjtCamera(camera.type).name,
+        "trackbodyid": int(camera.trackbodyid),
+        "lookat": camera.lookat.tolist(),
+        "distance": float(camera.distance),
+        "azimuth": float(camera.azimuth),
+        "elevation": float(camera.elevation),
+    }
+
+
+def _name_or_number(model: mujoco.MjModel, number: int) -> str | int:
+    # Unnamed cameras have an empty name.
+    name = model.cam(number).name if number >= 0 else ""
+    return name if name in camera_names(model) and name else number

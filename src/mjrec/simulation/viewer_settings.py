@@ -16,6 +16,13 @@ _FREE = int(mujoco.mjtCamera.mjCAMERA_FREE)
 _FIXED = int(mujoco.mjtCamera.mjCAMERA_FIXED)
 
 
+def option_without_rangefinder() -> mujoco.MjvOption:
+    """Return dm_control's default option, which differs from MuJoCo's in one flag."""
+    option = mujoco.MjvOption()
+    option.flags[mujoco.mjtVisFlag.mjVIS_RANGEFINDER] = False
+    return option
+
+
 def place_free_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
     """Put a camera where the model's fields, as they are now, have the free camera."""
     mujoco.mjv_defaultFreeCamera(model, camera)

@@ -57,7 +57,7 @@ def _convert(path: Path, *, side: int, delay: int, frame_count: int) -> bytes:
         "split[pictures][counted];[counted]palettegen=stats_mode=diff[palette];"
         "[pictures][palette]paletteuse=dither=bayer:bayer_scale=4:diff_mode=rectangle"
     )
-    done = run_ffmpeg(
+    return run_ffmpeg(
         [
             *("-hide_banner", "-loglevel", "error", "-nostdin"),
             *(*skipping, "-threads", "1", "-i", f"file:{path}"),
@@ -66,4 +66,3 @@ def _convert(path: Path, *, side: int, delay: int, frame_count: int) -> bytes:
         ],
         what=f"No preview could be made of {path}.",
     )
-    return done.stdout

@@ -17,9 +17,8 @@ from typing import Final, Self
 import numpy as np
 
 from ...errors import UnreadableFile
-from ...formats.ffmpeg import FfmpegProcess, every_frame_arguments
+from ...formats.ffmpeg import FfmpegProcess, as_file, every_frame_arguments
 from ...formats.regular_files import regular_path
-from ...formats.unfinished_video import as_file
 from .picture_similarity import Planes
 
 _READ_SIZE: Final = 1 << 20

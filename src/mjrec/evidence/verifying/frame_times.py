@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Final
 
 from ...errors import UnreadableFile
-from ...formats.ffmpeg import FfmpegProcess
+from ...formats.ffmpeg import FfmpegProcess, as_file
 from ...formats.regular_files import regular_path
-from ...formats.unfinished_video import as_file
 
 _READ_SIZE: Final = 1 << 16
 _LONGEST_LINE: Final = 4096
@@ -78,19 +77,16 @@ def _lines(path: Path) -> Generator[bytes, None, None]:
         source = regular_path(path)
     except (OSError, ValueError) as error:
         raise UnreadableFile(path, error) from error
-    process = FfmpegProcess(
-        [
-            *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
-            *("-protocol_whitelist", "file", "-f", "mp4", "-i", as_file(source)),
-            *("-map", "0:v:0", "-c", "copy"),
-            # As the file says them, not shifted so that the first is zero.
-            *("-copyts", "-avoid_negative_ts", "disabled"),
-            *("-f", "framecrc", "pipe:1"),
-        ],
-        what=f"When the frames of {path.name} are shown cannot be read.",
-        writes=True,
-    )
-    try:
+    arguments = [
+        *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
+        *("-protocol_whitelist", "file", "-f", "mp4", "-i", as_file(source)),
+        *("-map", "0:v:0", "-c", "copy"),
+        # As the file says them, not shifted so that the first is zero.
+        *("-copyts", "-avoid_negative_ts", "disabled"),
+        *("-f", "framecrc", "pipe:1"),
+    ]
+    what = f"When the frames of {path.name} are shown cannot be read."
+    with FfmpegProcess(arguments, what=what, writes=True) as process:
         rest = b""
         while block := process.read(_READ_SIZE):
             *lines, rest = (rest + block).split(b"\n")
@@ -98,6 +94,3 @@ def _lines(path: Path) -> Generator[bytes, None, None]:
             if len(rest) > _LONGEST_LINE:
                 raise UnreadableFile(path, f"ffmpeg says {rest!r:.80} of it")
         process.wait()
-    finally:
-        process.kill()
-        process.release()

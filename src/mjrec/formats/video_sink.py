@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where all frames end, live and deferred: frames in, one finished video out.
+
+Of images an mp4 with its frame hashes, of text an asciicast. The metadata file comes
+last: where it is, the video is there and whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from ..annotation import Caption, annotated, pillow_version
+from ..blank_frames import BlankFrames
+from ..frames import Frame
+from .asciicast import AsciicastWriter
+from .ffmpeg import ffmpeg_executable
+from .frame_hashes import frame_hash_path
+from .unfinished_video import VideoFile, VideoNote, note_path, write_note
+from .video_metadata import file_facts, metadata_path, write_metadata
+from .video_writer import VideoWriter
+
+
+class VideoSink:
+    """Makes one video, and what belongs to it, of the frames that it is given.
+
+    Args:
+        path: the video: `.mp4` for images, `.json` for text.
+        fps: frames per second.
+        frame_hashes: whether to write the `.framehash` of images.
+        note: returns the metadata so far and the timing for the note beside the
+            unfinished mp4, by which it is finished when this process is killed. None
+            where there is to be none, because it can be rendered again.
+
+    Raises:
+        Error: as `VideoWriter`.
+
+    Attributes:
+        path: the video.
+        blank: whether its frames show anything.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        fps: Fraction,
+        frame_hashes: bool = True,
+        note: Callable[[], tuple[Mapping[str, Any], Mapping[str, Any]]] | None = None,
+    ) -> None:
+        self.path = path
+        self.blank = BlankFrames()
+        self._note = note
+        self._is_annotated = self._is_finished = False
+        self._writer: VideoWriter | AsciicastWriter
+        if path.suffix == ".json":
+            self._writer = AsciicastWriter(path, rate=fps)
+        else:
+            self._writer = VideoWriter(path, fps=fps, frame_hashes=frame_hashes)
+
+    @property
+    def file(self) -> VideoFile | None:
+        """The finished mp4; None before, and for text."""
+        return getattr(self._writer, "result", None)
+
+    def write(self, frame: Frame | str, caption: Caption | None = None) -> None:
+        """Add a frame, and wait while the encoder is behind.
+
+        Args:
+            frame: an image, or text.
+            caption: what is written on the image.
+
+        Raises:
+            Error: as `VideoWriter.write`.
+        """
+        if isinstance(self._writer, AsciicastWriter):
+            assert isinstance(frame, str)
+            self._writer.write(frame)
+            return
+        assert not isinstance(frame, str)
+        if self._note is not None and not self._writer.frame_count:
+            # The note is there before the file that it is about.
+            self._write_note(self._writer, *frame.shape[:2])
+        self._writer.write(frame if caption is None else annotated(frame, caption))
+        self._is_annotated |= caption is not None
+        # Without the caption: whatever is written on it, it may show nothing.
+        self.blank.add(frame)
+
+    def finish(self) -> None:
+        """Give the video its name. Where it was interrupted, another call goes on.
+
+        Raises:
+            Error: as `VideoWriter.close`.
+        """
+        # An older video's would not be true of this one.
+        metadata_path(self.path).unlink(missing_ok=True)
+        self._writer.close()
+        self._is_finished = True
+
+    def describe(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
+        """Write the metadata of the finished video; it may be called again.
+
+        Args:
+            metadata: what is known of it besides.
+
+        Returns:
+            What was written.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        described = {**metadata, **self._facts()}
+        write_metadata(self.path, described)
+        self._forget_note()
+        return described
+
+    def discard(self) -> None:
+        """Leave nothing of the video. An older one stays, unless this has replaced it.
+
+        Idempotent.
+        """
+        self._writer.abort()
+        if self._is_finished:
+            # The metadata first: where that is, the video is.
+            for path in (
+                metadata_path(self.path),
+                self.path,
+                frame_hash_path(self.path),
+            ):
+                path.unlink(missing_ok=True)
+        self._forget_note()
+
+    def _facts(self) -> dict[str, Any]:
+        if self.file is None:
+            return {"encoder_version": {"backend": "TextEncoder", "version": 1}}
+        facts = {**file_facts(self.file), **self.blank.facts()}
+        if self._is_annotated:
+            facts["annotated"] = {"pillow": pillow_version()}
+        return facts
+
+    def _write_note(self, writer: VideoWriter, height: int, width: int) -> None:
+        assert self._note is not None
+        metadata, timing = self._note()
+        write_note(
+            VideoNote(
+                video=writer.unfinished(height, width),
+                metadata=metadata,
+                timing=timing,
+                ffmpeg_size=Path(ffmpeg_executable()).stat().st_size,
+            )
+        )
+
+    def _forget_note(self) -> None:
+        if self._note is not None:
+            note_path(self.path).unlink(missing_ok=True)

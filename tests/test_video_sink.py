@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sink: frames in, one finished video with its metadata out."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from full_disk import file_size_limit
+from recordings import frames_of
+
+from mjrec import FileNotWritten
+from mjrec.annotation import Caption
+from mjrec.formats.unfinished_video import note_path, read_note
+from mjrec.formats.video_sink import VideoSink
+from mjrec.frames import Frame
+
+
+def moving(number: int) -> Frame:
+    frame = np.full((48, 96, 3), 90, np.uint8)
+    frame[:, 5 * number : 5 * number + 20] = (200, 40, 10)
+    return frame
+
+
+def names(directory: Path) -> list[str]:
+    return sorted(path.name for path in directory.iterdir())
+
+
+def film(path: Path, count: int = 4) -> VideoSink:
+    """Return a sink that has been given some frames."""
+    sink = VideoSink(path, fps=Fraction(20))
+    for number in range(count):
+        sink.write(moving(number))
+    return sink
+
+
+def test_the_metadata_comes_last_and_tells_of_the_file(tmp_path: Path) -> None:
+    """Until then, no final name says that there is a video."""
+    sink = film(tmp_path / "v.mp4")
+    assert all(name.startswith(".") for name in names(tmp_path))
+    sink.finish()
+    assert names(tmp_path) == ["v.framehash", "v.mp4"]
+    written = sink.describe({"episode_id": 7})
+    assert json.loads((tmp_path / "v.meta.json").read_text()) == written
+    assert sink.file is not None
+    assert written["file_sha256"] == sink.file.file_sha256
+    assert (written["episode_id"], written["height"]) == (7, 48)
+    assert len(frames_of(tmp_path / "v.mp4")) == 4
+
+
+def test_discarded_it_leaves_an_older_video(tmp_path: Path) -> None:
+    """But for one that it has replaced."""
+    older = film(tmp_path / "v.mp4", 2)
+    older.finish()
+    older.describe({})
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    film(tmp_path / "v.mp4").discard()
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    newer = film(tmp_path / "v.mp4")
+    newer.finish()
+    newer.discard()
+    newer.discard()
+    assert names(tmp_path) == []
+
+
+def test_metadata_that_has_no_room_can_be_written_later(tmp_path: Path) -> None:
+    """The video stays meanwhile."""
+    sink = film(tmp_path / "v.mp4")
+    sink.finish()
+    with file_size_limit(100), pytest.raises(FileNotWritten, match=r"v\.meta\.json"):
+        sink.describe({"episode_id": 0})
+    assert names(tmp_path) == ["v.framehash", "v.mp4"]
+    assert sink.describe({"episode_id": 0})["width"] == 96
+    assert names(tmp_path) == ["v.framehash", "v.meta.json", "v.mp4"]
+
+
+def test_a_note_says_what_an_unfinished_video_is(tmp_path: Path) -> None:
+    """It is there before the video is, and goes when the metadata is there."""
+    timing = {"timestep": Fraction(1, 20), "stride": 1, "frames_per_step": 1}
+    path = tmp_path / "v.mp4"
+    sink = VideoSink(path, fps=Fraction(20), note=lambda: ({"seed": 3}, timing))
+    assert names(tmp_path) == []
+    sink.write(moving(0))
+    note = read_note(note_path(path))
+    assert (note.metadata, note.timing) == ({"seed": 3}, timing)
+    assert (note.video.path, note.video.height) == (path, 48)
+    assert note.video.temporary.exists()
+    sink.finish()
+    sink.describe({})
+    assert names(tmp_path) == ["v.framehash", "v.meta.json", "v.mp4"]
+
+
+def test_a_caption_is_on_the_frame_and_hides_no_blank_one(tmp_path: Path) -> None:
+    """What shows nothing shows nothing, whatever is written on it."""
+    sink = VideoSink(tmp_path / "v.mp4", fps=Fraction(20))
+    for step in range(3):
+        caption = Caption(episode_id=0, step=step, time=None, reward=0.0)
+        sink.write(np.zeros((48, 96, 3), np.uint8), caption)
+    sink.finish()
+    written = sink.describe({})
+    assert written["suspect_black"]
+    assert written["annotated"]["pillow"]
+    assert max(frame.max() for frame in frames_of(tmp_path / "v.mp4")) > 100
+
+
+def test_text_has_the_same_end(tmp_path: Path) -> None:
+    """An asciicast with its metadata, or nothing."""
+    sink = VideoSink(tmp_path / "v.json", fps=Fraction(4))
+    sink.write("a\n")
+    sink.finish()
+    assert sink.describe({})["encoder_version"]["backend"] == "TextEncoder"
+    assert names(tmp_path) == ["v.json", "v.meta.json"]
+    sink.discard()
+    assert names(tmp_path) == []
