@@ -35,7 +35,7 @@ def grey(frame: int) -> int:
 
 
 class Painter:
-    """Draws pictures of trajectories of this module, as `DrawingWorkers` would.
+    """Draws pictures of trajectories of this module, as `WorkerPool` would.
 
     Args:
         size: of the pictures.

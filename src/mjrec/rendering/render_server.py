@@ -42,8 +42,6 @@ from .render_service import ALL_SAID
 
 _NICE = 10
 _SECONDS_BETWEEN_REPORTS = 0.2
-# How long workers without work keep their memory.
-_SECONDS_OF_PATIENCE = 20.0
 _SECONDS_BETWEEN_LOOKS = 0.05
 _SECONDS_TO_LEAVE = 2.0
 _READ_SIZE = 1 << 16
@@ -122,9 +120,7 @@ class _Service:
 
     def _wait_for_work(self) -> None:
         self._finisher.rest()
-        if not self._inbox.wait(_SECONDS_OF_PATIENCE):
-            self._finisher.dismiss_workers()
-            self._inbox.wait(None)
+        self._inbox.wait()
 
     def _take_in(self) -> bool:
         """Take what was said, and return whether there is something to do."""
@@ -172,13 +168,9 @@ class _Inbox:
         self._next.clear()
         return names
 
-    def wait(self, seconds: float | None) -> bool:
-        """Wait until something is said, and return whether it was."""
-        try:
-            self._take(self._names.get(timeout=seconds))
-        except queue.Empty:
-            return False
-        return True
+    def wait(self) -> None:
+        """Wait until something is said."""
+        self._take(self._names.get())
 
     def _take(self, name: str | None) -> None:
         if name is None:

@@ -28,8 +28,8 @@ from ..child_python import (
 )
 from ..errors import Error
 from ..patience import Patience, patience_s
-from .cpu_slots import check_workers
 from .progress import Progress
+from .shared_pool import check_workers
 
 logger = logging.getLogger(__name__)
 

@@ -47,6 +47,7 @@ from ..rates import to_rate
 from ..recorder.endings import KILLED
 from ..recorder.versions import versions
 from .captions import Captions
+from .pool import WorkerPool
 from .recorded_facts import open_for_rendering
 from .recorded_pictures import (
     ChosenFrames,
@@ -55,7 +56,6 @@ from .recorded_pictures import (
     warn_of_other_pictures,
 )
 from .views import PlainCamera, View, plain_camera
-from .workers import DrawingWorkers
 
 logger = logging.getLogger(__name__)
 
@@ -116,7 +116,7 @@ class _Written:
 def render_video(
     trajectory: Path,
     *,
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     view: View | None = None,
     max_fps: float | Fraction | None = None,
     fps: float | Fraction | None = None,
@@ -192,7 +192,7 @@ def render_video(
 def render_footage(
     footage: Footage,
     *,
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     view: View,
     out: Path | None = None,
     strict: bool = False,
@@ -364,7 +364,7 @@ def is_annotated(facts: Mapping[str, Any]) -> bool:
 
 
 def _drawn(
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     runs: Sequence[tuple[Path, Sequence[int]]],
     shot: _Shot,
 ) -> Iterable[Frame]:
@@ -374,7 +374,7 @@ def _drawn(
 
 
 def _run(
-    workers: DrawingWorkers, trajectory: Path, indices: Sequence[int], shot: _Shot
+    workers: WorkerPool, trajectory: Path, indices: Sequence[int], shot: _Shot
 ) -> Iterable[Frame]:
     if shot.cameras is None:
         return workers.frames(trajectory, indices, shot.view)

@@ -8,16 +8,20 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from processes import children
+from rides import record
 
 from mjrec import DirectoryNotWritable
 from mjrec.machine import usable_cpus
-from mjrec.rendering.cpu_slots import CpuSlots
+from mjrec.rendering import shared_pool
+from mjrec.rendering.shared_pool import CpuSlots, SharedPool
 
 # Takes what is free of the two CPUs of argv[1], says how many, and waits.
 HOLDER = """
 import pathlib, sys
-from mjrec.rendering.cpu_slots import CpuSlots
+from mjrec.rendering.shared_pool import CpuSlots
 slots = CpuSlots(pathlib.Path(sys.argv[1]), total=2)
 print(slots.take(int(sys.argv[2])), flush=True)
 sys.stdin.read()
@@ -109,6 +113,30 @@ def test_the_cpus_of_a_dead_process_are_free(tmp_path: Path) -> None:
             slots_of(tmp_path).take(1)
         holder.kill()
     assert slots_of(tmp_path).take(2) == 2
+
+
+def test_workers_stay_while_cpus_come_and_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others take one between two videos; nobody starts the workers anew."""
+    ride = record(tmp_path)
+    monkeypatch.setattr(shared_pool, "usable_cpus", lambda: 2)
+    before = children()
+    shared = SharedPool(tmp_path, workers=None)
+    list(shared.at_work().frames(ride.path, range(4)))
+    both = children() - before
+    assert len(both) == 2
+    shared.rest()
+    other = slots_of(tmp_path)
+    other.take(1)
+    alone = list(shared.at_work().frames(ride.path, range(4)))
+    shared.rest()
+    other.give_back()
+    together = list(shared.at_work().frames(ride.path, range(4)))
+    assert children() - before == both
+    assert np.array_equal(alone, together)
+    shared.close()
+    assert children() == before
 
 
 def test_a_directory_that_is_gone(tmp_path: Path) -> None:

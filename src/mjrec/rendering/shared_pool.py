@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The machine's CPUs, shared by everybody who renders into one directory.
+"""The machine's CPUs, shared by all processes that render into one directory.
 
-A CPU is a lock file, `.openaigym.render.<number>.lock`; whoever holds it may keep one
-worker busy. Eight environments in eight processes that record into one directory on a
-machine with two CPUs so have two workers between them, not sixteen.
+A CPU is a lock file, `.openaigym.render.<number>.lock`; the process that holds it may
+keep one worker busy. Eight environments in eight processes that record into one
+directory on a machine with two CPUs so have two workers at work, not sixteen.
 """
 
 from __future__ import annotations
@@ -17,8 +17,57 @@ from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name
 from ..machine import usable_cpus
+from .pool import WorkerPool
 
 _SECONDS_BETWEEN_TRIES = 0.1
+
+
+class SharedPool:
+    """A pool of workers, of which as many draw as CPUs of the directory are free.
+
+    The workers stay from video to video; only how many of them draw changes.
+
+    Args:
+        directory: the monitor directory.
+        workers: how many, whatever is free; None is one for each free CPU.
+        wait: called with seconds to wait while no CPU is free.
+
+    Raises:
+        InvalidArgument: `workers` is no number of processes.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        workers: int | None,
+        wait: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self._fixed = check_workers(workers)
+        self._slots = CpuSlots(directory, wait=wait)
+        self._pool: WorkerPool | None = None
+
+    def at_work(self) -> WorkerPool:
+        """Return the workers, to be used until the next call of any method.
+
+        Waits for a free CPU, unless a number of workers was asked for.
+        """
+        limit = self._fixed or self._slots.take(self._slots.total)
+        if self._pool is None:
+            self._pool = WorkerPool(self._fixed or self._slots.total)
+        self._pool.limit = limit
+        return self._pool
+
+    def rest(self) -> None:
+        """Give the CPUs back: there is nothing to draw. The workers stay."""
+        self._slots.give_back()
+
+    def close(self) -> None:
+        """End the workers at once and give the CPUs back. Idempotent."""
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
+        self.rest()
 
 
 class CpuSlots:
@@ -27,7 +76,7 @@ class CpuSlots:
     Args:
         directory: the monitor directory.
         total: how many there are; those that this process can keep busy, if None.
-        wait: called with seconds to wait while all are in other hands.
+        wait: called with seconds to wait while none is free.
 
     Attributes:
         total: how many there are.
