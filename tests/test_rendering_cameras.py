@@ -35,7 +35,7 @@ from mjrec.formats.video_metadata import is_done, metadata_path
 from mjrec.rendering import again, shared_pool
 from mjrec.rendering.again import Variant, render_again
 from mjrec.rendering.captions import Captions
-from mjrec.rendering.drawing import TrajectoryDrawing
+from mjrec.rendering.drawing import trajectory_drawing
 from mjrec.rendering.finishing import EpisodeFinisher, finish_pending
 from mjrec.rendering.pending import EpisodeKey, look_at
 from mjrec.rendering.pool import WorkerPool
@@ -425,7 +425,7 @@ def test_a_grid_is_what_each_camera_shows(tmp_path: Path) -> None:
     (tmp_path / "side").mkdir()
     side = record_ride(tmp_path / "side", camera="side")
     ride = record_ride(tmp_path)
-    drawing = TrajectoryDrawing(ride.path, View(), cameras=[None, "side", "rider"])
+    drawing = trajectory_drawing(ride.path, View(), cameras=[None, "side", "rider"])
     try:
         assert drawing.size == (2 * HEIGHT, 2 * WIDTH)
         for number in (*range(FRAMES), 3, 7, 0):
@@ -448,7 +448,7 @@ def test_a_camera_that_follows_does_not_depend_on_the_order(tmp_path: Path) -> N
     view = View(
         camera={"type": tracking, "trackbodyid": 1, "distance": 4, "elevation": -30}
     )
-    drawing = TrajectoryDrawing(ride.path, view)
+    drawing = trajectory_drawing(ride.path, view)
     frames = [drawing.draw(number) for number in range(FRAMES)]
     for number in (4, 2, 8, 0, 0, 5, 7):
         np.testing.assert_array_equal(drawing.draw(number), frames[number])

@@ -33,6 +33,7 @@ from mjrec.errors import (
     UnknownName,
     UnreadableFile,
 )
+from mjrec.gl import Probe, choice
 from mjrec.rendering.pool import WorkerPool, _environment
 from mjrec.rendering.views import View
 
@@ -270,7 +271,7 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
         import pathlib, threading
         import mjrec.rendering.worker as worker
         from mjrec.rendering import drawing
-        draw = drawing.TrajectoryDrawing.draw
+        draw = drawing.Drawing.draw
         hung = pathlib.Path({str(tmp_path / "hung")!r})
         def wait_for_a_driver_that_hangs():
             hung.touch()
@@ -281,7 +282,7 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
             if index == 3 and not hung.exists():
                 wait_for_a_driver_that_hangs()
             return draw(self, index, **options)
-        drawing.TrajectoryDrawing.draw = hang_once
+        drawing.Drawing.draw = hang_once
         worker.main()
         """,
     )
@@ -323,11 +324,11 @@ def test_a_slow_worker_does_not_hang(
         import time
         import mjrec.rendering.worker as worker
         from mjrec.rendering import drawing
-        draw = drawing.TrajectoryDrawing.draw
+        draw = drawing.Drawing.draw
         def slowly(self, index, **options):
             time.sleep(0.3)
             return draw(self, index, **options)
-        drawing.TrajectoryDrawing.draw = slowly
+        drawing.Drawing.draw = slowly
         worker.main()
         """,
     )
@@ -348,7 +349,7 @@ def test_a_crash_says_where(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None
         from mjrec.rendering import drawing
         def crash_in_the_driver(*arguments, **options):
             os.kill(os.getpid(), signal.SIGSEGV)
-        drawing.TrajectoryDrawing.draw = crash_in_the_driver
+        drawing.Drawing.draw = crash_in_the_driver
         worker.main()
         """,
     )
@@ -378,12 +379,12 @@ def test_what_a_driver_prints_does_not_disturb(
         import os, sys
         import mjrec.rendering.worker as worker
         from mjrec.rendering import drawing
-        draw = drawing.TrajectoryDrawing.draw
+        draw = drawing.Drawing.draw
         def loud(*arguments, **options):
             os.write(1, b"x" * 100_000)
             print("a driver speaks")
             return draw(*arguments, **options)
-        drawing.TrajectoryDrawing.draw = loud
+        drawing.Drawing.draw = loud
         worker.main()
         """,
     )
@@ -471,7 +472,7 @@ def test_forgotten_workers_end(ride: Ride) -> None:
 
 
 def test_ctrl_c_while_a_picture_is_drawn(ride: Ride, one: WorkerPool) -> None:
-    """It reaches only the parent; the worker draws on for the next call."""
+    """It reaches only the parent; another worker draws for the next call."""
     list(one.frames(ride.path, [0]))
     [pid] = pids(one)
     large = View(height=1000, width=1400)
@@ -479,8 +480,9 @@ def test_ctrl_c_while_a_picture_is_drawn(ride: Ride, one: WorkerPool) -> None:
         list(one.frames(ride.path, range(FRAMES), large))
 
     assert np.array_equal(list(one.frames(ride.path, [4])), [ride.frames[4]])
-    assert pids(one) == [pid]
-    assert os.getsid(pid) == pid
+    [another] = pids(one)
+    assert another != pid
+    assert os.getsid(another) == another
 
 
 def test_a_worker_ends_with_its_input_in_mid_drawing(
@@ -508,6 +510,7 @@ CALLER = """
 import os, sys
 import numpy as np
 from pathlib import Path
+from mjrec.gl import Probe, choice
 from mjrec.rendering.pool import WorkerPool, _environment
 with WorkerPool(2) as pool:
     frames = list(pool.frames(Path(os.environ["RIDE"]), range(9)))
@@ -584,6 +587,7 @@ def test_a_killed_parent_leaves_no_workers(ride: Ride) -> None:
     script = """
 import os, signal, sys, time
 from pathlib import Path
+from mjrec.gl import Probe, choice
 from mjrec.rendering.pool import WorkerPool, _environment
 pool = WorkerPool(2)
 frames = pool.frames(Path(os.environ["RIDE"]), range(9))
@@ -627,6 +631,7 @@ def test_leaving_in_mid_drawing_is_silent(ride: Ride) -> None:
     script = """
 import os
 from pathlib import Path
+from mjrec.gl import Probe, choice
 from mjrec.rendering.pool import WorkerPool, _environment
 pool = WorkerPool(2)
 frames = pool.frames(Path(os.environ["RIDE"]), [0] * 1000)
@@ -689,17 +694,8 @@ def test_a_backend_that_does_not_work(
 
 def test_no_backend_works(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None:
     """One error with the reasons of all; the workers may be asked again."""
-    use_process(
-        monkeypatch,
-        """
-        import sys
-        import mjrec.gl.choice, mjrec.gl.probing
-        from mjrec.gl.probing import Probe
-        mjrec.gl.choice.probe = lambda name: Probe(name, False, cause="it is broken")
-        from mjrec.rendering import worker
-        worker.main()
-        """,
-    )
+    broken = Probe("", False, cause="it is broken")
+    monkeypatch.setattr(choice, "probe", lambda name: broken)
     monkeypatch.setenv("MUJOCO_GL", "off")
     with WorkerPool(2) as pool:
         for _ in range(2):
@@ -736,17 +732,16 @@ def test_warnings_of_workers_are_logged_here(
     use_process(
         monkeypatch,
         """
-        import logging, os
+        import logging
         from mjrec.rendering import worker
-        def use_gl():
+        open_drawing = worker.open_drawing
+        def open_and_warn(*arguments):
             logging.getLogger("x").error("no %s", "GPU")
-            os.environ["MUJOCO_GL"] = "egl"
-            return "egl"
-        worker.use_gl = use_gl
+            return open_drawing(*arguments)
+        worker.open_drawing = open_and_warn
         worker.main()
         """,
     )
-    monkeypatch.setenv("MUJOCO_GL", "")
     with WorkerPool(1) as pool:
         list(pool.frames(ride.path, [0]))
     levels = {r.getMessage(): r.levelno for r in caplog.records}

@@ -6,13 +6,14 @@ from __future__ import annotations
 import collections
 import contextlib
 import fcntl
+import itertools
 import json
 import logging
 import os
 import selectors
 import struct
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -23,6 +24,7 @@ from ..carried_errors import unpacked
 from ..child_python import Child
 from ..errors import ClosedError, Error, GLError, InvalidArgument
 from ..frames import Frame
+from ..gl import backend_for_children
 from ..gl.backends import (
     backend_in_environment,
     environment_for,
@@ -34,8 +36,8 @@ from .views import PlainCamera, View, plain_camera
 
 logger = logging.getLogger(__name__)
 
-# What a worker sends is a kind, the number of the job, and so many bytes.
-HEADER = struct.Struct("=cIQ")
+# What a worker sends begins with its kind and length.
+HEADER = struct.Struct("=cQ")
 FRAME, TEXT = b"F", b"T"
 
 _MOST_BUFFERED = 2
@@ -54,11 +56,11 @@ class WorkerPool:
     in the log.
 
     The processes are started as they are needed, or by `start`, and stay until `close`,
-    garbage collection or the end of this process.
+    garbage collection or the end of this process. Only one that is given up in the
+    midst of a job is ended, and started again for the next.
 
     They use the backend that `MUJOCO_GL` names. Where it names none, or turns rendering
-    off (which is for the simulation), the first of them chooses one that works, as
-    `mjrec.use_gl` does.
+    off (which is for the simulation), it is the first that works, as of `mjrec.use_gl`.
 
     For one thread at a time.
 
@@ -95,8 +97,8 @@ class WorkerPool:
         self.limit = count
         self.gl_facts: dict[str, Any] = {}
         self._has_drawn = False
-        self._job: _Job | None = None
-        self._jobs = 0
+        # The number of the call whose frames are drawn.
+        self._call = 0
         self._closed = False
         self._process_id = os.getpid()
 
@@ -104,12 +106,12 @@ class WorkerPool:
         """Start the workers now, so that the first frame comes sooner.
 
         Raises:
+            GLError: no backend works here.
             Error: one cannot be started.
         """
         self._check_usable()
         for worker in self._workers[: self.limit]:
-            if worker.child is None and self._can_start_one():
-                worker.start(self._environ)
+            self._start(worker)
 
     def frames(
         self,
@@ -155,24 +157,14 @@ class WorkerPool:
         As `frames`. Frames that an earlier call has not given yet are given up.
         """
         self._check_usable()
-        self._give_up()
-        if not indices:
-            return iter(())
-        self._jobs += 1
-        self._job = job = _Job(self._jobs, drawing, indices, stride=self.limit)
-        for first, worker in enumerate(self._workers[: job.stride]):
-            worker.take(job, first)
-        try:
-            self._settle(job, 0)
-        except BaseException:
-            self._give_up()
-            raise
-        return self._delivered(job)
+        self._call += 1
+        drawn = self._drawn(dict(drawing), indices, self._call)
+        first = list(itertools.islice(drawn, 1))
+        return itertools.chain(first, drawn)
 
     def close(self) -> None:
         """End the processes at once, whatever they are at. Idempotent."""
         self._closed = True
-        self._job = None
         for worker in self._workers:
             worker.end()
 
@@ -187,7 +179,9 @@ class WorkerPool:
     ) -> None:
         self.close()
 
-    def _check_usable(self) -> None:
+    def _check_usable(self, call: int | None = None) -> None:
+        if call not in (None, self._call):
+            raise ClosedError("A later call has taken the workers over.")
         if self._closed:
             raise ClosedError("The pool of workers is closed.")
         if os.getpid() != self._process_id:
@@ -196,106 +190,90 @@ class WorkerPool:
                 "in the process that uses it."
             )
 
-    def _can_start_one(self) -> bool:
-        # Where no backend is named, the first one chooses it for all.
-        return "MUJOCO_GL" in self._environ or not any(w.child for w in self._workers)
+    def _start(self, worker: _Worker) -> None:
+        if "MUJOCO_GL" not in self._environ:
+            self._environ = environment_for(backend_for_children(), self._environ)
+        worker.start(self._environ)
 
-    def _delivered(self, job: _Job) -> Iterator[Frame]:
+    def _drawn(
+        self, drawing: Mapping[str, Any], indices: Sequence[int], call: int
+    ) -> Iterator[Frame]:
+        workers = self._workers[: self.limit]
         try:
-            for position in range(len(job.indices)):
-                worker = self._settle(job, position)
+            for first, worker in enumerate(workers):
+                positions = range(first, len(indices), len(workers))
+                worker.take(drawing, indices, positions)
+            for position in range(len(indices)):
+                worker = workers[position % len(workers)]
+                while not worker.arrived:
+                    if worker.error is not None:
+                        raise worker.error
+                    self._wait_for_news(workers)
+                    self._check_usable(call)
                 frame = worker.arrived.popleft()
                 # Before the caller has it: it may be busy with it for long.
-                self._listen(job, 0)
+                self._listen(workers, 0)
                 yield frame
+                self._check_usable(call)
         finally:
-            if self._job is job and not self._closed:
-                self._give_up()
+            if self._call == call:
+                for worker in workers:
+                    worker.leave()
 
-    def _settle(self, job: _Job, position: int) -> _Worker:
-        """Return the worker of a position when that frame is there, or raise."""
-        worker = self._workers[position % job.stride]
-        while True:
-            self._check_usable()
-            if self._job is not job:
-                raise ClosedError("A later call has taken the workers over.")
-            if worker.arrived:
-                return worker
-            if worker.error is not None:
-                raise worker.error
-            self._order(job)
-            self._wait_for_news(job)
-
-    def _order(self, job: _Job) -> None:
-        """Let all begin who have not, and can."""
-        for worker in self._workers[: job.stride]:
-            if not worker.is_at_work:
-                if worker.child is None:
-                    if not self._can_start_one():
-                        return
-                    worker.start(self._environ)
-                worker.begin()
-
-    def _wait_for_news(self, job: _Job) -> None:
+    def _wait_for_news(self, workers: Sequence[_Worker]) -> None:
         """Wait until a worker says something; end those that have not for too long."""
-        hungry = self._hungry(job)
+        for worker in workers:
+            if worker.may_send and worker.child is None:
+                self._start(worker)
+                worker.begin()
+        hungry = [worker for worker in workers if worker.may_send]
         seconds = min(worker.patience.begin_slice() for worker in hungry)
-        heard = self._listen(job, seconds)
+        heard = self._listen(hungry, seconds)
         for worker in hungry:
             worker.patience.end_slice()
             if worker in heard:
                 worker.patience.renew()
             elif worker.patience.is_over:
-                self._end_hanging(job, worker)
+                self._end_hanging(worker)
 
-    def _hungry(self, job: _Job) -> list[_Worker]:
-        """Return the workers that are drawing and may send more."""
-        return [
-            worker
-            for worker in self._workers[: job.stride]
-            if worker.is_at_work and worker.may_send(job)
-        ]
-
-    def _listen(self, job: _Job, seconds: float) -> list[_Worker]:
+    def _listen(self, workers: Sequence[_Worker], seconds: float) -> list[_Worker]:
         """Take in what the workers send, waiting so long for it; return who sent."""
         with selectors.PollSelector() as selector:
-            for worker in self._hungry(job):
-                assert worker.child is not None
-                selector.register(worker.child.answers, selectors.EVENT_READ, worker)
+            for worker in workers:
+                if worker.child is not None and worker.may_send:
+                    selector.register(
+                        worker.child.answers, selectors.EVENT_READ, worker
+                    )
             heard = [key.data for key, _ in selector.select(seconds)]
         for worker in heard:
             try:
-                self._take_in(job, worker)
+                self._take_in(worker)
             except EOFError:
-                self._replace(job, worker, "died", worker.last_words())
+                assert worker.child is not None
+                worker.lose("died", worker.child.last_words())
             except BaseException:
-                # Ctrl-C, in the midst of a message: what follows cannot be understood.
+                # Ctrl-C, in the midst of a message: what follows makes no sense.
                 worker.end()
                 raise
         return heard
 
-    def _take_in(self, job: _Job, worker: _Worker) -> None:
-        while worker.may_send(job) and (message := worker.next_message()):
-            kind, number, content = message
+    def _take_in(self, worker: _Worker) -> None:
+        while worker.may_send and (message := worker.next_message()):
+            kind, content = message
             if kind == FRAME:
-                if number == job.number:
-                    self._has_drawn = True
-                    frame = np.frombuffer(content, np.uint8).reshape(worker.shape)
-                    worker.arrived.append(frame)
-                    worker.owes += job.stride
+                self._has_drawn = True
+                worker.add(content)
                 continue
             said = json.loads(content)
             if "log" in said:
                 logger.log(said["log"][0], "%s", said["log"][1])
-            elif "backend" in said:
-                self._environ = environment_for(said["backend"], self._environ)
-            elif number == job.number and "error" in said:
+            elif "error" in said:
                 worker.error = unpacked(said["error"])
-            elif number == job.number:
+            else:
                 worker.shape = (*said["size"], 3)
                 self.gl_facts = said["gl"]
 
-    def _end_hanging(self, job: _Job, worker: _Worker) -> None:
+    def _end_hanging(self, worker: _Worker) -> None:
         assert worker.child is not None
         seconds = worker.patience.seconds
         logger.error(
@@ -310,35 +288,7 @@ class WorkerPool:
             "in the log"
         )
         # Where nothing was ever drawn, it is not for the sake of this frame.
-        kind = Error if self._has_drawn else GLError
-        self._replace(job, worker, "hung", how, kind=kind)
-
-    def _replace(
-        self,
-        job: _Job,
-        worker: _Worker,
-        what: str,
-        how: str,
-        *,
-        kind: type[Error] = Error,
-    ) -> None:
-        """Let another one begin at the frame that a lost worker owes, just once."""
-        worker.end()
-        if worker.lost_at == worker.owes:
-            worker.error = kind(
-                f"A worker {what} while drawing frame {job.indices[worker.owes]} of "
-                f"{job}, which was the second try: {how}"
-            )
-            return
-        worker.lost_at = worker.owes
-        logger.warning("A drawing worker %s and is replaced: %s", what, how)
-
-    def _give_up(self) -> None:
-        """Want nothing more of the job there is."""
-        self._jobs += 1
-        self._job = None
-        for worker in self._workers:
-            worker.drop(self._jobs)
+        worker.lose("hung", how, kind=Error if self._has_drawn else GLError)
 
 
 class _Worker:
@@ -346,23 +296,30 @@ class _Worker:
 
     Attributes:
         arrived: the frames that it has sent and that were not taken.
-        owes: the position of the next one.
-        error: what there is instead of that.
-        lost_at: the position that a process before has died at.
+        owes: the positions of those that are to come.
+        error: what there is instead of the next one.
     """
 
     def __init__(self) -> None:
         self.child: Child | None = None
         self.patience = Patience()
         self.shape = (0, 0, 3)
-        self.is_at_work = False
         self.arrived: collections.deque[Frame] = collections.deque()
-        self.owes = 0
+        self.owes = range(0)
         self.error: Error | None = None
-        self.lost_at: int | None = None
-        self._job: _Job | None = None
+        self._lost_at: int | None = None
+        self._drawing: Mapping[str, Any] = {}
+        self._indices: Sequence[int] = ()
+
+    @property
+    def may_send(self) -> bool:
+        is_full = len(self.arrived) >= _MOST_BUFFERED
+        return bool(self.owes) and self.error is None and not is_full
 
     def start(self, environ: Mapping[str, str]) -> None:
+        """Start the process, if there is none."""
+        if self.child is not None:
+            return
         try:
             self.child = Child("mjrec.rendering.worker", environ=environ)
         except OSError as error:
@@ -374,128 +331,100 @@ class _Worker:
         # The system may grant no more than it has.
         with contextlib.suppress(OSError):
             fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-        self._messages = _Messages(pipe)
+        self._messages = _messages(pipe)
 
-    def take(self, job: _Job, first: int) -> None:
-        """Take over a part of a job, from the position `first` on."""
-        self._job = job
-        self.owes = first
+    def take(
+        self, drawing: Mapping[str, Any], indices: Sequence[int], positions: range
+    ) -> None:
+        """Take over a part of a job."""
+        self.leave()
+        self._drawing, self._indices, self.owes = drawing, indices, positions
+        if self.owes and self.child is not None:
+            self.begin()
 
     def begin(self) -> None:
         """Tell the process what to draw."""
-        assert self._job is not None
-        self._send(self._job.order(self.owes))
-        self.is_at_work = True
+        assert self.child is not None
+        runs = _runs(self._indices[position] for position in self.owes)
+        order = json.dumps({"drawing": self._drawing, "runs": runs})
         self.patience.renew()
+        # One that has died is noticed when it is listened to.
+        with contextlib.suppress(OSError):
+            self.child.orders.write(order.encode() + b"\n")
 
-    def drop(self, later: int) -> None:
-        """Forget the job, and let the process stop, whose next job is `later`."""
-        if self.is_at_work:
-            self._send({"job": later})
-        self._job = self.error = self.lost_at = None
-        self.is_at_work = False
+    def leave(self) -> None:
+        """Forget the job; a process that has more to send of it is ended."""
+        if self.owes and self.error is None:
+            self.end()
+        self.owes = range(0)
+        self.error = self._lost_at = None
         self.arrived.clear()
 
-    def may_send(self, job: _Job) -> bool:
-        is_done = self.error is not None or self.owes >= len(job.indices)
-        return not is_done and len(self.arrived) < _MOST_BUFFERED
+    def next_message(self) -> tuple[bytes, bytearray] | None:
+        """Return what it has sent; None if nothing more has come.
 
-    def next_message(self) -> tuple[bytes, int, bytearray] | None:
+        Raises:
+            EOFError: it has ended.
+        """
         assert self.child is not None
         self.child.forget_words()
-        return self._messages.next()
+        return next(self._messages)
 
-    def last_words(self) -> str:
-        assert self.child is not None
-        return self.child.last_words()
+    def add(self, frame: bytearray) -> None:
+        self.arrived.append(np.frombuffer(frame, np.uint8).reshape(self.shape))
+        self.owes = self.owes[1:]
+
+    def lose(self, what: str, how: str, *, kind: type[Error] = Error) -> None:
+        """End the process; the second one that is lost at a frame is an error."""
+        self.end()
+        position = self.owes.start
+        if self._lost_at == position:
+            source = self._drawing.get("trajectory", "the given states")
+            self.error = kind(
+                f"A worker {what} while drawing frame {self._indices[position]} of "
+                f"{source}, which was the second try: {how}"
+            )
+        else:
+            logger.warning("A drawing worker %s and is replaced: %s", what, how)
+        self._lost_at = position
 
     def end(self) -> None:
         """End the process, whatever it is at. Idempotent."""
         child, self.child = self.child, None
-        self.is_at_work = False
         if child is not None:
             child.end()
 
-    def _send(self, order: Mapping[str, Any]) -> None:
-        assert self.child is not None
-        # One that has died is noticed when it is listened to. At interpreter exit the
-        # pipe may be closed.
-        with contextlib.suppress(OSError, ValueError):
-            self.child.orders.write(json.dumps(order).encode() + b"\n")
+
+def _messages(pipe: int) -> Iterator[tuple[bytes, bytearray] | None]:
+    """Yield kind and content of what comes through a pipe, None where it has to wait.
+
+    Raises:
+        EOFError: the pipe has ended.
+    """
+    while True:
+        header = yield from _received(pipe, HEADER.size)
+        kind, size = HEADER.unpack(header)
+        content = yield from _received(pipe, size)
+        yield kind, content
 
 
-class _Job:
-    """What one caller wants; a position is a frame's place in the caller's order."""
-
-    def __init__(
-        self,
-        number: int,
-        drawing: Mapping[str, Any],
-        indices: Sequence[int],
-        *,
-        stride: int,
-    ) -> None:
-        self.number = number
-        self.stride = stride
-        self.indices = indices
-        self._drawing = drawing
-        self._runs = _runs(indices)
-
-    def order(self, first: int) -> dict[str, Any]:
-        """Return what a worker is told that draws from the position `first` on."""
-        return {
-            "job": self.number,
-            "drawing": self._drawing,
-            "runs": self._runs,
-            "first": first,
-            "stride": self.stride,
-        }
-
-    def __str__(self) -> str:
-        return str(self._drawing.get("trajectory", "the given states"))
+def _received(pipe: int, size: int) -> Generator[None, None, bytearray]:
+    content = bytearray(size)
+    missing = memoryview(content)
+    while missing:
+        try:
+            count = os.readv(pipe, [missing])
+        except BlockingIOError:
+            yield None
+            continue
+        if not count:
+            raise EOFError
+        missing = missing[count:]
+    return content
 
 
-class _Messages:
-    """Puts together what comes through a pipe that is never waited for."""
-
-    def __init__(self, pipe: int) -> None:
-        self._pipe = pipe
-        self._header: tuple[bytes, int, int] | None = None
-        self._content = bytearray(HEADER.size)
-        self._missing = memoryview(self._content)
-
-    def next(self) -> tuple[bytes, int, bytearray] | None:
-        """Return kind, job and content of a whole message; None if there is none yet.
-
-        Raises:
-            EOFError: the pipe has ended.
-        """
-        while True:
-            while self._missing:
-                try:
-                    count = os.readv(self._pipe, [self._missing])
-                except BlockingIOError:
-                    return None
-                if not count:
-                    raise EOFError
-                self._missing = self._missing[count:]
-            content = self._content
-            if self._header is not None:
-                (kind, job, _), self._header = self._header, None
-                self._expect(HEADER.size)
-                return kind, job, content
-            self._header = HEADER.unpack(content)
-            self._expect(self._header[2])
-
-    def _expect(self, size: int) -> None:
-        self._content = bytearray(size)
-        self._missing = memoryview(self._content)
-
-
-def _runs(indices: Sequence[int]) -> list[tuple[int, int, int]]:
+def _runs(indices: Iterable[int]) -> list[tuple[int, int, int]]:
     """Return first, step and count of each even run in `indices`."""
-    if isinstance(indices, range):
-        return [(indices.start, indices.step, len(indices))]
     runs: list[tuple[int, int, int]] = []
     for index in map(int, indices):
         first, step, count = runs[-1] if runs else (0, 0, 0)
