@@ -59,6 +59,8 @@ class Painter:
             shown = [int(reader.snapshots(i, i + 1)[0, 0]) for i in indices]
         return map(self._picture, shown)
 
+    def start(self) -> None: ...
+
     def close(self) -> None: ...
 
     def _picture(self, brightness: int) -> Any:

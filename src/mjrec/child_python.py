@@ -17,6 +17,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import weakref
 from collections.abc import Mapping
@@ -46,13 +47,18 @@ class Child:
         module: what to run.
         arguments: its command line.
         environ: its environment variables, besides the module search path.
+        cwd: its working directory; the parent's, if None.
 
     Raises:
         OSError: it cannot be started.
     """
 
     def __init__(
-        self, module: str, *arguments: str, environ: Mapping[str, str]
+        self,
+        module: str,
+        *arguments: str,
+        environ: Mapping[str, str],
+        cwd: str | None = None,
     ) -> None:
         words = os.memfd_create("mjrec-words")
         try:
@@ -61,8 +67,7 @@ class Child:
             self._process = subprocess.Popen(
                 [*python_command(module), *arguments],
                 env=environment_of_child(environ),
-                # No directory is kept from being removed or unmounted.
-                cwd="/",
+                cwd=cwd,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=words,
@@ -97,12 +102,12 @@ class Child:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_SECONDS_TO_END)
         status = self._process.returncode
-        how = "lives and is silent" if status is None else how_it_ended(status)
+        how = "lives, and is silent" if status is None else how_it_ended(status)
         begin = max(0, os.fstat(self._words.fileno()).st_size - _END_OF_WORDS)
         # Not by seeking: the position is the child's too.
         said = os.pread(self._words.fileno(), _END_OF_WORDS, begin)
         words = said.decode(errors="replace").strip() or "(nothing)"
-        return f"process {self.pid} {how}. The end of what it said: {words}"
+        return f"it {how}. The end of what it said: {words}"
 
     def forget_words(self) -> None:
         """Drop what it has printed, if that is much."""
@@ -122,6 +127,40 @@ class Child:
         """End it, by force where it does not end by itself. Idempotent."""
         _children.discard(self)
         self._end()
+
+
+class LineWriter:
+    """Writes lines into a pipe, from any thread, and never waits for the reader.
+
+    Args:
+        pipe: its descriptor.
+    """
+
+    def __init__(self, pipe: int) -> None:
+        self._pipe = pipe
+        self._unwritten = b""
+        self._one_at_a_time = threading.RLock()
+        os.set_blocking(pipe, False)
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the reader has not taken all yet, after one more try."""
+        self.write(b"")
+        return bool(self._unwritten)
+
+    def write(self, lines: bytes) -> None:
+        """Write whole lines, now or, where the pipe is full, with later ones."""
+        with self._one_at_a_time:
+            self._unwritten += lines
+            try:
+                while self._unwritten:
+                    written = os.write(self._pipe, self._unwritten)
+                    self._unwritten = self._unwritten[written:]
+            except BlockingIOError:
+                return
+            except BrokenPipeError:
+                # That it has no reader is noticed elsewhere.
+                self._unwritten = b""
 
 
 def _end_child(

@@ -178,6 +178,9 @@ class EpisodeFinisher:
         videos, frames = _work(pending)
         if videos:
             self._count(videos=videos, frames=frames)
+            # What stands in the way is told when the video is drawn.
+            with contextlib.suppress(Error):
+                self._pool.start()
         return True
 
     def is_ready(self) -> bool:

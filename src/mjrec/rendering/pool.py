@@ -321,7 +321,8 @@ class _Worker:
         if self.child is not None:
             return
         try:
-            self.child = Child("mjrec.rendering.worker", environ=environ)
+            # No directory of others is kept from being removed or unmounted.
+            self.child = Child("mjrec.rendering.worker", environ=environ, cwd="/")
         except OSError as error:
             raise Error(
                 f"No process that draws could be started: {sys.executable!r}: {error}."

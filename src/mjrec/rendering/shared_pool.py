@@ -44,23 +44,40 @@ class SharedPool:
         wait: Callable[[float], object] = time.sleep,
     ) -> None:
         self._fixed = check_workers(workers)
-        self._slots = CpuSlots(directory, wait=wait)
+        self._count = self._fixed or usable_cpus()
+        self._directory = directory
+        self._wait = wait
+        # The CPUs that this process holds.
+        self._held: dict[int, Lock] = {}
         self._pool: WorkerPool | None = None
+
+    def start(self) -> None:
+        """Start the workers: soon there is something to draw. Idempotent.
+
+        Raises:
+            DirectoryNotWritable, Error, GLError: as `at_work`, or `WorkerPool.start`.
+        """
+        if self._pool is None and (limit := self._free()):
+            self._made(limit).start()
+            self.rest()
 
     def at_work(self) -> WorkerPool:
         """Return the workers, to be used until the next call of any method.
 
         Waits for a free CPU, unless a number of workers was asked for.
+
+        Raises:
+            DirectoryNotWritable: there can be no lock in the directory.
         """
-        limit = self._fixed or self._slots.take(self._slots.total)
-        if self._pool is None:
-            self._pool = WorkerPool(self._fixed or self._slots.total)
-        self._pool.limit = limit
-        return self._pool
+        while not (limit := self._free()):
+            self._wait(_SECONDS_BETWEEN_TRIES)
+        return self._made(limit)
 
     def rest(self) -> None:
         """Give the CPUs back: there is nothing to draw. The workers stay."""
-        self._slots.give_back()
+        while self._held:
+            _, lock = self._held.popitem()
+            lock.release()
 
     def close(self) -> None:
         """End the workers at once and give the CPUs back. Idempotent."""
@@ -69,73 +86,27 @@ class SharedPool:
             self._pool = None
         self.rest()
 
+    def _made(self, limit: int) -> WorkerPool:
+        self._pool = self._pool or WorkerPool(self._count)
+        self._pool.limit = limit
+        return self._pool
 
-class CpuSlots:
-    """The CPUs of a directory, as far as this process holds them.
-
-    Args:
-        directory: the monitor directory.
-        total: how many there are; those that this process can keep busy, if None.
-        wait: called with seconds to wait while none is free.
-
-    Attributes:
-        total: how many there are.
-    """
-
-    def __init__(
-        self,
-        directory: Path,
-        *,
-        total: int | None = None,
-        wait: Callable[[float], object] = time.sleep,
-    ) -> None:
-        self.total = usable_cpus() if total is None else total
-        self._directory = directory
-        self._wait = wait
-        self._held: dict[int, Lock] = {}
-
-    @property
-    def held(self) -> int:
-        """How many this process holds."""
-        return len(self._held)
-
-    def take(self, most: int) -> int:
-        """Take what is free, up to `most` in all, and return how many are held now.
-
-        Waits until there is one. Those that are held already count.
-
-        Raises:
-            DirectoryNotWritable: there can be no lock in the directory.
-        """
-        most = max(1, min(most, self.total))
-        self._take_free(most)
-        while not self._held:
-            self._wait(_SECONDS_BETWEEN_TRIES)
-            self._take_free(most)
-        return self.held
-
-    def give_back(self) -> None:
-        """Let all of them go. Idempotent."""
-        while self._held:
-            _, lock = self._held.popitem()
-            lock.release()
-
-    def _take_free(self, most: int) -> None:
-        for number in range(self.total):
-            if len(self._held) >= most:
-                return
+    def _free(self) -> int:
+        """Take the CPUs that are free; return how many workers may draw."""
+        if self._fixed is not None:
+            return self._fixed
+        for number in range(self._count):
             if number not in self._held:
-                lock = self._try(number)
+                path = self._directory / render_lock_name(number)
+                try:
+                    lock = try_lock(path, f"{os.getpid()}\n")
+                except OSError as error:
+                    raise DirectoryNotWritable(
+                        self._directory, error.strerror
+                    ) from error
                 if lock is not None:
                     self._held[number] = lock
-
-    def _try(self, number: int) -> Lock | None:
-        try:
-            return try_lock(
-                self._directory / render_lock_name(number), f"{os.getpid()}\n"
-            )
-        except OSError as error:
-            raise DirectoryNotWritable(self._directory, error.strerror) from error
+        return len(self._held)
 
 
 def check_workers(workers: int | None) -> int | None:
