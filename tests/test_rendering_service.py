@@ -134,6 +134,25 @@ def test_nothing_is_started_before_there_is_something_to_do(
     assert children() == before
 
 
+def test_a_video_that_is_expected_finds_its_workers(
+    recorded: Path, start: Callable[..., RenderService]
+) -> None:
+    """They start while its episode runs, and stay from video to video."""
+    others = children()
+    service = start(recorded, workers=2)
+    service.expect()
+    [server] = children() - others
+    wait_until(lambda: len(children(server)) == 2)
+    workers = children(server)
+    for log in sorted(recorded.glob("*.log")):
+        service.expect()
+        service.submit(log)
+        service.wait()
+        assert children(server) == workers
+    assert service.failures == {}
+    assert len(list(recorded.glob("*.mp4"))) == 2
+
+
 def test_submitting_never_waits(
     others: set[int], tmp_path: Path, start: Callable[..., RenderService]
 ) -> None:

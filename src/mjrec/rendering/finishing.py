@@ -178,9 +178,7 @@ class EpisodeFinisher:
         videos, frames = _work(pending)
         if videos:
             self._count(videos=videos, frames=frames)
-            # What stands in the way is told when the video is drawn.
-            with contextlib.suppress(Error):
-                self._pool.start()
+            self.start_workers()
         return True
 
     def is_ready(self) -> bool:
@@ -204,6 +202,12 @@ class EpisodeFinisher:
             )
             self._count(videos_done=videos)
         return key, outcome
+
+    def start_workers(self) -> None:
+        """Start the workers: soon there is a video to draw. Idempotent."""
+        # What stands in the way is told when the video is drawn.
+        with contextlib.suppress(Error):
+            self._pool.start()
 
     def rest(self) -> None:
         """Let others use the CPUs: there is nothing to do."""

@@ -3,8 +3,8 @@
 
 `python -m mjrec.rendering.render_server DIRECTORY --workers N|auto [--strict]`. On its
 standard input it is told the base name of one ended trajectory a line, or of the first
-log of a clip, and `that was all` where it is waited for. On its standard output it says
-one JSON object a line::
+log of a clip, `that was all` where it is waited for, and `a video is expected`. On its
+standard output it says one JSON object a line::
 
     {"progress": {"videos_done": 0, "videos": 2, "frames_done": 40, "frames": 2002}}
     {"done": "<trajectory>", "name": "<video or trajectory>", "failure": null}
@@ -37,7 +37,7 @@ from ..patience import patience_s
 from .finishing import EpisodeFinisher
 from .pending import RecordingKey, key_of
 from .progress import Progress
-from .render_service import ALL_SAID
+from .render_service import ALL_SAID, EXPECTED
 
 _NICE = 10
 _SECONDS_BETWEEN_REPORTS = 0.2
@@ -158,7 +158,9 @@ class _Service:
         for name in told:
             self._all_said = name == ALL_SAID
             key = key_of(name)
-            if key is not None and self._finisher.add(key):
+            if name == EXPECTED:
+                self._finisher.start_workers()
+            elif key is not None and self._finisher.add(key):
                 self._names[key] = name
             elif not self._all_said:
                 self._answers.say(done=name, name=name, failure=None)

@@ -23,8 +23,9 @@ from .shared_pool import check_workers
 
 logger = logging.getLogger(__name__)
 
-# The line after which nothing comes for now. It is no name of a trajectory.
+# Lines that are no names of trajectories: nothing comes for now, or a video will.
 ALL_SAID = "that was all"
+EXPECTED = "a video is expected"
 
 _MODULE = "mjrec.rendering.render_server"
 _READ_SIZE = 1 << 16
@@ -35,10 +36,10 @@ _PATIENCES = 3
 class RenderService:
     """Turns ended trajectories into finished ones and into videos, beside the caller.
 
-    The first trajectory, or `start`, starts the process that does it, which stays until
-    `stop`. Where it dies, another one goes on with what is left; what that one does not
-    do either is left pending. One that hangs while it is waited for is ended and has
-    died. The service belongs to the process that made it.
+    `expect`, or the first trajectory, starts the process that does it, which stays with
+    its workers until `stop`. Where it dies, another one goes on with what is left; what
+    that one does not do either is left pending. One that hangs while it is waited for
+    is ended and has died. The service belongs to the process that made it.
 
     Args:
         directory: the monitor directory.
@@ -77,6 +78,11 @@ class RenderService:
     def waiting(self) -> list[str]:
         """The trajectories that were taken over and are not done, in their order."""
         return list(self._waiting)
+
+    def expect(self) -> None:
+        """Start all processes: a video will have to be rendered. Idempotent."""
+        if self._server is None and not self._was_forked():
+            self._say(EXPECTED)
 
     def submit(self, trajectory: Path) -> None:
         """Take over an ended trajectory. Never waits, and raises no failure.

@@ -12,7 +12,8 @@ import numpy as np
 from ..errors import InvalidArgument
 from ..frames import Frame, check_quality, check_size
 from .baked_fields import BakedFields
-from .gl_thread import GLStrings, GLThread, gl_error, opengl
+from .gl_strings import current_gl_strings, largest_picture
+from .gl_thread import GLStrings, GLThread, gl_error
 
 
 class Canvas:
@@ -238,10 +239,10 @@ def _with_settings(
 
 
 def _check_driver_can_draw(height: int, width: int) -> None:
-    gl = opengl()
-    limit = int(gl.glGetIntegerv(gl.GL_MAX_RENDERBUFFER_SIZE))
+    limit = largest_picture()
     if max(height, width) > limit:
+        renderer = current_gl_strings().get("gl_renderer")
         raise InvalidArgument(
             f"A picture of {width}x{height} pixels is larger than this OpenGL driver "
-            f"({gl.glGetString(gl.GL_RENDERER).decode()}) can draw: {limit}x{limit}."
+            f"({renderer}) can draw: {limit}x{limit}."
         )
