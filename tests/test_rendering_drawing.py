@@ -105,7 +105,7 @@ def test_the_context_is_kept_from_drawing_to_drawing(ride: Ride) -> None:
         for view in (View(), View(), other, View()):
             drawing = trajectory_drawing(ride.path, view, kept=kept)
             drawn = [drawing.draw(number) for number in range(FRAMES)]
-            canvases.append(drawing._eyes[0].renderer._canvas)
+            canvases.append(drawing._cameras[0].renderer._canvas)
             drawing.close()
             if view != other:
                 assert np.array_equal(drawn, ride.frames)

@@ -38,19 +38,19 @@ class Drawing:
 
     Args:
         scene: what is drawn.
-        eyes: whose frames they are, in a grid where there are several. All draw with
-            one context.
+        cameras: whose frames they are, in a grid where there are several. All draw
+            with one context.
         acquired: what `close` frees.
     """
 
     def __init__(
         self,
         scene: RecordedScene | GivenStates,
-        eyes: Iterable[_Eye],
+        cameras: Iterable[_CameraReplay],
         acquired: contextlib.ExitStack,
     ) -> None:
         self._scene = scene
-        self._eyes = list(eyes)
+        self._cameras = list(cameras)
         self._acquired = acquired
         # The frame whose cameras the renderers have in mind.
         self._last: int | None = None
@@ -59,14 +59,14 @@ class Drawing:
     @property
     def size(self) -> tuple[int, int]:
         """`(height, width)` of the frames."""
-        height, width = self._eyes[0].renderer.size
-        rows, columns = grid_shape(len(self._eyes))
+        height, width = self._cameras[0].renderer.size
+        rows, columns = grid_shape(len(self._cameras))
         return rows * height, columns * width
 
     @property
     def gl_facts(self) -> dict[str, Any]:
         """Who draws, and on which device: `gl_strings.current_gl_facts`."""
-        return self._eyes[0].renderer.gl_facts
+        return self._cameras[0].renderer.gl_facts
 
     def draw(self, index: int, *, out: Frame | None = None) -> Frame:
         """Return a frame, in `out` if that is given.
@@ -86,7 +86,7 @@ class Drawing:
             self._prepare(index, last)
         self._bring_to(index)
         if self._context_is_old:
-            self._eyes[0].renderer.model_changed()
+            self._cameras[0].renderer.model_changed()
             self._context_is_old = False
         frame = self._render(out)
         self._last = index
@@ -97,9 +97,11 @@ class Drawing:
         self._acquired.close()
 
     def _render(self, out: Frame | None) -> Frame:
-        if len(self._eyes) == 1:
-            return self._eyes[0].renderer.render(self._scene.data, out=out)
-        grid = grid_frame([eye.renderer.render(self._scene.data) for eye in self._eyes])
+        if len(self._cameras) == 1:
+            return self._cameras[0].renderer.render(self._scene.data, out=out)
+        grid = grid_frame(
+            [camera.renderer.render(self._scene.data) for camera in self._cameras]
+        )
         if out is None:
             return grid
         np.copyto(out, grid)
@@ -108,22 +110,22 @@ class Drawing:
     def _prepare(self, index: int, last: int | None) -> None:
         """Bring the cameras to where they are before a frame."""
         start = max(0, index - 1)
-        if any(eye.is_following for eye in self._eyes):
+        if any(camera.is_following for camera in self._cameras):
             start = 0 if last is None or last >= index else last + 1
         if start == 0:
-            for eye in self._eyes:
-                eye.begin()
+            for camera in self._cameras:
+                camera.begin()
         for earlier in range(start, index):
             self._bring_to(earlier)
-            for eye in self._eyes:
-                eye.renderer.look(self._scene.data)
+            for camera in self._cameras:
+                camera.renderer.look(self._scene.data)
 
     def _bring_to(self, index: int) -> None:
         self._context_is_old |= self._scene.bring_to(index)
 
 
-class _Eye:
-    """One camera's renderer.
+class _CameraReplay:
+    """One camera's renderer, brought to any frame as if all before had been drawn.
 
     Args:
         renderer: of its frames.
@@ -182,9 +184,9 @@ def trajectory_drawing(
         }
         if kept is None:
             kept = opened.enter_context(contextlib.closing(KeptCanvas()))
-        canvas = kept.canvas(model, facts["model"].get("sha256"), **look)
+        canvas = kept.canvas(model, **look)
 
-        def eye(asked: PlainCamera | None) -> _Eye:
+        def replay(asked: PlainCamera | None) -> _CameraReplay:
             # Of a camera as recorded it is known how the frames have moved it.
             camera = None if asked is None else _camera(model, asked)
             renderer = SceneRenderer(
@@ -197,10 +199,10 @@ def trajectory_drawing(
                 **look,
             )
             before = scene.previous_cameras if asked is None else np.zeros((2, 3))
-            return _Eye(renderer, camera, before)
+            return _CameraReplay(renderer, camera, before)
 
         wanted = [view.camera] if cameras is None else cameras
-        return Drawing(scene, [eye(asked) for asked in wanted], opened.pop_all())
+        return Drawing(scene, [replay(asked) for asked in wanted], opened.pop_all())
 
 
 def states_drawing(
@@ -224,10 +226,10 @@ def states_drawing(
         "width": view.width,
         "quality": view.quality,
     }
-    canvas = kept.canvas(scene.model, None, **look)
+    canvas = kept.canvas(scene.model, **look)
     renderer = SceneRenderer(scene.model, camera=camera, canvas=canvas, **look)
-    eye = _Eye(renderer, camera, np.zeros((2, 3)))
-    return Drawing(scene, [eye], contextlib.ExitStack())
+    replay = _CameraReplay(renderer, camera, np.zeros((2, 3)))
+    return Drawing(scene, [replay], contextlib.ExitStack())
 
 
 def open_drawing(drawing: Mapping[str, Any], kept: KeptCanvas) -> Drawing:

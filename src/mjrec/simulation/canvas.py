@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 from typing import Any
 
 import mujoco
@@ -117,7 +118,6 @@ class KeptCanvas:
     def canvas(
         self,
         model: mujoco.MjModel,
-        digest: str | None,
         *,
         height: int,
         width: int,
@@ -127,7 +127,6 @@ class KeptCanvas:
 
         Args:
             model: of the scenes.
-            digest: of the model's file; None where there is none.
             height: in pixels.
             width: in pixels.
             quality: as of `SceneRenderer`.
@@ -139,10 +138,10 @@ class KeptCanvas:
         height, width = check_size(height, width)
         check_quality(quality)
         before, self._kind = self._kind, None
-        kind = (digest, height, width, quality)
+        kind = (_digest(model), height, width, quality)
         if self._canvas is None:
             self._canvas = Canvas(model, height=height, width=width, quality=quality)
-        elif digest is not None and kind == before:
+        elif kind == before:
             self._canvas.update(model)
         else:
             self._canvas.go_over_to(model, height=height, width=width, quality=quality)
@@ -154,6 +153,13 @@ class KeptCanvas:
         if self._canvas is not None:
             self._canvas.close()
             self._canvas = None
+
+
+def _digest(model: mujoco.MjModel) -> bytes:
+    # Not what a recording says of its model, which may be a stranger's.
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return hashlib.blake2b(buffer.data).digest()
 
 
 # What to upload for which attribute of `BakedFields`, and how many there are.
