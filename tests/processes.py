@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The processes that the tests' own process has started."""
+"""The processes that a process, mostly the tests' own, has started."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 
-def children() -> set[int]:
+def children(of: int | str = "self") -> set[int]:
     """Return those that are still there, be it as zombies.
 
     Without the one in which multiprocessing tracks what processes share: it starts
@@ -16,7 +16,7 @@ def children() -> set[int]:
         try:
             return {
                 int(pid)
-                for thread in Path("/proc/self/task").iterdir()
+                for thread in Path(f"/proc/{of}/task").iterdir()
                 for pid in (thread / "children").read_text().split()
                 if b"resource_tracker" not in Path("/proc", pid, "cmdline").read_bytes()
             }

@@ -26,7 +26,7 @@ from trajectories_by_hand import (
 from mjrec import GLError, Monitor, clear_monitor_files, iter_episodes
 from mjrec.commands import main
 from mjrec.formats.monitor_directory import Infix
-from mjrec.rendering import again, crew
+from mjrec.rendering import again, shared_pool
 from mjrec.rendering.again import Variant
 from mjrec.rendering.pending import EpisodeKey, claim
 from mjrec.rendering.progress import Progress
@@ -51,7 +51,7 @@ def mjrec(capsys: pytest.CaptureFixture[str]) -> Run:
 def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
     """Draw without processes and without OpenGL."""
     painter = Painter()
-    monkeypatch.setattr(crew, "DrawingWorkers", lambda count: painter)
+    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
 
     class InWith:
         def __init__(self, count: int) -> None: ...
@@ -60,7 +60,7 @@ def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
 
         def __exit__(self, *error: object) -> None: ...
 
-    monkeypatch.setattr(again, "DrawingWorkers", InWith)
+    monkeypatch.setattr(again, "WorkerPool", InWith)
     return painter
 
 

@@ -21,7 +21,7 @@ from trajectories_by_hand import (
 
 import mjrec
 from mjrec import InvalidArgument, LocalEngine, UnknownName, render_videos
-from mjrec.rendering import again, crew
+from mjrec.rendering import again, shared_pool
 from mjrec.rendering.again import Variant
 from mjrec.rendering.directory_videos import RenderedVideos
 from mjrec.rendering.pending import EpisodeKey, claim
@@ -43,8 +43,8 @@ def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
 
         def __exit__(self, *error: object) -> None: ...
 
-    monkeypatch.setattr(crew, "DrawingWorkers", lambda count: painter)
-    monkeypatch.setattr(again, "DrawingWorkers", InWith)
+    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
+    monkeypatch.setattr(again, "WorkerPool", InWith)
     return painter
 
 

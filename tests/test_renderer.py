@@ -554,7 +554,7 @@ def test_a_foreign_context_freed_on_the_thread_does_no_harm(
     first = renderer.render(data)
     data.geom_xpos[-1] += (0.3, 0, 0.2)
 
-    renderer._thread.call(foreign.free)
+    renderer._canvas._thread.call(foreign.free)
 
     # Without a context nothing is read, and the picture before would come again.
     second = renderer.render(data)

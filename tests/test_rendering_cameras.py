@@ -32,16 +32,16 @@ from mjrec.annotation import Caption, annotated
 from mjrec.formats.frame_hashes import frame_hash_path
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_metadata import is_done, metadata_path
-from mjrec.rendering import again, crew
+from mjrec.rendering import again, shared_pool
 from mjrec.rendering.again import Variant, render_again
 from mjrec.rendering.captions import Captions
-from mjrec.rendering.drawing import TrajectoryDrawing
+from mjrec.rendering.drawing import trajectory_drawing
 from mjrec.rendering.finishing import EpisodeFinisher, finish_pending
 from mjrec.rendering.pending import EpisodeKey, look_at
+from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.recorded_facts import open_for_rendering
 from mjrec.rendering.videos import render_video
 from mjrec.rendering.views import View
-from mjrec.rendering.workers import DrawingWorkers
 
 STEM = "openaigym.video.0.7.video000000"
 FIRST, SIDE, SECOND = (f"{STEM}{part}.mp4" for part in ("", ".side", ".camera3"))
@@ -303,8 +303,8 @@ def test_what_cannot_be_is_refused(said: dict[str, Any], tmp_path: Path) -> None
 def painter(monkeypatch: pytest.MonkeyPatch) -> Cameras:
     """Draw without processes and without OpenGL."""
     painter = Cameras()
-    monkeypatch.setattr(crew, "DrawingWorkers", lambda count: painter)
-    monkeypatch.setattr(again, "DrawingWorkers", lambda count: painter)
+    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
+    monkeypatch.setattr(again, "WorkerPool", lambda count: painter)
     return painter
 
 
@@ -425,7 +425,7 @@ def test_a_grid_is_what_each_camera_shows(tmp_path: Path) -> None:
     (tmp_path / "side").mkdir()
     side = record_ride(tmp_path / "side", camera="side")
     ride = record_ride(tmp_path)
-    drawing = TrajectoryDrawing(ride.path, View(), cameras=[None, "side", "rider"])
+    drawing = trajectory_drawing(ride.path, View(), cameras=[None, "side", "rider"])
     try:
         assert drawing.size == (2 * HEIGHT, 2 * WIDTH)
         for number in (*range(FRAMES), 3, 7, 0):
@@ -448,12 +448,12 @@ def test_a_camera_that_follows_does_not_depend_on_the_order(tmp_path: Path) -> N
     view = View(
         camera={"type": tracking, "trackbodyid": 1, "distance": 4, "elevation": -30}
     )
-    drawing = TrajectoryDrawing(ride.path, view)
+    drawing = trajectory_drawing(ride.path, view)
     frames = [drawing.draw(number) for number in range(FRAMES)]
     for number in (4, 2, 8, 0, 0, 5, 7):
         np.testing.assert_array_equal(drawing.draw(number), frames[number])
     drawing.close()
-    with DrawingWorkers(2) as workers:
+    with WorkerPool(2) as workers:
         drawn = list(workers.frames(ride.path, range(FRAMES), view))
     np.testing.assert_array_equal(drawn, frames)
     assert len({frame.tobytes() for frame in frames}) == FRAMES
@@ -474,7 +474,7 @@ def test_an_unknown_camera_is_named_with_those_there_are(
         },
     )
     before = names(tmp_path)
-    with DrawingWorkers(1) as workers, pytest.raises(ValueError, match="side, rider"):
+    with WorkerPool(1) as workers, pytest.raises(ValueError, match="side, rider"):
         render_video(ride.path, workers=workers)
     assert names(tmp_path) == before
 

@@ -18,8 +18,9 @@ from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFil
 from mjrec.formats.trajectory import Array, RowLayout, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.formats.trajectory_log import TrajectoryLogWriter
-from mjrec.rendering.drawing import TrajectoryDrawing
+from mjrec.rendering.drawing import Drawing, trajectory_drawing
 from mjrec.rendering.views import View
+from mjrec.simulation.canvas import KeptCanvas
 from mjrec.simulation.renderer import SceneRenderer
 
 
@@ -29,15 +30,13 @@ def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
 
 
 @pytest.fixture
-def drawing(ride: Ride) -> Iterator[TrajectoryDrawing]:
-    drawing = TrajectoryDrawing(ride.path, View())
+def drawing(ride: Ride) -> Iterator[Drawing]:
+    drawing = trajectory_drawing(ride.path, View())
     yield drawing
     drawing.close()
 
 
-def test_pictures_are_those_that_were_seen(
-    ride: Ride, drawing: TrajectoryDrawing
-) -> None:
+def test_pictures_are_those_that_were_seen(ride: Ride, drawing: Drawing) -> None:
     """Byte for byte, over an infinite plane and through changes of the model."""
     drawn = [drawing.draw(number) for number in range(FRAMES)]
 
@@ -47,7 +46,7 @@ def test_pictures_are_those_that_were_seen(
     assert len({frame.tobytes() for frame in drawn}) == FRAMES
 
 
-def test_the_order_does_not_matter(ride: Ride, drawing: TrajectoryDrawing) -> None:
+def test_the_order_does_not_matter(ride: Ride, drawing: Drawing) -> None:
     """Terrain and textures change back too, and the plane is where it was."""
     order = [*range(FRAMES), *reversed(range(FRAMES)), 4, 4]
     random.Random(0).shuffle(order)
@@ -58,7 +57,7 @@ def test_the_order_does_not_matter(ride: Ride, drawing: TrajectoryDrawing) -> No
 def test_a_picture_alone_is_the_same(ride: Ride) -> None:
     """Also the first thing that is drawn."""
     for number in (0, 4, FRAMES - 1):
-        drawing = TrajectoryDrawing(ride.path, View())
+        drawing = trajectory_drawing(ride.path, View())
         assert np.array_equal(drawing.draw(number), ride.frames[number])
         drawing.close()
 
@@ -68,7 +67,7 @@ def test_the_plane_depends_on_the_picture_before(ride: Ride, tmp_path: Path) -> 
     fresh = record(tmp_path, fresh=True)
     assert not np.array_equal(fresh.frames[4], ride.frames[4])
 
-    drawing = TrajectoryDrawing(fresh.path, View())
+    drawing = trajectory_drawing(fresh.path, View())
     for number in (*range(FRAMES), 4, 2):
         assert np.array_equal(drawing.draw(number), fresh.frames[number])
     drawing.close()
@@ -90,7 +89,7 @@ def test_the_first_picture_comes_after_those_of_episodes_before(
         expected = renderer.render(data)
     assert not np.array_equal(expected, ride.frames[0])
 
-    drawing = TrajectoryDrawing(after.path, View())
+    drawing = trajectory_drawing(after.path, View())
 
     for number in (0, 1, 0):
         shown = expected if number == 0 else ride.frames[number]
@@ -98,10 +97,25 @@ def test_the_first_picture_comes_after_those_of_episodes_before(
     drawing.close()
 
 
+def test_the_context_is_kept_from_drawing_to_drawing(ride: Ride) -> None:
+    """The first has changed its terrain, a texture and a plane; the next sees none."""
+    other = View(height=30, width=50, quality="draft")
+    with contextlib.closing(KeptCanvas()) as kept:
+        canvases = []
+        for view in (View(), View(), other, View()):
+            drawing = trajectory_drawing(ride.path, view, kept=kept)
+            drawn = [drawing.draw(number) for number in range(FRAMES)]
+            canvases.append(drawing._cameras[0].renderer._canvas)
+            drawing.close()
+            if view != other:
+                assert np.array_equal(drawn, ride.frames)
+    assert len(set(map(id, canvases))) == 1
+
+
 def test_a_finished_recording_gives_the_same(ride: Ride, tmp_path: Path) -> None:
     """HDF5 instead of the log."""
     path = finish_trajectory(record(tmp_path).path)
-    drawing = TrajectoryDrawing(path, View())
+    drawing = trajectory_drawing(path, View())
     drawn = [drawing.draw(number) for number in range(FRAMES)]
     drawing.close()
 
@@ -112,7 +126,7 @@ def test_a_finished_recording_gives_the_same(ride: Ride, tmp_path: Path) -> None
 def test_another_view_takes_the_place_of_the_recorded_one(ride: Ride) -> None:
     """Camera, size and quality; the visual options stay."""
     view = View(camera="side", height=30, width=50, quality="draft")
-    drawing = TrajectoryDrawing(ride.path, view)
+    drawing = trajectory_drawing(ride.path, view)
     drawn = [drawing.draw(number) for number in (2, 0, 1)]
     drawing.close()
 
@@ -134,7 +148,7 @@ def test_another_view_takes_the_place_of_the_recorded_one(ride: Ride) -> None:
 
 def test_one_side_alone_leaves_the_other_as_recorded(ride: Ride) -> None:
     """None is as recorded, for each by itself."""
-    drawing = TrajectoryDrawing(ride.path, View(height=20))
+    drawing = trajectory_drawing(ride.path, View(height=20))
     assert drawing.draw(0).shape == (20, WIDTH, 3)
     drawing.close()
 
@@ -144,7 +158,7 @@ def test_the_recorded_quality_is_the_default(ride: Ride, tmp_path: Path) -> None
     draft = record(tmp_path, facts={"video": {"quality": "draft"}})
     pictures = {}
     for quality in (None, "draft", "full"):
-        drawing = TrajectoryDrawing(draft.path, View(quality=quality))
+        drawing = trajectory_drawing(draft.path, View(quality=quality))
         pictures[quality] = drawing.draw(1)
         drawing.close()
 
@@ -166,7 +180,7 @@ def test_a_camera_by_its_members(ride: Ride) -> None:
     ) as renderer:
         expected = renderer.render(data)
 
-    drawing = TrajectoryDrawing(ride.path, View(camera=members))
+    drawing = trajectory_drawing(ride.path, View(camera=members))
     assert np.array_equal(drawing.draw(0), expected)
     drawing.close()
 
@@ -184,10 +198,10 @@ def test_a_camera_by_its_members(ride: Ride) -> None:
 def test_a_camera_that_the_model_lacks(ride: Ride, camera: Any, message: str) -> None:
     """One error, and no crash of MuJoCo."""
     with pytest.raises(InvalidArgument, match=message):
-        TrajectoryDrawing(ride.path, View(camera=camera))
+        trajectory_drawing(ride.path, View(camera=camera))
 
 
-def test_a_picture_that_is_not_there(drawing: TrajectoryDrawing) -> None:
+def test_a_picture_that_is_not_there(drawing: Drawing) -> None:
     """It says how many there are."""
     for number in (FRAMES, -1):
         with pytest.raises(InvalidArgument, match="there are 9"):
@@ -203,7 +217,7 @@ def test_a_trajectory_without_snapshots(tmp_path: Path) -> None:
     writer.close()
 
     with pytest.raises(NoPictures, match=r"a plugin draws.*render_states"):
-        TrajectoryDrawing(path, View())
+        trajectory_drawing(path, View())
 
 
 def test_a_missing_model_is_named(tmp_path: Path) -> None:
@@ -212,7 +226,7 @@ def test_a_missing_model_is_named(tmp_path: Path) -> None:
     [model] = tmp_path.glob("openaigym.model.*")
     model.unlink()
     with pytest.raises(UnreadableFile, match=r"openaigym\.model\."):
-        TrajectoryDrawing(ride.path, View())
+        trajectory_drawing(ride.path, View())
 
 
 @pytest.mark.parametrize(
@@ -227,7 +241,7 @@ def test_facts_that_cannot_be(tmp_path: Path, facts: dict[str, Any]) -> None:
     """A file may be hostile: one error that names it."""
     ride = record(tmp_path, facts=facts)
     with pytest.raises(UnreadableFile, match="Cannot read"):
-        TrajectoryDrawing(ride.path, View())
+        trajectory_drawing(ride.path, View())
 
 
 @parametrize(
@@ -250,7 +264,7 @@ def test_a_recorded_camera_that_the_model_lacks(
 
     with (
         pytest.raises(UnreadableFile, match="camera"),
-        contextlib.closing(TrajectoryDrawing(path, View())) as drawing,
+        contextlib.closing(trajectory_drawing(path, View())) as drawing,
     ):
         drawing.draw(0)
 
@@ -267,7 +281,7 @@ def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:
     [model] = ride.path.parent.glob("openaigym.model.*")
     (tmp_path / model.name).write_bytes(model.read_bytes())
 
-    drawing = TrajectoryDrawing(path, View())
+    drawing = trajectory_drawing(path, View())
     with pytest.raises(UnreadableFile, match="geom_xpos"):
         drawing.draw(0)
     drawing.close()

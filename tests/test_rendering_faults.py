@@ -30,7 +30,7 @@ from mjrec.formats.trajectory_file import (
     open_trajectory,
 )
 from mjrec.formats.video_metadata import metadata_path
-from mjrec.rendering import crew
+from mjrec.rendering import shared_pool
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.outcomes import Outcome
 from mjrec.rendering.pending import recorded_episodes
@@ -43,7 +43,7 @@ FRAMES = 5
 def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
     """Draw without processes and without OpenGL; the encoder is the real one."""
     painter = Painter()
-    monkeypatch.setattr(crew, "DrawingWorkers", lambda count: painter)
+    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
     return painter
 
 

@@ -28,7 +28,7 @@ from mjrec import GLError, LocalEngine, Monitor
 from mjrec.engines.work import Job, JobOutcome, Work
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import Infix
-from mjrec.rendering import crew, video_jobs
+from mjrec.rendering import shared_pool, video_jobs
 from mjrec.rendering.again import Variant, render_again
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.on_engine import finish_on_engine, render_again_on_engine
@@ -98,8 +98,8 @@ class Here:
 def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
     """Draw without processes and without OpenGL."""
     painter = Painter()
-    for module in (crew, video_jobs):
-        monkeypatch.setattr(module, "DrawingWorkers", lambda count: painter)
+    for module in (shared_pool, video_jobs):
+        monkeypatch.setattr(module, "WorkerPool", lambda count: painter)
     return painter
 
 

@@ -24,7 +24,7 @@ from mjrec.formats.monitor_directory import Infix, lock_name, video_lock_name
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_log_facts import append_facts
 from mjrec.formats.video_metadata import is_done
-from mjrec.rendering import crew
+from mjrec.rendering import shared_pool
 from mjrec.rendering.finishing import EpisodeFinisher, finish_pending
 from mjrec.rendering.outcomes import Outcome
 from mjrec.rendering.pending import EpisodeKey, claim, look_at, recorded_episodes
@@ -39,7 +39,7 @@ VIDEO = "openaigym.video.0.7.video000000"
 def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
     """Draw without processes and without OpenGL."""
     painter = Painter()
-    monkeypatch.setattr(crew, "DrawingWorkers", lambda count: painter)
+    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
     return painter
 
 

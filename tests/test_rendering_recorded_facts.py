@@ -108,7 +108,7 @@ def test_a_hostile_trajectory_stops_no_other(
 
         def __exit__(self, *error: object) -> None: ...
 
-    monkeypatch.setattr(again, "DrawingWorkers", Painters)
+    monkeypatch.setattr(again, "WorkerPool", Painters)
     paths = [write_saying(tmp_path, video="x"), write_finished(tmp_path, 2)]
     outcomes = list(render_again(paths, Variant(max_fps=10), workers=1))
     assert "video" in str(outcomes[0].failure)

@@ -88,9 +88,9 @@ def finished(logs: list[Path]) -> list[bool]:
 def test_trajectories_get_their_final_form(
     tmp_path: Path, start: Callable[..., RenderService]
 ) -> None:
-    """Those that come later too, and after a wait."""
-    service = start()
+    """Those that come later too, and after a wait, from one process."""
     before = children()
+    service = start()
     for round_ in range(2):
         logs = [write_log(tmp_path, 10 * round_ + k, video=None) for k in range(3)]
         for log in logs:
@@ -99,7 +99,9 @@ def test_trajectories_get_their_final_form(
         assert finished(logs) == [True] * 3
         assert service.waiting == []
         assert service.failures == {}
-        assert children() == before
+        assert len(children() - before) == 1
+    service.stop()
+    assert children() == before
 
 
 def test_videos_are_rendered(
@@ -117,6 +119,7 @@ def test_videos_are_rendered(
     assert [len(frames_of(video)) for video in videos] == [4, 4]
     assert finished(logs) == [True] * 2
     assert seen[-1] == Progress(videos_done=2, videos=2, frames_done=8, frames=8)
+    service.stop()
     assert not list(recorded.glob(".*"))
 
 
@@ -129,6 +132,25 @@ def test_nothing_is_started_before_there_is_something_to_do(
     service.wait()
     service.stop()
     assert children() == before
+
+
+def test_a_video_that_is_expected_finds_its_workers(
+    recorded: Path, start: Callable[..., RenderService]
+) -> None:
+    """They start while its episode runs, and stay from video to video."""
+    others = children()
+    service = start(recorded, workers=2)
+    service.expect()
+    [server] = children() - others
+    wait_until(lambda: len(children(server)) == 2)
+    workers = children(server)
+    for log in sorted(recorded.glob("*.log")):
+        service.expect()
+        service.submit(log)
+        service.wait()
+        assert children(server) == workers
+    assert service.failures == {}
+    assert len(list(recorded.glob("*.mp4"))) == 2
 
 
 def test_submitting_never_waits(
@@ -188,7 +210,7 @@ def test_a_model_that_is_still_being_written_is_waited_for(
 def test_a_model_that_never_comes_is_an_error(
     recorded: Path, start: Callable[..., RenderService]
 ) -> None:
-    """Once all was said, nobody writes it any more."""
+    """Once the service is waited for, nobody writes it any more."""
     for model in recorded.glob("*.model.*"):
         model.unlink()
     service = start(recorded)
@@ -215,6 +237,26 @@ def test_stopping_leaves_what_is_not_done(
     assert not list(recorded.glob("*.meta.json"))
     assert not list(recorded.glob(".*"))
     assert len(list(recorded.glob("*.trajectory.*"))) == 2
+
+
+def test_one_worker_beside_a_simulation_uses_one_cpu(
+    recorded: Path,
+    start: Callable[..., RenderService],
+    stuck_encoder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Mesa's rasteriser starts no threads that would get in the way of the steps."""
+    monkeypatch.delenv("LP_NUM_THREADS", raising=False)
+    others = children()
+    service = start(recorded, workers=1)
+    for log in recorded.glob("*.log"):
+        service.submit(log)
+    wait_until(stuck_encoder.exists)
+    [server] = children() - others
+    commands = {pid: Path(f"/proc/{pid}/cmdline") for pid in children(server)}
+    [worker] = [pid for pid, cmd in commands.items() if b"worker" in cmd.read_bytes()]
+    environment = Path(f"/proc/{worker}/environ").read_bytes().split(b"\0")
+    assert b"LP_NUM_THREADS=1" in environment
 
 
 def test_nothing_is_begun_after_a_stop(
@@ -284,6 +326,7 @@ def test_a_second_server_goes_on_for_a_dead_one(
     assert service.failures == {}
     assert [len(frames_of(video)) for video in recorded.glob("*.mp4")] == [4, 4]
     assert signum.name in caplog.text
+    service.stop()
     assert not list(recorded.glob(".*"))
     assert children() == others
 
@@ -307,7 +350,7 @@ def test_servers_that_die_are_one_clear_failure(
         service.submit(later)
     service.wait()
     assert list(service.failures) == [log.name for log in [*logs, later]]
-    assert "killed (SIGKILL)" in service.failures[later.name]
+    assert "killed by SIGKILL" in service.failures[later.name]
     assert len(set(service.failures.values())) == 1
     assert caplog.text.count("SIGKILL") == 2
     service.submit(write_log(tmp_path, 3))
@@ -405,7 +448,7 @@ def test_a_server_that_cannot_start_says_why(
     log = write_log(tmp_path)
     service.submit(log)
     service.wait()
-    assert "exit status is 1" in service.failures[log.name]
+    assert "ended with status 1" in service.failures[log.name]
     monkeypatch.setattr(sys, "executable", "/no/such/python")
     service = start()
     service.submit(log)
@@ -504,7 +547,7 @@ def test_the_server_ends_with_its_parent(tmp_path: Path) -> None:
     write_log(tmp_path, model={"mjb": "none"})
     code = (
         "import os, time\nif os.fork() == 0:\n    time.sleep(60)\n    os._exit(0)\n"
-        "print(service._server._process.pid, flush=True)\ntime.sleep(60)\n"
+        "print(service._server.child.pid, flush=True)\ntime.sleep(60)\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM + code, str(tmp_path)],

@@ -23,7 +23,7 @@ import mjrec
 from mjrec.environments.from_name import environment_from_name
 from mjrec.environments.options import EnvironmentOptions
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.rendering.workers import DrawingWorkers
+from mjrec.rendering.pool import WorkerPool
 from mjrec.simulation.cameras import raw_data, raw_model
 from mjrec.simulation.inside import simulation_in
 
@@ -54,23 +54,23 @@ def every(names: str, cases: list[Any], *default: Any) -> pytest.MarkDecorator:
 
 
 @pytest.fixture(scope="module")
-def one_worker() -> Iterator[DrawingWorkers]:
+def one_worker() -> Iterator[WorkerPool]:
     """A process that draws."""
-    with DrawingWorkers(1) as workers:
+    with WorkerPool(1) as workers:
         yield workers
 
 
 @pytest.fixture(scope="module")
-def three_workers() -> Iterator[DrawingWorkers]:
+def three_workers() -> Iterator[WorkerPool]:
     """Three that share a video."""
-    with DrawingWorkers(3) as workers:
+    with WorkerPool(3) as workers:
         yield workers
 
 
 def differences(
     directory: Path,
     live: list[list[Any]],
-    *crews: DrawingWorkers,
+    *crews: WorkerPool,
     is_seen_to_move: bool = True,
 ) -> list[str]:
     """Return which frames of a recording are not the pictures of their moments."""

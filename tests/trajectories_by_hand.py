@@ -35,7 +35,7 @@ def grey(frame: int) -> int:
 
 
 class Painter:
-    """Draws pictures of trajectories of this module, as `DrawingWorkers` would.
+    """Draws pictures of trajectories of this module, as `WorkerPool` would.
 
     Args:
         size: of the pictures.
@@ -58,6 +58,8 @@ class Painter:
         with open_trajectory(trajectory) as reader:
             shown = [int(reader.snapshots(i, i + 1)[0, 0]) for i in indices]
         return map(self._picture, shown)
+
+    def start(self) -> None: ...
 
     def close(self) -> None: ...
 

@@ -10,22 +10,197 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import fcntl
 import json
 import logging
 import os
 import signal
+import subprocess
 import sys
+import threading
 import time
+import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
 logger = logging.getLogger(__name__)
 
-MOST_OF_STACKS = 20_000
 _STACKS = signal.SIGUSR1
+_MOST_OF_STACKS = 20_000
 _LOOKS_FOR_STACKS = 20
 _SECONDS_BETWEEN_LOOKS = 0.1
+_MOST_WORDS = 1 << 20
+_END_OF_WORDS = 2000
+_SECONDS_TO_END = 3.0
+
+
+class Child:
+    """A Python process that runs a module of ours, connected by two pipes.
+
+    It has a session of its own, so that Ctrl-C in the terminal reaches only the parent.
+    It is ended by `end`, by garbage collection and at interpreter exit. Its standard
+    input ends whenever and however the parent dies, so a module that heeds that leaves
+    no process behind. Its standard error goes into memory, for the log.
+
+    Args:
+        module: what to run.
+        arguments: its command line.
+        environ: its environment variables, besides the module search path.
+        cwd: its working directory; the parent's, if None.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        *arguments: str,
+        environ: Mapping[str, str],
+        cwd: str | None = None,
+    ) -> None:
+        words = os.memfd_create("mjrec-words")
+        try:
+            # So that the file can be emptied while the child writes into it.
+            fcntl.fcntl(words, fcntl.F_SETFL, os.O_APPEND)
+            self._process = subprocess.Popen(
+                [*python_command(module), *arguments],
+                env=environment_of_child(environ),
+                cwd=cwd,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=words,
+                bufsize=0,
+                start_new_session=True,
+            )
+        except BaseException:
+            os.close(words)
+            raise
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self.orders: IO[bytes] = self._process.stdin
+        self.answers: IO[bytes] = self._process.stdout
+        self._words: IO[bytes] = os.fdopen(words, "r+b", buffering=0)
+        self._files = (self.orders, self.answers, self._words)
+        self._end = weakref.finalize(
+            self, _end_child, self._process, self._files, os.getpid()
+        )
+        _children.add(self)
+
+    @property
+    def pid(self) -> int:
+        """The process's number."""
+        return self._process.pid
+
+    def stacks(self) -> str:
+        """Return what the threads of one that hangs are at, for the log."""
+        return stacks_said_in(self._words, self.pid)
+
+    def last_words(self) -> str:
+        """Return what became of it, and the end of what it printed."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_SECONDS_TO_END)
+        status = self._process.returncode
+        how = "lives, and is silent" if status is None else how_it_ended(status)
+        begin = max(0, os.fstat(self._words.fileno()).st_size - _END_OF_WORDS)
+        # Not by seeking: the position is the child's too.
+        said = os.pread(self._words.fileno(), _END_OF_WORDS, begin)
+        words = said.decode(errors="replace").strip() or "(nothing)"
+        return f"it {how}. The end of what it said: {words}"
+
+    def forget_words(self) -> None:
+        """Drop what it has printed, if that is much."""
+        if os.fstat(self._words.fileno()).st_size > _MOST_WORDS:
+            os.ftruncate(self._words.fileno(), 0)
+
+    def kill(self) -> None:
+        """Kill it and its children, which may hang as well; `end` does the rest."""
+        if self._process.poll() is None:
+            # Stopped, it starts no other and waits for none: their numbers stay theirs.
+            self._process.send_signal(signal.SIGSTOP)
+            for pid in [*_pids_of_children(self.pid), self.pid]:
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.kill(pid, signal.SIGKILL)
+
+    def end(self) -> None:
+        """End it, by force where it does not end by itself. Idempotent."""
+        _children.discard(self)
+        self._end()
+
+
+class LineWriter:
+    """Writes lines into a pipe, from any thread, and never waits for the reader.
+
+    Args:
+        pipe: its descriptor.
+    """
+
+    def __init__(self, pipe: int) -> None:
+        self._pipe = pipe
+        self._unwritten = b""
+        self._one_at_a_time = threading.RLock()
+        os.set_blocking(pipe, False)
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the reader has not taken all yet, after one more try."""
+        self.write(b"")
+        return bool(self._unwritten)
+
+    def write(self, lines: bytes) -> None:
+        """Write whole lines, now or, where the pipe is full, with later ones."""
+        with self._one_at_a_time:
+            self._unwritten += lines
+            try:
+                while self._unwritten:
+                    written = os.write(self._pipe, self._unwritten)
+                    self._unwritten = self._unwritten[written:]
+            except BlockingIOError:
+                return
+            except BrokenPipeError:
+                # That it has no reader is noticed elsewhere.
+                self._unwritten = b""
+
+
+def _end_child(
+    process: subprocess.Popen[bytes], files: tuple[IO[bytes], ...], owner: int
+) -> None:
+    # A forked child has copies; the process is its parent's.
+    if os.getpid() == owner:
+        process.terminate()
+        try:
+            process.wait(_SECONDS_TO_END)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            # One whose disk or driver does not answer cannot die.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_SECONDS_TO_END)
+    for file in files:
+        with contextlib.suppress(OSError):
+            file.close()
+    # Python waits for no process that it takes for ended.
+    process.returncode = process.returncode or 0
+
+
+def _pids_of_children(pid: int) -> list[int]:
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            found += map(int, task.read_text().split())
+    return found
+
+
+_children: weakref.WeakSet[Child] = weakref.WeakSet()
+
+
+def _leave_all_to_parent() -> None:
+    """Close a forked child's copies of the pipes, which would not end otherwise."""
+    for child in list(_children):
+        child.end()
+
+
+os.register_at_fork(after_in_child=_leave_all_to_parent)
 
 
 def python_command(module: str) -> list[str]:
@@ -67,19 +242,11 @@ def take_standard_output() -> int:
 def say_stacks_when_asked() -> None:
     """Let this process write what its threads are at to the standard error.
 
-    At `ask_for_stacks`, whatever it hangs in, and when it dies of a signal such as
+    At `stacks_said_in`, whatever it hangs in, and when it dies of a signal such as
     SIGSEGV.
     """
     faulthandler.enable()
     faulthandler.register(_STACKS)
-
-
-def ask_for_stacks(pid: int) -> None:
-    """Let a child that hangs say where. One that has not begun yet dies of it."""
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, _STACKS)
-        # Should it only have been stopped.
-        os.kill(pid, signal.SIGCONT)
 
 
 def stacks_said_in(words: IO[bytes], pid: int) -> str:
@@ -92,7 +259,11 @@ def stacks_said_in(words: IO[bytes], pid: int) -> str:
     """
     descriptor = words.fileno()
     before = os.fstat(descriptor).st_size
-    ask_for_stacks(pid)
+    with contextlib.suppress(ProcessLookupError):
+        # One that has not begun yet dies of it.
+        os.kill(pid, _STACKS)
+        # Should it only have been stopped.
+        os.kill(pid, signal.SIGCONT)
     after = before
     for _ in range(_LOOKS_FOR_STACKS):
         time.sleep(_SECONDS_BETWEEN_LOOKS)
@@ -100,11 +271,7 @@ def stacks_said_in(words: IO[bytes], pid: int) -> str:
         if size == after > before:
             break
         after = size
-    return stacks_in(os.pread(descriptor, MOST_OF_STACKS, before))
-
-
-def stacks_in(said: bytes) -> str:
-    """Return what a child has said of where it hangs, as text."""
+    said = os.pread(descriptor, _MOST_OF_STACKS, before)
     return said.decode(errors="replace").strip() or "(it does not say)"
 
 

@@ -7,7 +7,7 @@ Nothing here imports mujoco or OpenGL; what must is tried in child processes.
 from __future__ import annotations
 
 from .backends import BACKENDS
-from .choice import Choice, choose, use_gl
+from .choice import Choice, backend_for_children, choose, use_gl
 from .diagnosis import Diagnosis, diagnose
 from .egl_device import EglDevice
 from .given_gpu import GivenGpu, render_on_given_gpu, visible_gpus
@@ -20,6 +20,7 @@ __all__ = [
     "EglDevice",
     "GivenGpu",
     "Probe",
+    "backend_for_children",
     "choose",
     "diagnose",
     "probe",

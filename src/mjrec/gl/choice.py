@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from ..errors import GLError
@@ -67,12 +68,21 @@ def use_gl(backend: str | None = None) -> str:
             here, or none does. The message has the cause and the fix of each.
     """
     choice = choose(backend)
-    for name, rejected in choice.rejected:
-        _LOG.warning("%s cannot be used: %s %s", name, rejected.cause, rejected.fix)
-    if choice.probe.warning():
-        _LOG.warning("%s", choice.probe.warning())
-    _LOG.info("Using %s (%s).", choice.backend, choice.probe.gl_renderer)
+    _log(choice)
     set_backend(choice.backend)
+    return choice.backend
+
+
+def backend_for_children() -> str:
+    """Return the first backend that renders, for processes that draw for this one.
+
+    Whatever this process has imported, and whatever its `MUJOCO_GL` says.
+
+    Raises:
+        GLError: as `use_gl`.
+    """
+    choice = _first_that_renders(BACKENDS, None, "the first that renders")
+    _log(choice)
     return choice.backend
 
 
@@ -84,8 +94,19 @@ def choose(backend: str | None = None) -> Choice:
         GLError: as `use_gl`.
     """
     asked, reason = _asked_for(backend)
+    return _first_that_renders(
+        [asked] if asked else BACKENDS, asked, reason, conflict_with
+    )
+
+
+def _first_that_renders(
+    candidates: Iterable[str],
+    asked: str | None,
+    reason: str,
+    conflict_with: Callable[[str], Diagnosis | None] = lambda _: None,
+) -> Choice:
     rejected: list[tuple[str, Diagnosis]] = []
-    for candidate in [asked] if asked else BACKENDS:
+    for candidate in candidates:
         conflict = conflict_with(candidate)
         if conflict:
             rejected.append((candidate, conflict))
@@ -95,6 +116,14 @@ def choose(backend: str | None = None) -> Choice:
             return Choice(candidate, reason, tried, tuple(rejected))
         rejected.append((candidate, Diagnosis(tried.cause, tried.fix)))
     raise GLError(_nothing_renders(asked, reason, rejected))
+
+
+def _log(choice: Choice) -> None:
+    for name, rejected in choice.rejected:
+        _LOG.warning("%s cannot be used: %s %s", name, rejected.cause, rejected.fix)
+    if choice.probe.warning():
+        _LOG.warning("%s", choice.probe.warning())
+    _LOG.info("Using %s (%s).", choice.backend, choice.probe.gl_renderer)
 
 
 def _asked_for(backend: str | None) -> tuple[str | None, str]:

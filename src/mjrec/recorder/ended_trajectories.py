@@ -16,6 +16,9 @@ _NO_FAILURES: Mapping[str, str] = MappingProxyType({})
 class Rendering(Protocol):
     """Whoever turns ended trajectories into videos, beside the simulation."""
 
+    def expect(self) -> None:
+        """Get ready: a trajectory will come that has a video. Never waits."""
+
     def submit(self, trajectory: Path) -> None:
         """Take over an ended trajectory, or a clip by its first log. Never waits."""
 
@@ -50,6 +53,11 @@ class EndedTrajectories:
     def failures(self) -> Mapping[str, str]:
         """Why videos could not be rendered, by the base names of the videos."""
         return _NO_FAILURES if self._rendering is None else self._rendering.failures
+
+    def expect(self) -> None:
+        """Let whoever renders get ready for a video. Never waits."""
+        if self._rendering is not None:
+            self._rendering.expect()
 
     def add(self, log: Path) -> None:
         """Take over the log of an episode that is over. Never waits."""

@@ -586,6 +586,7 @@ class Recorder:
             )
         if deferred:
             assert self._trajectory is not None
+            self._ended.expect()
             self.video_recorder = self._trajectory.deferred = DeferredVideo(
                 self._promises.path(episode_id), self._trajectory.recorder
             )

@@ -17,12 +17,12 @@ from ..formats.video_names import camera_part, name_part
 from ..rates import to_rate
 from .outcomes import Outcome
 from .pending import EpisodeKey
+from .pool import WorkerPool
 from .progress import Progress
 from .recorded_facts import open_for_rendering
 from .recorded_pictures import chosen_frames
 from .videos import further_video_paths, render_video
 from .views import PlainCamera, View, plain_camera
-from .workers import DrawingWorkers
 
 logger = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ def render_again(
         on_progress(now)
 
     gl_failure: str | None = None
-    with DrawingWorkers(workers) as crew:
+    with WorkerPool(workers) as pool:
         for place, (trajectory, video) in enumerate(zip(paths, outs, strict=True), 1):
             outcome = Outcome(
                 name=video.name, directory=video.parent, failure=gl_failure
@@ -141,7 +141,7 @@ def render_again(
                         trajectory,
                         variant,
                         video,
-                        workers=crew,
+                        workers=pool,
                         strict=strict,
                         on_frame=count_frame,
                     )
@@ -176,7 +176,7 @@ def render_one_again(
     variant: Variant,
     video: Path,
     *,
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     strict: bool,
     on_frame: Callable[[], object] = lambda: None,
 ) -> Outcome:

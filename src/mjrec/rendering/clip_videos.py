@@ -11,6 +11,7 @@ from typing import Any
 from ..annotation import Caption, check_annotation
 from ..formats.unfinished_video import VideoFile
 from .captions import Captions
+from .pool import WorkerPool
 from .recorded_clips import RecordedClip, read_clip
 from .recorded_facts import open_for_rendering
 from .videos import (
@@ -25,7 +26,6 @@ from .videos import (
     write_that_it_broke,
 )
 from .views import View
-from .workers import DrawingWorkers
 
 _NO_FRAME = "the process was killed before its first frame"
 
@@ -33,7 +33,7 @@ _NO_FRAME = "the process was killed before its first frame"
 def render_clip(
     parts: Sequence[Path],
     *,
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     strict: bool = False,
     on_frame: Callable[[], object] = lambda: None,
 ) -> VideoFile | None:

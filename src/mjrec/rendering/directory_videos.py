@@ -18,12 +18,12 @@ from ..formats.trajectory_file import find_trajectory
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_all_models
 from .again import Variant, render_again
-from .cpu_slots import check_workers
 from .finishing import finish_pending
 from .on_engine import finish_on_engine, given_engine, render_again_on_engine
 from .outcomes import Outcome
 from .pending import EpisodeKey, RecordingKey, key_of, recordings
 from .progress import Progress
+from .shared_pool import check_workers
 from .views import View, plain_camera
 
 _SHOWN = 20

@@ -1,21 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a recorded episode, or of given states, in any order.
+"""Frames of a recorded episode, or of given states, in any order.
 
-This is what a worker does; whoever wants many pictures lets several workers do it.
+This is what a worker does; who wants many frames lets several workers do it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
-from ..simulation.cameras import Camera, camera_from_members
-from ..simulation.eyes import Eye
+from ..simulation.cameras import Camera, camera_from_members, is_tracking
+from ..simulation.canvas import KeptCanvas
 from ..simulation.given_states import GivenStates
 from ..simulation.mujoco_warnings import log_mujoco_warnings
 from ..simulation.recorded_scene import RecordedScene
@@ -25,212 +27,54 @@ from .recorded_pictures import check_has_pictures
 from .views import PlainCamera, View
 
 
-class Drawing(Protocol):
-    """Pictures that are known by their numbers, from 0."""
+class Drawing:
+    """Frames of a scene, known by their numbers, from 0.
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """`(height, width)` of the pictures."""
-
-    @property
-    def gl_facts(self) -> dict[str, Any]:
-        """Who draws, and on which device: `gl_strings.current_gl_facts`."""
-
-    def draw(self, index: int, *, out: Frame | None = None) -> Frame:
-        """Return a picture, in `out` if that is given.
-
-        It is the same whatever was drawn before.
-        """
-
-    def close(self) -> None:
-        """Free what was acquired. Idempotent."""
-
-
-class TrajectoryDrawing:
-    """The pictures that `env.render()` would have given in a recorded episode.
+    Each is the same whatever was drawn before. MuJoCo's visualiser remembers: an
+    infinite plane is drawn around the place where the cameras stood in the frame
+    before, and a camera that tracks a body goes a part of the way to it in each frame.
+    So the cameras are brought to where they would be.
 
     Args:
-        path: of the trajectory; its model is looked for beside it.
-        view: what of them is to be other than recorded.
-        cameras: several in place of that of the view; None among them is as recorded.
-            A picture is then all that they show, in a grid.
-
-    Raises:
-        UnreadableFile: of the trajectory or its model.
-        NoPictures: it has no snapshots.
-        UnknownName, InvalidArgument: its model has no such camera, or a size that the
-            driver cannot draw.
-        GLError: nothing can be drawn here.
+        scene: what is drawn.
+        cameras: whose frames they are, in a grid where there are several. All draw
+            with one context.
+        acquired: what `close` frees.
     """
 
     def __init__(
         self,
-        path: Path,
-        view: View,
-        *,
-        cameras: Sequence[PlainCamera | None] | None = None,
+        scene: RecordedScene | GivenStates,
+        cameras: Iterable[_CameraReplay],
+        acquired: contextlib.ExitStack,
     ) -> None:
-        self._reader = open_for_rendering(path)
-        try:
-            check_has_pictures(self._reader)
-            scene = RecordedScene(self._reader)
-        except BaseException:
-            self._reader.close()
-            raise
-        self._pictures = _Pictures(scene)
-        try:
-            for camera in [view.camera] if cameras is None else cameras:
-                self._pictures.eyes.append(self._eye(scene, view, camera))
-        except BaseException:
-            self.close()
-            raise
-
-    def _eye(self, scene: RecordedScene, view: View, camera: PlainCamera | None) -> Eye:
-        recorded = scene.view
-        chosen = recorded.camera if camera is None else _camera(scene.model, camera)
-        return Eye(
-            SceneRenderer(
-                scene.model,
-                height=_or(view.height, recorded.height),
-                width=_or(view.width, recorded.width),
-                camera=chosen,
-                scene_option=recorded.option,
-                max_geom=recorded.max_geom,
-                quality=view.quality or _recorded_quality(self._reader.header.facts),
-                fresh=recorded.fresh,
-            ),
-            # Of a camera as recorded it is known how the pictures have moved it.
-            camera=None if camera is None else chosen,
-            before=scene.previous_cameras if camera is None else np.zeros((2, 3)),
-        )
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """`(height, width)` of the pictures."""
-        return self._pictures.size
-
-    @property
-    def gl_facts(self) -> dict[str, Any]:
-        """Who draws, and on which device: `gl_strings.current_gl_facts`."""
-        return self._pictures.gl_facts()
-
-    def draw(self, index: int, *, out: Frame | None = None) -> Frame:
-        """Return picture `index` of the trajectory, in `out` if that is given.
-
-        Raises:
-            InvalidArgument: there is no such picture.
-            UnreadableFile: the file is damaged.
-            GLError: the driver hangs.
-        """
-        return self._pictures.draw(index, out)
-
-    def close(self) -> None:
-        """Close the file and free the renderers. Idempotent."""
-        self._pictures.close()
-        self._reader.close()
-
-
-class StatesDrawing:
-    """The pictures of given states, with everything computed that follows from them.
-
-    Args:
-        directory: where `save_states` wrote them.
-        spec: which components a state has.
-        view: how they are to be drawn, with nothing left open.
-
-    Raises:
-        UnknownName, InvalidArgument, GLError: as `TrajectoryDrawing`.
-    """
-
-    def __init__(self, directory: Path, spec: int, view: View) -> None:
-        scene = GivenStates(directory, spec)
-        assert view.height is not None
-        assert view.width is not None
-        camera = _camera(scene.model, _or(view.camera, -1))
-        renderer = SceneRenderer(
-            scene.model,
-            height=view.height,
-            width=view.width,
-            camera=camera,
-            quality=view.quality or "full",
-        )
-        self._pictures = _Pictures(scene)
-        self._pictures.eyes.append(
-            Eye(renderer, camera=camera, before=np.zeros((2, 3)))
-        )
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """`(height, width)` of the pictures."""
-        return self._pictures.size
-
-    @property
-    def gl_facts(self) -> dict[str, Any]:
-        """Who draws, and on which device: `gl_strings.current_gl_facts`."""
-        return self._pictures.gl_facts()
-
-    def draw(self, index: int, *, out: Frame | None = None) -> Frame:
-        """Return the picture of row `index`, in `out` if that is given."""
-        return self._pictures.draw(index, out)
-
-    def close(self) -> None:
-        """Free the renderer. Idempotent."""
-        self._pictures.close()
-
-
-def open_drawing(drawing: Mapping[str, Any]) -> Drawing:
-    """Return what is described, for a worker, in plain JSON.
-
-    Args:
-        drawing: `trajectory` (a path), or `states` (a directory) and `spec`; and
-            `view`; and, of a trajectory, `cameras`.
-    """
-    log_mujoco_warnings()
-    view = View(**drawing["view"])
-    if "trajectory" in drawing:
-        return TrajectoryDrawing(
-            Path(drawing["trajectory"]), view, cameras=drawing.get("cameras")
-        )
-    return StatesDrawing(Path(drawing["states"]), drawing["spec"], view)
-
-
-class _Scene(Protocol):
-    @property
-    def data(self) -> Any: ...
-
-    @property
-    def count(self) -> int: ...
-
-    def bring_to(self, index: int) -> bool: ...
-
-
-class _Pictures:
-    """Draws a scene so that each picture is as if all before had been drawn.
-
-    An infinite plane depends on where the cameras were in the picture before, and a
-    camera that follows a body on all pictures before.
-
-    Args:
-        scene: what is drawn.
-
-    Attributes:
-        eyes: whose pictures they are, in a grid where there are several.
-    """
-
-    def __init__(self, scene: _Scene) -> None:
-        self.eyes: list[Eye] = []
         self._scene = scene
-        # The picture whose cameras the renderers have in mind.
+        self._cameras = list(cameras)
+        self._acquired = acquired
+        # The frame whose cameras the renderers have in mind.
         self._last: int | None = None
         self._context_is_old = False
 
     @property
     def size(self) -> tuple[int, int]:
-        height, width = self.eyes[0].renderer.size
-        rows, columns = grid_shape(len(self.eyes))
+        """`(height, width)` of the frames."""
+        height, width = self._cameras[0].renderer.size
+        rows, columns = grid_shape(len(self._cameras))
         return rows * height, columns * width
 
-    def draw(self, index: int, out: Frame | None) -> Frame:
+    @property
+    def gl_facts(self) -> dict[str, Any]:
+        """Who draws, and on which device: `gl_strings.current_gl_facts`."""
+        return self._cameras[0].renderer.gl_facts
+
+    def draw(self, index: int, *, out: Frame | None = None) -> Frame:
+        """Return a frame, in `out` if that is given.
+
+        Raises:
+            InvalidArgument: there is no such frame.
+            UnreadableFile: the file is damaged.
+            GLError: the driver hangs.
+        """
         if not 0 <= index < self._scene.count:
             raise InvalidArgument(
                 f"There is no picture {index}: there are {self._scene.count}, numbered "
@@ -241,56 +85,167 @@ class _Pictures:
             self._prepare(index, last)
         self._bring_to(index)
         if self._context_is_old:
-            for eye in self.eyes:
-                eye.renderer.model_changed()
+            self._cameras[0].renderer.model_changed()
             self._context_is_old = False
         frame = self._render(out)
         self._last = index
         return frame
 
-    def gl_facts(self) -> dict[str, Any]:
-        return self.eyes[0].renderer.gl_facts
-
     def close(self) -> None:
-        for eye in self.eyes:
-            eye.renderer.close()
+        """Free what was acquired for this drawing. Idempotent."""
+        self._acquired.close()
 
     def _render(self, out: Frame | None) -> Frame:
-        if len(self.eyes) == 1:
-            return self.eyes[0].renderer.render(self._scene.data, out=out)
-        frames = [eye.renderer.render(self._scene.data) for eye in self.eyes]
-        grid = grid_frame(frames)
+        if len(self._cameras) == 1:
+            return self._cameras[0].renderer.render(self._scene.data, out=out)
+        grid = grid_frame(
+            [camera.renderer.render(self._scene.data) for camera in self._cameras]
+        )
         if out is None:
             return grid
         np.copyto(out, grid)
         return out
 
     def _prepare(self, index: int, last: int | None) -> None:
-        """Bring the cameras to where they are before a picture."""
+        """Bring the cameras to where they are before a frame."""
         start = max(0, index - 1)
-        if any(eye.is_following for eye in self.eyes):
+        if any(camera.is_following for camera in self._cameras):
             start = 0 if last is None or last >= index else last + 1
         if start == 0:
-            for eye in self.eyes:
-                eye.begin()
+            for camera in self._cameras:
+                camera.begin()
         for earlier in range(start, index):
             self._bring_to(earlier)
-            for eye in self.eyes:
-                eye.renderer.look(self._scene.data)
+            for camera in self._cameras:
+                camera.renderer.look(self._scene.data)
 
     def _bring_to(self, index: int) -> None:
         self._context_is_old |= self._scene.bring_to(index)
 
 
-def _camera(model: Any, camera: PlainCamera) -> Camera:
-    if isinstance(camera, dict):
-        return camera_from_members(model, camera)
-    return camera
+class _CameraReplay:
+    """One camera's renderer, brought to any frame as if all before had been drawn.
+
+    Args:
+        renderer: of its frames.
+        camera: what it draws with; None where the recording moves that.
+        before: where the two cameras of its scene stand before the first frame.
+    """
+
+    def __init__(self, renderer: SceneRenderer, camera: Any, before: ArrayLike) -> None:
+        self.renderer = renderer
+        self.is_following = is_tracking(camera)
+        self._before = before
+        self._camera = camera
+        self._start = camera.lookat.copy() if self.is_following else None
+
+    def begin(self) -> None:
+        """Go to before the first frame."""
+        self.renderer.camera_positions = self._before
+        if self.is_following:
+            self._camera.lookat[:] = self._start
 
 
-def _recorded_quality(facts: Mapping[str, Any]) -> Any:
-    return (facts.get("video") or {}).get("quality", "full")
+def trajectory_drawing(
+    path: Path,
+    view: View,
+    *,
+    cameras: Sequence[PlainCamera | None] | None = None,
+    kept: KeptCanvas | None = None,
+) -> Drawing:
+    """Return the frames that `env.render()` would have given in a recorded episode.
+
+    Args:
+        path: of the trajectory; its model is looked for beside it.
+        view: what of them is to be other than recorded.
+        cameras: several in place of that of the view; None among them is as recorded.
+            A frame is then all that they show, in a grid.
+        kept: what to draw on; something new, if None.
+
+    Raises:
+        UnreadableFile: of the trajectory or its model.
+        NoPictures: it has no snapshots.
+        UnknownName, InvalidArgument: its model has no such camera, or a size that the
+            driver cannot draw.
+        GLError: nothing can be drawn here.
+    """
+    with contextlib.ExitStack() as opened:
+        reader = opened.enter_context(open_for_rendering(path))
+        check_has_pictures(reader)
+        facts = reader.header.facts
+        scene = RecordedScene(reader)
+        model, recorded = scene.model, scene.view
+        look: dict[str, Any] = {
+            "height": recorded.height if view.height is None else view.height,
+            "width": recorded.width if view.width is None else view.width,
+            "quality": view.quality
+            or (facts.get("video") or {}).get("quality", "full"),
+        }
+        if kept is None:
+            kept = opened.enter_context(contextlib.closing(KeptCanvas()))
+        canvas = kept.canvas(model, **look)
+
+        def replay(asked: PlainCamera | None) -> _CameraReplay:
+            # Of a camera as recorded it is known how the frames have moved it.
+            camera = None if asked is None else _camera(model, asked)
+            renderer = SceneRenderer(
+                model,
+                camera=recorded.camera if camera is None else camera,
+                scene_option=recorded.option,
+                max_geom=recorded.max_geom,
+                fresh=recorded.fresh,
+                canvas=canvas,
+                **look,
+            )
+            before = scene.previous_cameras if asked is None else np.zeros((2, 3))
+            return _CameraReplay(renderer, camera, before)
+
+        wanted = [view.camera] if cameras is None else cameras
+        return Drawing(scene, [replay(asked) for asked in wanted], opened.pop_all())
 
 
-def _or(value: Any, otherwise: Any) -> Any:
-    return otherwise if value is None else value
+def states_drawing(
+    directory: Path, spec: int, view: View, *, kept: KeptCanvas
+) -> Drawing:
+    """Return the frames of given states, with all that is computed from them.
+
+    Args:
+        directory: where `save_states` wrote them.
+        spec: which components a state has.
+        view: how they are to be drawn, with nothing left open.
+        kept: what to draw on.
+
+    Raises:
+        UnknownName, InvalidArgument, GLError: as `trajectory_drawing`.
+    """
+    scene = GivenStates(directory, spec)
+    camera = _camera(scene.model, view.camera)
+    look: dict[str, Any] = {
+        "height": view.height,
+        "width": view.width,
+        "quality": view.quality,
+    }
+    canvas = kept.canvas(scene.model, **look)
+    renderer = SceneRenderer(scene.model, camera=camera, canvas=canvas, **look)
+    replay = _CameraReplay(renderer, camera, np.zeros((2, 3)))
+    return Drawing(scene, [replay], contextlib.ExitStack())
+
+
+def open_drawing(drawing: Mapping[str, Any], kept: KeptCanvas) -> Drawing:
+    """Return what is described, for a worker, in plain JSON.
+
+    Args:
+        drawing: `trajectory` (a path), or `states` (a directory) and `spec`; and
+            `view`; and, of a trajectory, `cameras`.
+        kept: what to draw on.
+    """
+    log_mujoco_warnings()
+    view = View(**drawing["view"])
+    if "trajectory" in drawing:
+        path, cameras = Path(drawing["trajectory"]), drawing.get("cameras")
+        return trajectory_drawing(path, view, cameras=cameras, kept=kept)
+    return states_drawing(Path(drawing["states"]), drawing["spec"], view, kept=kept)
+
+
+def _camera(model: Any, camera: Any) -> Camera:
+    return camera_from_members(model, camera) if isinstance(camera, dict) else camera

@@ -22,7 +22,6 @@ from ..formats.second_names import give_all_second_names
 from ..formats.trajectory_file import finish_trajectory
 from ..formats.unfinished_video import VideoFile
 from .clip_videos import render_clip
-from .crew import Crew
 from .outcomes import Outcome
 from .pending import (
     PendingEpisode,
@@ -32,11 +31,12 @@ from .pending import (
     look_at,
     remove_unfinished,
 )
+from .pool import WorkerPool
 from .progress import Progress
 from .recorded_clips import PendingClip
 from .rendered_manifests import reconcile, update_manifest
+from .shared_pool import SharedPool
 from .videos import render_video
-from .workers import DrawingWorkers
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class _Render(Protocol):
     def __call__(
         self,
         *,
-        workers: DrawingWorkers,
+        workers: WorkerPool,
         strict: bool,
         on_frame: Callable[[], object],
     ) -> VideoFile | None: ...
@@ -145,7 +145,7 @@ class EpisodeFinisher:
         self.on_progress = on_progress
         self._directory = directory
         self._strict = strict
-        self._crew = Crew(directory, workers=workers, wait=wait)
+        self._pool = SharedPool(directory, workers=workers, wait=wait)
         # None stands for one that could not be read when it was added.
         self._waiting: dict[RecordingKey, PendingRecording | None] = {}
         self._gl_failure: GLError | None = None
@@ -162,7 +162,7 @@ class EpisodeFinisher:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._crew.close()
+        self._pool.close()
 
     def add(self, key: RecordingKey) -> bool:
         """Add a recording, and return whether there is anything to do about it."""
@@ -178,6 +178,7 @@ class EpisodeFinisher:
         videos, frames = _work(pending)
         if videos:
             self._count(videos=videos, frames=frames)
+            self.start_workers()
         return True
 
     def is_ready(self) -> bool:
@@ -202,13 +203,15 @@ class EpisodeFinisher:
             self._count(videos_done=videos)
         return key, outcome
 
+    def start_workers(self) -> None:
+        """Start the workers: soon there is a video to draw. Idempotent."""
+        # What stands in the way is told when the video is drawn.
+        with contextlib.suppress(Error):
+            self._pool.start()
+
     def rest(self) -> None:
         """Let others use the CPUs: there is nothing to do."""
-        self._crew.rest()
-
-    def dismiss_workers(self) -> None:
-        """End the workers, who have had nothing to do for long."""
-        self._crew.dismiss()
+        self._pool.rest()
 
     def _count(self, **more: int) -> None:
         now = {name: getattr(self.progress, name) + more[name] for name in more}
@@ -306,7 +309,7 @@ class EpisodeFinisher:
             raise self._gl_failure
         try:
             return render(
-                workers=self._crew.at_work(),
+                workers=self._pool.at_work(),
                 strict=self._strict,
                 on_frame=lambda: self._count(frames_done=1),
             )

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import InvalidArgument
 from ..frames import Frame
+from .pool import WorkerPool
 from .recorded_facts import open_for_rendering
 from .recorded_pictures import (
     check_has_pictures,
@@ -23,7 +24,6 @@ from .recorded_pictures import (
     warn_of_other_pictures,
 )
 from .views import View, plain_camera
-from .workers import DrawingWorkers
 
 if TYPE_CHECKING:
     from ..simulation.cameras import Camera
@@ -94,7 +94,7 @@ def render(
         warn_of_other_pictures(reader)
         chosen = chosen_frames(reader.frame_count, reader.header.facts, max_fps)
     is_trusted = bool(getattr(trajectory, "trust_models", False))
-    pool = DrawingWorkers(workers, trust_models=is_trusted)
+    pool = WorkerPool(workers, trust_models=is_trusted)
     return _Pictures(pool, lambda: pool.frames(path, chosen.indices, view))
 
 
@@ -153,13 +153,13 @@ def render_states(
         camera=plain_camera(camera), height=height, width=width, quality=quality
     )
     rows = check_states(model, states, spec)
-    pool = DrawingWorkers(workers)
+    pool = WorkerPool(workers)
     directory = Path(tempfile.mkdtemp(prefix="mjrec-states-"))
     drawing = {"states": str(directory), "spec": int(spec), "view": view.as_json()}
 
     def begin() -> Iterator[Frame]:
         save_states(directory, model, rows)
-        return pool.pictures(drawing, range(len(rows)))
+        return pool.frames_of(drawing, range(len(rows)))
 
     return _Pictures(pool, begin, directory=directory)
 
@@ -179,7 +179,7 @@ class _Pictures:
 
     def __init__(
         self,
-        pool: DrawingWorkers,
+        pool: WorkerPool,
         begin: Callable[[], Iterator[Frame]],
         *,
         directory: Path | None = None,
@@ -208,7 +208,7 @@ class _Pictures:
         self._frames = iter(())
 
 
-def _leave(pool: DrawingWorkers, directory: Path | None, owner: int) -> None:
+def _leave(pool: WorkerPool, directory: Path | None, owner: int) -> None:
     pool.close()
     if directory is not None and os.getpid() == owner:
         shutil.rmtree(directory, ignore_errors=True)

@@ -90,6 +90,11 @@ class Share:
             if infix_of(name) in self._infixes
         }
 
+    def expect(self) -> None:
+        """Start all processes: a video will have to be rendered. Idempotent."""
+        if not self._stopped:
+            self._service.expect()
+
     def submit(self, trajectory: Path) -> None:
         """Take over an ended trajectory. Never waits; does nothing after `stop`.
 

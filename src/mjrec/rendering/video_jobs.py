@@ -32,7 +32,7 @@ from .again import Variant, render_one_again
 from .finishing import EpisodeFinisher
 from .outcomes import Outcome
 from .pending import RecordingKey, key_of
-from .workers import DrawingWorkers
+from .pool import WorkerPool
 
 _RASTERISER_THREADS = "LP_NUM_THREADS"
 
@@ -166,13 +166,13 @@ class _Again:
     """Renders recorded episodes another way."""
 
     def __init__(self) -> None:
-        self._workers: DrawingWorkers | None = None
+        self._workers: WorkerPool | None = None
         self._gl_failure: str | None = None
 
     def __call__(self, arguments: Mapping[str, Any]) -> Outcome:
         video = Path(arguments["video"])
         if self._workers is None:
-            self._workers = DrawingWorkers(1)
+            self._workers = WorkerPool(1)
         # Where nothing can be drawn, each would take as long to find that out.
         if self._gl_failure is None:
             try:

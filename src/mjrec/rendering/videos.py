@@ -38,6 +38,7 @@ from ..rates import to_rate
 from ..recorder.endings import KILLED
 from ..recorder.versions import versions
 from .captions import Captions
+from .pool import WorkerPool
 from .recorded_facts import open_for_rendering
 from .recorded_pictures import (
     ChosenFrames,
@@ -46,7 +47,6 @@ from .recorded_pictures import (
     warn_of_other_pictures,
 )
 from .views import PlainCamera, View, plain_camera
-from .workers import DrawingWorkers
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ class Footage:
 def render_video(
     trajectory: Path,
     *,
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     view: View | None = None,
     max_fps: float | Fraction | None = None,
     fps: float | Fraction | None = None,
@@ -175,7 +175,7 @@ def render_video(
 def render_footage(
     footage: Footage,
     *,
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     view: View,
     out: Path | None = None,
     strict: bool = False,
@@ -336,7 +336,7 @@ def is_annotated(facts: Mapping[str, Any]) -> bool:
 
 
 def _drawn(
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     runs: Sequence[tuple[Path, Sequence[int]]],
     shot: _Shot,
 ) -> Iterable[Frame]:
@@ -346,7 +346,7 @@ def _drawn(
 
 
 def _run(
-    workers: DrawingWorkers, trajectory: Path, indices: Sequence[int], shot: _Shot
+    workers: WorkerPool, trajectory: Path, indices: Sequence[int], shot: _Shot
 ) -> Iterable[Frame]:
     if shot.cameras is None:
         return workers.frames(trajectory, indices, shot.view)

@@ -1,21 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that draws pictures: `python -m mjrec.rendering.worker DESCRIPTOR`.
+"""A process that draws frames: `python -m mjrec.rendering.worker`.
 
-DESCRIPTOR is the file descriptor of a `FrameRing`. Both sides say one JSON object a
-line. On its standard input it is told::
+On its standard input it is told one JSON object a line::
 
-    {"job": 3, "drawing": {...}, "pictures": [[position, index, slot], ...]}
-    {"cancel": 3}
+    {"drawing": {...}, "runs": [[1, 2, 250]]}
 
-`drawing` is what `open_drawing` takes. A job is what one caller wants from all
-workers; its number grows. On its standard output it says::
+`drawing` is what `open_drawing` takes; `runs` are the frames, as first number, step and
+count. What it says begins with a `pool_worker.HEADER`. It is the bytes of a frame,
+`(height, width, 3) uint8`, or a JSON object::
 
-    {"backend": "egl"}                                      once, before anything else
-    {"job": 3, "size": [48, 64], "gl": {...}}               before its first picture
-    {"job": 3, "position": 0}                               the picture is in its slot
-    {"job": 3, "position": 1, "error": {...}}               there will be none
-    {"error": {...}}                                        instead of a backend
-    {"log": [30, "..."]}                                    for the parent's log
+    {"size": [48, 64], "gl": {...}}         before the frames of a job
+    {"error": {...}}                        instead of a frame and all that would follow
+    {"log": [30, "..."]}                    for the parent's log
 
 Whatever drivers print goes to the standard error. It ends when its standard input
 does, in mid-drawing too: nothing that it does is of use to anybody but its parent.
@@ -23,6 +19,7 @@ does, in mid-drawing too: nothing that it does is of use to anybody but its pare
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -30,12 +27,15 @@ import queue
 import sys
 import threading
 from collections.abc import Mapping
-from typing import IO, Any
+from typing import Any
+
+import numpy as np
 
 from ..carried_errors import carried
 from ..child_python import say_stacks_when_asked, take_standard_output
-from ..gl import use_gl
-from .frame_ring import FrameRing
+from ..simulation.canvas import KeptCanvas
+from .drawing import open_drawing
+from .pool_worker import FRAME, HEADER, TEXT
 
 _NICE = 10
 
@@ -43,116 +43,58 @@ _NICE = 10
 def main() -> None:
     """Draw until the standard input ends."""
     say_stacks_when_asked()
-    answers = _Answers(os.fdopen(take_standard_output(), "wb"))
+    answers = _Answers(take_standard_output())
     logging.getLogger().addHandler(_ToParent(answers))
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
-    orders = _Orders()
-    try:
-        answers.say(backend=os.environ.get("MUJOCO_GL") or use_gl())
-    except Exception as error:
-        answers.say(error=carried(error))
-        # The answer is what the parent waits for; it ends this process.
-        orders.wait_for_end()
-    _Desk(FrameRing(int(sys.argv[1])), answers).serve(orders)
+    orders: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=[orders], daemon=True).start()
+    kept = KeptCanvas()
+    while True:
+        order = orders.get()
+        try:
+            _draw(order, kept, answers)
+        except Exception as error:
+            answers.say(error=carried(error))
+
+
+def _read(orders: queue.SimpleQueue[dict[str, Any]]) -> None:
+    """Read what the parent says, and notice its end in mid-drawing."""
+    for line in sys.stdin.buffer:
+        orders.put(json.loads(line))
+    # Not `sys.exit`, which would wait for the driver.
+    os._exit(0)
+
+
+def _draw(order: Mapping[str, Any], kept: KeptCanvas, answers: _Answers) -> None:
+    with contextlib.closing(open_drawing(order["drawing"], kept)) as drawing:
+        answers.say(size=drawing.size, gl=drawing.gl_facts)
+        frame = np.empty((*drawing.size, 3), np.uint8)
+        for first, step, count in order["runs"]:
+            for place in range(count):
+                drawing.draw(first + step * place, out=frame)
+                answers.send(FRAME, frame.data.cast("B"))
 
 
 class _Answers:
-    """What is said to the parent, in whole lines from any thread."""
+    """What is sent to the parent, in whole messages from any thread."""
 
-    def __init__(self, pipe: IO[bytes]) -> None:
+    def __init__(self, pipe: int) -> None:
         self._pipe = pipe
         self._one_at_a_time = threading.Lock()
 
-    def say(self, **answer: Any) -> None:
-        line = json.dumps(answer).encode() + b"\n"
+    def say(self, **said: Any) -> None:
+        self.send(TEXT, memoryview(json.dumps(said).encode()))
+
+    def send(self, kind: bytes, content: memoryview) -> None:
+        header = memoryview(HEADER.pack(kind, len(content)))
         try:
             with self._one_at_a_time:
-                self._pipe.write(line)
-                self._pipe.flush()
+                for rest in (header, content):
+                    while rest:
+                        rest = rest[os.write(self._pipe, rest) :]
         except OSError:
             # Nobody listens any more.
             os._exit(0)
-
-
-class _Orders:
-    """What the parent says; read on a thread, to be noticed in mid-drawing."""
-
-    def __init__(self) -> None:
-        self._waiting: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        self._cancelled = 0
-        threading.Thread(target=self._read, name="mjrec-orders", daemon=True).start()
-
-    def next(self) -> dict[str, Any]:
-        """Return the next order for pictures, waiting for it."""
-        return self._waiting.get()
-
-    def is_cancelled(self, job: int) -> bool:
-        """Return whether the pictures of this job are not wanted any more."""
-        return job <= self._cancelled
-
-    def wait_for_end(self) -> None:
-        """Wait for the end of this process."""
-        while True:
-            self._waiting.get()
-
-    def _read(self) -> None:
-        for line in sys.stdin.buffer:
-            order = json.loads(line)
-            if "cancel" in order:
-                self._cancelled = order["cancel"]
-            else:
-                self._waiting.put(order)
-        # Not `sys.exit`, which would wait for the driver.
-        os._exit(0)
-
-
-class _Desk:
-    """Draws what is ordered, keeping the drawing of a job from order to order."""
-
-    def __init__(self, ring: FrameRing, answers: _Answers) -> None:
-        self._ring = ring
-        self._answers = answers
-        self._job = 0
-        self._drawing: Any = None
-
-    def serve(self, orders: _Orders) -> None:
-        """Draw what is ordered, for ever."""
-        while True:
-            order = orders.next()
-            for position, index, slot in order["pictures"]:
-                if not orders.is_cancelled(order["job"]):
-                    self._draw(order, position, index, slot)
-
-    def _draw(
-        self, order: Mapping[str, Any], position: int, index: int, slot: int
-    ) -> None:
-        answer: dict[str, Any] = {"job": order["job"], "position": position}
-        try:
-            self._open(order)
-            self._drawing.draw(index, out=self._ring.slot(slot))
-        except Exception as error:
-            answer["error"] = carried(error)
-        self._answers.say(**answer)
-
-    def _open(self, order: Mapping[str, Any]) -> None:
-        if self._job == order["job"]:
-            return
-        # Here, because mujoco reads the backend when it is imported, and that was
-        # chosen only just now.
-        from .drawing import open_drawing
-
-        self._close()
-        self._drawing = open_drawing(order["drawing"])
-        self._ring.shape(*self._drawing.size)
-        self._job = order["job"]
-        self._answers.say(
-            job=self._job, size=self._drawing.size, gl=self._drawing.gl_facts
-        )
-
-    def _close(self) -> None:
-        drawing, self._drawing, self._job = self._drawing, None, 0
-        if drawing is not None:
-            drawing.close()
 
 
 class _ToParent(logging.Handler):

@@ -29,10 +29,10 @@ from ..formats.json_fields import field, integer, list_of, rate, read_object
 from ..formats.video_metadata import metadata_path
 from ..frames import Frame
 from ..rendering.captions import Captions
+from ..rendering.pool import WorkerPool
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.recorded_pictures import check_has_pictures, warn_of_other_pictures
 from ..rendering.views import View, plain_camera
-from ..rendering.workers import DrawingWorkers
 from .video_stream import VideoStream, read_stream, stream_frames, video_kind
 
 _TRAJECTORIES: Final = (".h5", ".log")
@@ -156,7 +156,7 @@ def _of_trajectory(path: Path, count: int, view: View) -> Iterator[_Shots]:
         warn_of_other_pictures(reader)
         indices = _spread(reader.frame_count, count, path)
         times = [caption.time for caption in Captions(reader, indices)]
-    workers = DrawingWorkers(1)
+    workers = WorkerPool(1)
     try:
         yield _Shots(workers.frames(path, indices, view), times)
     finally:

@@ -127,6 +127,12 @@ def check_camera(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
         )
 
 
+def is_tracking(camera: object) -> bool:
+    """Tell whether each picture moves a camera, a part of the way to a body."""
+    tracking = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
+    return isinstance(camera, mujoco.MjvCamera) and int(camera.type) == tracking
+
+
 def tracking_camera(model: Any) -> str | int | None:
     """Return the camera of the model that follows its robot, if it has one.
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import sys
 from typing import Any
@@ -10,6 +11,17 @@ from typing import Any
 from .egl_devices import egl_devices
 
 _NAMES = ("GL_VENDOR", "GL_RENDERER", "GL_VERSION")
+_MAX_RENDERBUFFER_SIZE = 0x84E8
+
+
+def raw_opengl() -> Any:
+    """Return PyOpenGL's functions of OpenGL 1.0, for use on a thread with a context.
+
+    Not `OpenGL.GL`, which takes longer to import than a picture to draw.
+    """
+    # It chooses its platform when it is imported, and mujoco sets which one when it
+    # imports its context class: not before there is a context.
+    return importlib.import_module("OpenGL.raw.GL.VERSION.GL_1_0")
 
 
 def current_gl_strings() -> dict[str, str]:
@@ -18,21 +30,28 @@ def current_gl_strings() -> dict[str, str]:
     The keys are `gl_vendor`, `gl_renderer` and `gl_version`; empty where no context
     is current, or none was made through PyOpenGL.
     """
-    # PyOpenGL chooses its platform when it is first imported: whoever drew has done so
-    # already, and nobody else may do it here.
+    # Whoever drew has imported it already, and nobody else may do it here.
     if "OpenGL.platform" not in sys.modules:
         return {}
-    gl = importlib.import_module("OpenGL.GL")
+    gl = raw_opengl()
     strings = {}
     for name in _NAMES:
         try:
-            value = gl.glGetString(getattr(gl, name))
-        except gl.GLError:
+            pointer = gl.glGetString(getattr(gl, name))
+        except sys.modules["OpenGL.error"].Error:
             return {}
+        value = ctypes.cast(pointer, ctypes.c_char_p).value
         if value is None:
             return {}
         strings[name.lower()] = value.decode(errors="replace")
     return strings
+
+
+def largest_picture() -> int:
+    """Return the longest side that the driver of this thread's context can draw."""
+    limit = ctypes.c_int()
+    raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limit)
+    return limit.value
 
 
 def current_gl_facts() -> dict[str, Any]:

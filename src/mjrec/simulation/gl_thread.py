@@ -27,7 +27,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import mujoco
 
 from ..errors import ClosedError, Error, GLError
-from .gl_strings import current_gl_facts, current_gl_strings
+from .gl_strings import current_gl_facts, current_gl_strings, raw_opengl
 
 _logger = logging.getLogger(__name__)
 
@@ -306,22 +306,13 @@ def _make_context() -> Any:
 
 def _read_strings() -> GLStrings:
     # Not every context of mujoco's imports it, and nothing is read through it before.
-    opengl()
+    raw_opengl()
     return _strings_in(current_gl_strings())
 
 
 def _strings_in(facts: Mapping[str, Any]) -> GLStrings:
     names = ("gl_vendor", "gl_renderer", "gl_version")
     return GLStrings(*(facts.get(name, "") for name in names))
-
-
-def opengl() -> Any:
-    """Return PyOpenGL's functions, for use on a thread with a context."""
-    # It chooses its platform when it is imported, and mujoco sets which one when it
-    # imports its context class: not before there is a context.
-    from OpenGL import GL
-
-    return GL
 
 
 def _context_class() -> Any:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import threading
 from collections.abc import Iterator
 from types import TracebackType
@@ -16,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InvalidArgument
 from ..frames import Frame, check_frame, check_quality, check_size
-from .baked_fields import BakedFields
 from .cameras import FREE_CAMERA, Camera, raw_data, raw_model, resolve_camera
-from .gl_thread import GLStrings, GLThread, gl_error, opengl
+from .canvas import Canvas
+from .gl_thread import GLStrings
 
 
 class SceneRenderer:
@@ -57,6 +56,8 @@ class SceneRenderer:
         quality: `"full"` is what the model asks for. `"draft"` is the model without
             multisampling and with a shadow map of at most 1024x1024.
         fresh: draw each picture as if it were the first, as dm_control does.
+        canvas: where to draw, of this model, size and quality, which others may draw
+            on in turn; one of its own, if None.
 
     Raises:
         UnknownName: the model has no such camera, or there is no such quality.
@@ -77,6 +78,7 @@ class SceneRenderer:
         max_geom: int = 10000,
         quality: str = "full",
         fresh: bool = False,
+        canvas: Canvas | None = None,
     ) -> None:
         self._height, self._width = check_size(height, width)
         check_quality(quality)
@@ -87,17 +89,12 @@ class SceneRenderer:
         self._fresh = fresh
         resolve_camera(self._model, camera)
         self._scene = mujoco.MjvScene(self._model, maxgeom=self._max_geom)
-        # Nothing of what the caller sees is shared with the thread, except while a call
-        # lasts: dropping the renderer ends the thread.
-        self._canvas = _Canvas(self._height, self._width, quality)
+        self._quality = quality
         self._one_at_a_time = threading.Lock()
-        self._thread = GLThread(finish=self._canvas.free)
-        try:
-            self._baked = BakedFields.of(self._model)
-            self._thread.call(self._canvas.prepare, self._model)
-        except BaseException:
-            self._thread.close()
-            raise
+        self._owns_canvas = canvas is None
+        self._canvas = canvas or Canvas(
+            self._model, height=self._height, width=self._width, quality=quality
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -107,12 +104,12 @@ class SceneRenderer:
     @property
     def gl_strings(self) -> GLStrings:
         """Who draws: OpenGL's vendor, renderer and version."""
-        return self._thread.strings
+        return self._canvas.gl_strings
 
     @property
     def gl_facts(self) -> dict[str, Any]:
         """What metadata says of who draws, as `gl_strings.current_gl_facts`."""
-        return self._thread.facts
+        return self._canvas.gl_facts
 
     @property
     def camera_positions(self) -> NDArray[np.float32]:
@@ -163,7 +160,7 @@ class SceneRenderer:
             if self._fresh:
                 self.camera_positions = np.zeros((2, 3))
             self._update_scene(data)
-            return self._thread.call(self._canvas.draw, self._scene, out)
+            return self._canvas.draw(self._scene, out)
 
     def model_changed(self, model: Any = None) -> None:
         """Bring the renderer up to date with its model, or go over to another one.
@@ -182,17 +179,18 @@ class SceneRenderer:
             ClosedError: after `close`.
             GLError: as `render`.
         """
-        self._thread.check_usable()
+        self._canvas.check_usable()
         with self._one_at_a_time:
-            self._thread.settle()
+            self._canvas.settle()
             if model is None or raw_model(model) is self._model:
-                self._upload_changes()
+                self._canvas.update(self._model)
             else:
                 self._go_over_to(raw_model(model))
 
     def close(self) -> None:
-        """Free the context and end its thread. Idempotent."""
-        self._thread.close()
+        """Free the context and end its thread, if they are its own. Idempotent."""
+        if self._owns_canvas:
+            self._canvas.close()
 
     def __enter__(self) -> SceneRenderer:
         return self
@@ -215,12 +213,12 @@ class SceneRenderer:
     def _scene_of(self, data: mujoco.MjData) -> Iterator[mujoco.MjData]:
         """Have the scene for oneself, to put `data` into it."""
         # Before the lock, which another thread may have held at the time of a fork.
-        self._thread.check_usable()
+        self._canvas.check_usable()
         with self._one_at_a_time:
             # Memory beyond the arrays of smaller data would be read.
             _check_belongs(data, self._model)
             # The thread may still be drawing the last scene, after Ctrl-C.
-            self._thread.settle()
+            self._canvas.settle()
             yield data
 
     def _update_scene(self, data: mujoco.MjData) -> None:
@@ -235,79 +233,13 @@ class SceneRenderer:
             self._scene,
         )
 
-    def _upload_changes(self) -> None:
-        baked = BakedFields.of(self._model)
-        if changed := baked.changed_since(self._baked):
-            self._thread.call(self._canvas.upload, self._model, changed)
-            self._baked = baked
-
     def _go_over_to(self, model: mujoco.MjModel) -> None:
         resolve_camera(model, self._camera)
         scene = mujoco.MjvScene(model, maxgeom=self._max_geom)
-        baked = BakedFields.of(model)
-        self._thread.call(self._canvas.prepare, model)
-        self._model, self._scene, self._baked = model, scene, baked
-
-
-# What to upload for which attribute of `BakedFields`, and how many there are.
-_UPLOADS = {
-    "hfields": ("nhfield", mujoco.mjr_uploadHField),
-    "textures": ("ntex", mujoco.mjr_uploadTexture),
-    "meshes": ("nmesh", mujoco.mjr_uploadMesh),
-}
-
-
-class _Canvas:
-    """What lives on the GL thread; every method is called there."""
-
-    def __init__(self, height: int, width: int, quality: str) -> None:
-        self._quality = quality
-        self._context: mujoco.MjrContext | None = None
-        self._rectangle = mujoco.MjrRect(0, 0, width, height)
-        self._bottom_up = np.empty((height, width, 3), np.uint8)
-
-    def prepare(self, model: mujoco.MjModel) -> None:
-        """Make the context for `model`, in place of an earlier one."""
-        rectangle = self._rectangle
-        _check_driver_can_draw(rectangle.height, rectangle.width)
-        # Only the context needs these settings, and it keeps no reference.
-        for_context = _with_settings(
-            model, rectangle.height, rectangle.width, self._quality
+        self._canvas.go_over_to(
+            model, height=self._height, width=self._width, quality=self._quality
         )
-        self.free()
-        try:
-            context = mujoco.MjrContext(
-                for_context, int(mujoco.mjtFontScale.mjFONTSCALE_150)
-            )
-        except mujoco.FatalError as error:
-            what = f"A {rectangle.width}x{rectangle.height} picture cannot be drawn"
-            raise gl_error(what, error, remedy="Ask for a smaller one.") from error
-        self._context = context
-        mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), context)
-
-    def upload(self, model: mujoco.MjModel, changed: set[str]) -> None:
-        """Bring the context up to date with what `BakedFields` says has changed."""
-        if not changed <= _UPLOADS.keys():
-            self.prepare(model)
-            return
-        for name in changed:
-            count, upload = _UPLOADS[name]
-            for index in range(getattr(model, count)):
-                upload(model, self._context, index)
-
-    def draw(self, scene: mujoco.MjvScene, out: Frame | None) -> Frame:
-        """Return the picture of `scene`, in `out` if that is given."""
-        mujoco.mjr_render(self._rectangle, scene, self._context)
-        mujoco.mjr_readPixels(self._bottom_up, None, self._rectangle, self._context)
-        frame = np.empty_like(self._bottom_up) if out is None else out
-        np.copyto(frame, self._bottom_up[::-1])
-        return frame
-
-    def free(self) -> None:
-        """Free the context. Idempotent."""
-        if self._context is not None:
-            self._context.free()
-        self._context = None
+        self._model, self._scene = model, scene
 
 
 def _check_max_geom(max_geom: int) -> int:
@@ -343,35 +275,4 @@ def _check_belongs(data: mujoco.MjData, model: mujoco.MjModel) -> None:
         raise InvalidArgument(
             f"The data belongs to another model ({'; '.join(differing)}). If the "
             "environment has compiled a new one, call model_changed with it first."
-        )
-
-
-_DRAFT_SHADOW_MAP = 1024
-
-
-def _with_settings(
-    model: mujoco.MjModel, height: int, width: int, quality: str
-) -> mujoco.MjModel:
-    """Return `model`, or a copy with a large enough buffer and of that quality."""
-    buffer = model.vis.global_
-    is_large_enough = height <= buffer.offheight and width <= buffer.offwidth
-    if is_large_enough and quality == "full":
-        return model
-    changed = copy.copy(model)
-    changed.vis.global_.offheight = max(height, buffer.offheight)
-    changed.vis.global_.offwidth = max(width, buffer.offwidth)
-    if quality == "draft":
-        settings = changed.vis.quality
-        settings.offsamples = 0
-        settings.shadowsize = min(settings.shadowsize, _DRAFT_SHADOW_MAP)
-    return changed
-
-
-def _check_driver_can_draw(height: int, width: int) -> None:
-    gl = opengl()
-    limit = int(gl.glGetIntegerv(gl.GL_MAX_RENDERBUFFER_SIZE))
-    if max(height, width) > limit:
-        raise InvalidArgument(
-            f"A picture of {width}x{height} pixels is larger than this OpenGL driver "
-            f"({gl.glGetString(gl.GL_RENDERER).decode()}) can draw: {limit}x{limit}."
         )

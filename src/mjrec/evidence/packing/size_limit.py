@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ...errors import ArchiveTooLarge
 from ...machine import usable_cpus
+from ...rendering.pool import WorkerPool
 from ...rendering.progress import Progress
-from ...rendering.workers import DrawingWorkers
 from .assembly import Assembly
 from .smaller_videos import SCALES, draw_smaller, redrawable
 
@@ -31,7 +31,7 @@ def archive_within(
     videos = redrawable(assembly.contents.videos)
     drawn = sum(video.video.stat().st_size for video in videos)
     rest = size - drawn
-    with DrawingWorkers(usable_cpus()) as workers:
+    with WorkerPool(usable_cpus()) as workers:
         for scale in SCALES if videos and rest < limit else ():
             # No video shrinks more than its pictures do: there is no use in trying.
             if rest + drawn * scale**2 > limit and scale is not SCALES[-1]:

@@ -19,10 +19,10 @@ from ...atomic_files import write_text
 from ...errors import PackError
 from ...formats.json_fields import read_object, unreadable
 from ...formats.video_metadata import metadata_path
+from ...rendering.pool import WorkerPool
 from ...rendering.progress import Progress
 from ...rendering.videos import render_video
 from ...rendering.views import View
-from ...rendering.workers import DrawingWorkers
 from .contents import VideoFiles
 
 # Of width and height, one after the other until the archive is small enough.
@@ -85,7 +85,7 @@ def draw_smaller(
     folder: Path,
     scale: Fraction,
     *,
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     on_progress: Callable[[Progress], object],
 ) -> None:
     """Put smaller videos in the place of those in `folder`, with all about them.
@@ -123,7 +123,7 @@ def _draw(
     folder: Path,
     scale: Fraction,
     *,
-    workers: DrawingWorkers,
+    workers: WorkerPool,
     on_frame: Callable[[], object],
 ) -> None:
     out = folder / video.video.name

@@ -38,7 +38,7 @@ from ...formats.monitor_directory import iter_monitor_files
 from ...frames import Frame
 from ...machine import machine_fingerprint, usable_cpus
 from ...recorder.versions import versions
-from ...rendering.workers import DrawingWorkers
+from ...rendering.pool import WorkerPool
 from ...simulation.model_trust import trusting_models
 from ..verification import Check, Level, Verdict
 from .decoded_video import DecodedVideo
@@ -98,7 +98,7 @@ def check_pixels(
     most = max(1, sum(totals) // _FRAMES_OF_A_WORKER)
     with (
         trusting_models(sorted(made_again)),
-        DrawingWorkers(min(most, usable_cpus())) as workers,
+        WorkerPool(min(most, usable_cpus())) as workers,
     ):
         studio = _Studio(task=task, workers=workers)
         for video, total, end in zip(read, totals, ends, strict=True):
@@ -266,7 +266,7 @@ class _Studio:
         workers: who draw.
     """
 
-    def __init__(self, *, task: Task, workers: DrawingWorkers) -> None:
+    def __init__(self, *, task: Task, workers: WorkerPool) -> None:
         self._task = task
         self._workers = workers
         self._pictures = itertools.count()

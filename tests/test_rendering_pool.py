@@ -22,8 +22,9 @@ from processes import children
 from rides import FRAMES, HEIGHT, WIDTH, Ride, record
 
 import mjrec
+from mjrec import child_python
 from mjrec.carried_errors import carried, unpacked
-from mjrec.child_python import environment_of_child
+from mjrec.child_python import Child, environment_of_child
 from mjrec.errors import (
     ClosedError,
     Error,
@@ -32,10 +33,9 @@ from mjrec.errors import (
     UnknownName,
     UnreadableFile,
 )
-from mjrec.rendering import worker_process, workers
+from mjrec.gl import Probe, choice
+from mjrec.rendering.pool import WorkerPool, _environment
 from mjrec.rendering.views import View
-from mjrec.rendering.worker_process import WorkerProcess
-from mjrec.rendering.workers import DrawingWorkers
 
 
 @pytest.fixture(scope="module")
@@ -44,15 +44,15 @@ def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
 
 
 @pytest.fixture(scope="module")
-def three() -> Iterator[DrawingWorkers]:
+def three() -> Iterator[WorkerPool]:
     """Three workers, which stay from test to test."""
-    with DrawingWorkers(3) as three:
+    with WorkerPool(3) as three:
         yield three
 
 
 @pytest.fixture
-def one() -> Iterator[DrawingWorkers]:
-    with DrawingWorkers(1) as one:
+def one() -> Iterator[WorkerPool]:
+    with WorkerPool(1) as one:
         yield one
 
 
@@ -65,8 +65,8 @@ def new_children() -> Iterator[list[int]]:
     new += children() - before
 
 
-def pids(pool: DrawingWorkers) -> list[int]:
-    return [seat.process.pid for seat in pool._seats if seat.process is not None]
+def pids(pool: WorkerPool) -> list[int]:
+    return [worker.child.pid for worker in pool._workers if worker.child is not None]
 
 
 def wait_for_end(pid: int) -> None:
@@ -81,18 +81,18 @@ def wait_for_end(pid: int) -> None:
 def use_process(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
     """Let another program be the worker."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
-    monkeypatch.setattr(worker_process, "python_command", lambda _: command)
+    monkeypatch.setattr(child_python, "python_command", lambda _: command)
 
 
 # In order, whoever draws
 
 
-def test_one_worker_gives_what_was_seen(ride: Ride, one: DrawingWorkers) -> None:
+def test_one_worker_gives_what_was_seen(ride: Ride, one: WorkerPool) -> None:
     """Byte for byte."""
     assert np.array_equal(list(one.frames(ride.path, range(FRAMES))), ride.frames)
 
 
-def test_three_workers_give_the_same(ride: Ride, three: DrawingWorkers) -> None:
+def test_three_workers_give_the_same(ride: Ride, three: WorkerPool) -> None:
     """Over an infinite plane, whose place depends on the picture before."""
     drawn = list(three.frames(ride.path, range(FRAMES), View()))
 
@@ -101,24 +101,22 @@ def test_three_workers_give_the_same(ride: Ride, three: DrawingWorkers) -> None:
 
 
 @pytest.mark.thorough
-def test_many_pictures_from_workers_that_do_not_divide_the_slots(
-    ride: Ride, three: DrawingWorkers
-) -> None:
-    """Each worker has slots of its own: nobody takes one before its turn."""
+def test_more_frames_than_are_buffered(ride: Ride, three: WorkerPool) -> None:
+    """Each worker waits until its frames are taken; none takes another's turn."""
     indices = [number % FRAMES for number in range(70)]
 
     for frame, index in zip(three.frames(ride.path, indices), indices, strict=True):
         assert np.array_equal(frame, ride.frames[index])
 
 
-def test_any_order_and_repetition(ride: Ride, three: DrawingWorkers) -> None:
+def test_any_order_and_repetition(ride: Ride, three: WorkerPool) -> None:
     """As asked for."""
     indices = [8, 0, 0, 3, 7, 2, 2, 8]
     drawn = list(three.frames(ride.path, indices))
     assert np.array_equal(drawn, [ride.frames[index] for index in indices])
 
 
-def test_pictures_are_the_callers_to_keep(ride: Ride, one: DrawingWorkers) -> None:
+def test_pictures_are_the_callers_to_keep(ride: Ride, one: WorkerPool) -> None:
     """Nothing is drawn over them, and they may be written to."""
     frames = one.frames(ride.path, [0] * 12)
     first = next(frames)
@@ -127,19 +125,24 @@ def test_pictures_are_the_callers_to_keep(ride: Ride, one: DrawingWorkers) -> No
     assert (first == 1).all()
 
 
+def test_few_frames_are_kept_here(ride: Ride, three: WorkerPool) -> None:
+    """However slow the caller is: two of each worker, besides what its pipe holds."""
+    frames = three.frames(ride.path, [number % FRAMES for number in range(60)])
+    for _ in frames:
+        assert all(len(worker.arrived) <= 2 for worker in three._workers)
+
+
 def test_no_pictures_are_no_work() -> None:
     """No process is started."""
-    with new_children() as new, DrawingWorkers(2) as pool:
+    with new_children() as new, WorkerPool(2) as pool:
         assert list(pool.frames(Path("nothing.h5"), [])) == []
         assert pids(pool) == []
     assert new == []
 
 
 @pytest.mark.thorough
-def test_workers_stay_and_go_over_to_other_views(
-    ride: Ride, three: DrawingWorkers
-) -> None:
-    """Larger and smaller pictures through the same memory."""
+def test_workers_stay_and_go_over_to_other_views(ride: Ride, three: WorkerPool) -> None:
+    """Larger and smaller frames through the same pipes."""
     before = pids(three)
     for height in (20, 90, 48):
         for frame in three.frames(ride.path, range(5), View(height=height)):
@@ -148,7 +151,7 @@ def test_workers_stay_and_go_over_to_other_views(
     assert pids(three) == before
 
 
-def test_the_driver_is_told(ride: Ride, three: DrawingWorkers) -> None:
+def test_the_driver_is_told(ride: Ride, three: WorkerPool) -> None:
     """Who draws is known from the first picture on."""
     frames = three.frames(ride.path, [0])
     strings = {"gl_vendor", "gl_renderer", "gl_version"}
@@ -160,7 +163,7 @@ def test_the_driver_is_told(ride: Ride, three: DrawingWorkers) -> None:
 # What goes wrong
 
 
-def test_errors_are_raised_by_the_call(ride: Ride, three: DrawingWorkers) -> None:
+def test_errors_are_raised_by_the_call(ride: Ride, three: WorkerPool) -> None:
     """The same class and facts as in the worker; the workers go on."""
     with pytest.raises(UnknownName, match="no camera 'sid'") as caught:
         three.frames(ride.path, range(FRAMES), View(camera="sid"))
@@ -171,7 +174,7 @@ def test_errors_are_raised_by_the_call(ride: Ride, three: DrawingWorkers) -> Non
     assert np.array_equal(list(three.frames(ride.path, [3])), [ride.frames[3]])
 
 
-def test_an_error_comes_at_its_place(ride: Ride, three: DrawingWorkers) -> None:
+def test_an_error_comes_at_its_place(ride: Ride, three: WorkerPool) -> None:
     """The pictures before it are given."""
     frames = three.frames(ride.path, [0, 1, 2, 3, 99])
     assert [np.array_equal(next(frames), ride.frames[n]) for n in range(4)] == [
@@ -186,7 +189,7 @@ def test_a_killed_worker_is_replaced(
 ) -> None:
     """What it was drawing is drawn again, and the log says so."""
     indices = [number % FRAMES for number in range(40)]
-    with DrawingWorkers(2) as pool:
+    with WorkerPool(2) as pool:
         frames = pool.frames(ride.path, indices)
         drawn = [next(frames)]
         for pid in pids(pool):
@@ -211,7 +214,7 @@ def test_a_worker_that_dies_twice_is_an_error(
         """,
     )
     with (
-        DrawingWorkers(2) as pool,
+        WorkerPool(2) as pool,
         pytest.raises(Error, match=r"(?s)SIGSEGV.*out of registers") as caught,
     ):
         pool.frames(ride.path, range(FRAMES))
@@ -220,20 +223,20 @@ def test_a_worker_that_dies_twice_is_an_error(
 
 
 @pytest.fixture
-def be_impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[DrawingWorkers], None]:
+def be_impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[WorkerPool], None]:
     """Let the first worker hang after a moment; the next one gets its time."""
 
-    def shorten(pool: DrawingWorkers) -> None:
-        stacks = WorkerProcess.stacks
+    def shorten(pool: WorkerPool) -> None:
+        stacks = Child.stacks
 
-        def prolong_and_ask(process: WorkerProcess) -> str:
-            for seat in pool._seats:
-                seat.patience.seconds = 120
-            return stacks(process)
+        def prolong_and_ask(child: Child) -> str:
+            for worker in pool._workers:
+                worker.patience.seconds = 120
+            return stacks(child)
 
-        monkeypatch.setattr(WorkerProcess, "stacks", prolong_and_ask)
+        monkeypatch.setattr(Child, "stacks", prolong_and_ask)
         # It has drawn, the others may only be about to begin.
-        pool._seats[0].patience.seconds = 0.5
+        pool._workers[0].patience.seconds = 0.5
 
     return shorten
 
@@ -246,8 +249,8 @@ def test_a_worker_that_always_hangs_is_not_waited_for(
     use_process(monkeypatch, "import time; time.sleep(100)")
     with (
         new_children() as new,
-        DrawingWorkers(1) as pool,
-        pytest.raises(GLError, match=r"picture 0 of .* nothing for 0.2 seconds"),
+        WorkerPool(1) as pool,
+        pytest.raises(GLError, match=r"frame 0 of .* nothing for 0.2 seconds"),
     ):
         pool.frames(ride.path, range(FRAMES))
     assert new == []
@@ -257,7 +260,7 @@ def test_a_worker_that_always_hangs_is_not_waited_for(
 def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
     ride: Ride,
     tmp_path: Path,
-    be_impatient: Callable[[DrawingWorkers], None],
+    be_impatient: Callable[[WorkerPool], None],
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -268,7 +271,7 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
         import pathlib, threading
         import mjrec.rendering.worker as worker
         from mjrec.rendering import drawing
-        draw = drawing.TrajectoryDrawing.draw
+        draw = drawing.Drawing.draw
         hung = pathlib.Path({str(tmp_path / "hung")!r})
         def wait_for_a_driver_that_hangs():
             hung.touch()
@@ -279,11 +282,11 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
             if index == 3 and not hung.exists():
                 wait_for_a_driver_that_hangs()
             return draw(self, index, **options)
-        drawing.TrajectoryDrawing.draw = hang_once
+        drawing.Drawing.draw = hang_once
         worker.main()
         """,
     )
-    with DrawingWorkers(1) as pool:
+    with WorkerPool(1) as pool:
         frames = pool.frames(ride.path, range(FRAMES))
         be_impatient(pool)
         assert np.array_equal(list(frames), ride.frames)
@@ -294,12 +297,12 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
 @pytest.mark.thorough
 def test_a_worker_that_was_stopped_hangs(
     ride: Ride,
-    be_impatient: Callable[[DrawingWorkers], None],
+    be_impatient: Callable[[WorkerPool], None],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Of two, the other one draws on; the stopped one can still say where it was."""
     indices = [number % FRAMES for number in range(40)]
-    with DrawingWorkers(2) as pool:
+    with WorkerPool(2) as pool:
         frames = pool.frames(ride.path, indices)
         drawn = [next(frames)]
         os.kill(pids(pool)[0], signal.SIGSTOP)
@@ -307,7 +310,7 @@ def test_a_worker_that_was_stopped_hangs(
         drawn += frames
     assert np.array_equal(drawn, [ride.frames[index] for index in indices])
     assert caplog.text.count("A drawing worker hangs") == 1
-    assert "in serve" in caplog.text
+    assert "in main" in caplog.text
 
 
 @pytest.mark.thorough
@@ -321,17 +324,17 @@ def test_a_slow_worker_does_not_hang(
         import time
         import mjrec.rendering.worker as worker
         from mjrec.rendering import drawing
-        draw = drawing.TrajectoryDrawing.draw
+        draw = drawing.Drawing.draw
         def slowly(self, index, **options):
             time.sleep(0.3)
             return draw(self, index, **options)
-        drawing.TrajectoryDrawing.draw = slowly
+        drawing.Drawing.draw = slowly
         worker.main()
         """,
     )
-    with DrawingWorkers(1) as pool:
+    with WorkerPool(1) as pool:
         frames = pool.frames(ride.path, range(FRAMES))
-        pool._seats[0].patience.seconds = 2
+        pool._workers[0].patience.seconds = 2
         assert np.array_equal(list(frames), ride.frames)
     assert not caplog.records
 
@@ -346,12 +349,12 @@ def test_a_crash_says_where(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None
         from mjrec.rendering import drawing
         def crash_in_the_driver(*arguments, **options):
             os.kill(os.getpid(), signal.SIGSEGV)
-        drawing.TrajectoryDrawing.draw = crash_in_the_driver
+        drawing.Drawing.draw = crash_in_the_driver
         worker.main()
         """,
     )
     with (
-        DrawingWorkers(1) as pool,
+        WorkerPool(1) as pool,
         pytest.raises(Error, match=r"(?s)SIGSEGV.*in crash_in_the_driver"),
     ):
         pool.frames(ride.path, range(FRAMES))
@@ -362,7 +365,7 @@ def test_a_worker_that_cannot_be_started(
 ) -> None:
     """The error names the program."""
     monkeypatch.setattr(sys, "executable", "/nonexistent/python")
-    with DrawingWorkers(1) as pool, pytest.raises(Error, match="/nonexistent/python"):
+    with WorkerPool(1) as pool, pytest.raises(Error, match="/nonexistent/python"):
         pool.frames(ride.path, range(FRAMES))
 
 
@@ -376,16 +379,16 @@ def test_what_a_driver_prints_does_not_disturb(
         import os, sys
         import mjrec.rendering.worker as worker
         from mjrec.rendering import drawing
-        draw = drawing.TrajectoryDrawing.draw
+        draw = drawing.Drawing.draw
         def loud(*arguments, **options):
             os.write(1, b"x" * 100_000)
             print("a driver speaks")
             return draw(*arguments, **options)
-        drawing.TrajectoryDrawing.draw = loud
+        drawing.Drawing.draw = loud
         worker.main()
         """,
     )
-    with DrawingWorkers(1) as pool:
+    with WorkerPool(1) as pool:
         assert np.array_equal(list(pool.frames(ride.path, range(4))), ride.frames[:4])
 
 
@@ -397,7 +400,7 @@ def test_errors_that_nobody_foresaw_keep_their_traceback() -> None:
         told = unpacked(carried(error))
 
     assert type(told) is Error
-    assert "test_rendering_workers.py" in str(told)
+    assert "test_rendering_pool.py" in str(told)
     assert "KeyError: 'qpos'" in str(told)
 
 
@@ -411,7 +414,7 @@ def test_errors_are_carried_without_pickle() -> None:
 def test_a_number_of_workers_that_cannot_be(count: Any) -> None:
     """One error before anything is started."""
     with pytest.raises(InvalidArgument, match="workers must be"):
-        DrawingWorkers(count)
+        WorkerPool(count)
 
 
 # Their life
@@ -419,7 +422,7 @@ def test_a_number_of_workers_that_cannot_be(count: Any) -> None:
 
 @pytest.mark.thorough
 def test_dropping_the_iterator_leaves_the_workers_usable(
-    ride: Ride, three: DrawingWorkers
+    ride: Ride, three: WorkerPool
 ) -> None:
     """What was ordered and is not wanted any more does not come."""
     for _ in range(3):
@@ -431,7 +434,7 @@ def test_dropping_the_iterator_leaves_the_workers_usable(
     assert np.array_equal(backwards, ride.frames[::-1])
 
 
-def test_a_later_call_takes_the_workers_over(ride: Ride, three: DrawingWorkers) -> None:
+def test_a_later_call_takes_the_workers_over(ride: Ride, three: WorkerPool) -> None:
     """The iterator before says so."""
     first = three.frames(ride.path, range(FRAMES))
     next(first)
@@ -445,7 +448,7 @@ def test_a_later_call_takes_the_workers_over(ride: Ride, three: DrawingWorkers) 
 def test_closed_workers_say_so(ride: Ride) -> None:
     """Closing twice is allowed, and leaves no process."""
     with new_children() as new:
-        pool = DrawingWorkers(2)
+        pool = WorkerPool(2)
         frames = pool.frames(ride.path, range(FRAMES))
         assert len(pids(pool)) == 2
         pool.close()
@@ -460,7 +463,7 @@ def test_closed_workers_say_so(ride: Ride) -> None:
 def test_forgotten_workers_end(ride: Ride) -> None:
     """Garbage collection is enough."""
     with new_children() as new:
-        pool = DrawingWorkers(1)
+        pool = WorkerPool(1)
         frames = pool.frames(ride.path, range(FRAMES))
         next(frames)
         del pool, frames
@@ -468,8 +471,8 @@ def test_forgotten_workers_end(ride: Ride) -> None:
     assert new == []
 
 
-def test_ctrl_c_while_a_picture_is_drawn(ride: Ride, one: DrawingWorkers) -> None:
-    """It reaches only the parent; the worker draws on for the next call."""
+def test_ctrl_c_while_a_picture_is_drawn(ride: Ride, one: WorkerPool) -> None:
+    """It reaches only the parent; another worker draws for the next call."""
     list(one.frames(ride.path, [0]))
     [pid] = pids(one)
     large = View(height=1000, width=1400)
@@ -477,30 +480,24 @@ def test_ctrl_c_while_a_picture_is_drawn(ride: Ride, one: DrawingWorkers) -> Non
         list(one.frames(ride.path, range(FRAMES), large))
 
     assert np.array_equal(list(one.frames(ride.path, [4])), [ride.frames[4]])
-    assert pids(one) == [pid]
-    assert os.getsid(pid) == pid
+    [another] = pids(one)
+    assert another != pid
+    assert os.getsid(another) == another
 
 
 def test_a_worker_ends_with_its_input_in_mid_drawing(
-    ride: Ride, one: DrawingWorkers
+    ride: Ride, one: WorkerPool
 ) -> None:
     """Nobody is left to want what it draws."""
-    large = View(height=3000, width=3000)
-    frames = one.frames(ride.path, [0] * 50, View())
-    process = one._seats[0].process
-    assert process is not None
-    one._give_up()
-    process.send(
-        job=100,
-        drawing={"trajectory": str(ride.path), "view": large.as_json()},
-        pictures=[[number, 0, 0] for number in range(1000)],
-    )
-    process._process.stdin.close()  # type: ignore[union-attr]  # it has one
-    wait_for_end(process.pid)
+    frames = one.frames(ride.path, [0] * 1000, View(height=1000, width=1000))
+    child = one._workers[0].child
+    assert child is not None
+    child.orders.close()
+    wait_for_end(child.pid)
     del frames
 
 
-def test_workers_are_nice(ride: Ride, one: DrawingWorkers) -> None:
+def test_workers_are_nice(ride: Ride, one: WorkerPool) -> None:
     """They give way to the simulation."""
     list(one.frames(ride.path, [0]))
     [pid] = pids(one)
@@ -513,8 +510,9 @@ CALLER = """
 import os, sys
 import numpy as np
 from pathlib import Path
-from mjrec.rendering.workers import DrawingWorkers
-with DrawingWorkers(2) as pool:
+from mjrec.gl import Probe, choice
+from mjrec.rendering.pool import WorkerPool, _environment
+with WorkerPool(2) as pool:
     frames = list(pool.frames(Path(os.environ["RIDE"]), range(9)))
 print(len(frames), sum(int(frame.sum()) for frame in frames))
 """
@@ -573,7 +571,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.thorough
-def test_from_a_thread(ride: Ride, one: DrawingWorkers) -> None:
+def test_from_a_thread(ride: Ride, one: WorkerPool) -> None:
     """Any thread, one at a time."""
     drawn: list[Any] = []
     thread = threading.Thread(
@@ -589,8 +587,9 @@ def test_a_killed_parent_leaves_no_workers(ride: Ride) -> None:
     script = """
 import os, signal, sys, time
 from pathlib import Path
-from mjrec.rendering.workers import DrawingWorkers
-pool = DrawingWorkers(2)
+from mjrec.gl import Probe, choice
+from mjrec.rendering.pool import WorkerPool, _environment
+pool = WorkerPool(2)
 frames = pool.frames(Path(os.environ["RIDE"]), range(9))
 if not os.fork():
     # A forked child has copies of the pipes, and may not use them.
@@ -600,7 +599,7 @@ if not os.fork():
         os.write(1, f"{type(error).__name__}\\n".encode())
     sys.stdin.read()
     os._exit(0)
-os.write(1, " ".join(str(s.process.pid) for s in pool._seats).encode() + b"\\n")
+os.write(1, " ".join(str(w.child.pid) for w in pool._workers).encode() + b"\\n")
 os.kill(os.getpid(), signal.SIGKILL)
 """
     # The child reads this end until the test is over.
@@ -632,8 +631,9 @@ def test_leaving_in_mid_drawing_is_silent(ride: Ride) -> None:
     script = """
 import os
 from pathlib import Path
-from mjrec.rendering.workers import DrawingWorkers
-pool = DrawingWorkers(2)
+from mjrec.gl import Probe, choice
+from mjrec.rendering.pool import WorkerPool, _environment
+pool = WorkerPool(2)
 frames = pool.frames(Path(os.environ["RIDE"]), [0] * 1000)
 next(frames)
 print("end")
@@ -656,7 +656,7 @@ def test_a_backend_is_chosen_where_none_is_named(
         monkeypatch.delenv("MUJOCO_GL")
     else:
         monkeypatch.setenv("MUJOCO_GL", setting)
-    with DrawingWorkers(3) as pool:
+    with WorkerPool(3) as pool:
         drawn = list(pool.frames(ride.path, range(FRAMES)))
         assert len(pids(pool)) == 3
     assert [frame.shape for frame in drawn] == [(HEIGHT, WIDTH, 3)] * FRAMES
@@ -668,7 +668,7 @@ def test_a_backend_that_is_named_is_used(
 ) -> None:
     """In mjrec's spelling or another."""
     monkeypatch.setenv("MUJOCO_GL", "OSMesa")
-    with DrawingWorkers(1) as pool:
+    with WorkerPool(1) as pool:
         list(pool.frames(ride.path, [0]))
         [pid] = pids(pool)
         environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
@@ -680,7 +680,7 @@ def test_a_backend_that_there_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """An error before anything is started."""
     monkeypatch.setenv("MUJOCO_GL", "vulkan")
     with pytest.raises(UnknownName, match="MUJOCO_GL"):
-        DrawingWorkers(1)
+        WorkerPool(1)
 
 
 def test_a_backend_that_does_not_work(
@@ -688,39 +688,30 @@ def test_a_backend_that_does_not_work(
 ) -> None:
     """The error has the way out."""
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
-    with DrawingWorkers(2) as pool, pytest.raises(GLError, match="mjrec doctor"):
+    with WorkerPool(2) as pool, pytest.raises(GLError, match="mjrec doctor"):
         pool.frames(ride.path, range(FRAMES))
 
 
 def test_no_backend_works(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None:
     """One error with the reasons of all; the workers may be asked again."""
-    use_process(
-        monkeypatch,
-        """
-        import sys
-        import mjrec.gl.choice, mjrec.gl.probing
-        from mjrec.gl.probing import Probe
-        mjrec.gl.choice.probe = lambda name: Probe(name, False, cause="it is broken")
-        from mjrec.rendering import worker
-        worker.main()
-        """,
-    )
+    broken = Probe("", False, cause="it is broken")
+    monkeypatch.setattr(choice, "probe", lambda name: broken)
     monkeypatch.setenv("MUJOCO_GL", "off")
-    with DrawingWorkers(2) as pool:
+    with WorkerPool(2) as pool:
         for _ in range(2):
             with pytest.raises(GLError, match=r"(?s)egl.*broken.*osmesa.*broken"):
                 pool.frames(ride.path, range(FRAMES))
 
 
 def test_workers_beside_each_other_use_one_cpu_each(
-    ride: Ride, three: DrawingWorkers
+    ride: Ride, three: WorkerPool
 ) -> None:
     """And one alone uses all; the caller's own setting is left alone."""
     list(three.frames(ride.path, range(6)))
     for pid in pids(three):
         assert b"LP_NUM_THREADS=1\0" in Path(f"/proc/{pid}/environ").read_bytes()
-    assert "LP_NUM_THREADS" not in workers._environment({}, alone=True)
-    asked = workers._environment({"LP_NUM_THREADS": "2"}, alone=False)
+    assert "LP_NUM_THREADS" not in _environment({}, alone=True)
+    asked = _environment({"LP_NUM_THREADS": "2"}, alone=False)
     assert asked["LP_NUM_THREADS"] == "2"
 
 
@@ -729,7 +720,7 @@ def test_a_setting_that_crashes_mesa_is_left_out(
 ) -> None:
     """And the log says so."""
     monkeypatch.setenv("LP_NATIVE_VECTOR_WIDTH", "512")
-    with DrawingWorkers(1) as pool:
+    with WorkerPool(1) as pool:
         assert np.array_equal(list(pool.frames(ride.path, [2])), [ride.frames[2]])
     assert "LP_NATIVE_VECTOR_WIDTH" in caplog.text
 
@@ -741,18 +732,17 @@ def test_warnings_of_workers_are_logged_here(
     use_process(
         monkeypatch,
         """
-        import logging, os
+        import logging
         from mjrec.rendering import worker
-        def use_gl():
+        open_drawing = worker.open_drawing
+        def open_and_warn(*arguments):
             logging.getLogger("x").error("no %s", "GPU")
-            os.environ["MUJOCO_GL"] = "egl"
-            return "egl"
-        worker.use_gl = use_gl
+            return open_drawing(*arguments)
+        worker.open_drawing = open_and_warn
         worker.main()
         """,
     )
-    monkeypatch.setenv("MUJOCO_GL", "")
-    with DrawingWorkers(1) as pool:
+    with WorkerPool(1) as pool:
         list(pool.frames(ride.path, [0]))
     levels = {r.getMessage(): r.levelno for r in caplog.records}
     assert levels["no GPU"] == logging.ERROR

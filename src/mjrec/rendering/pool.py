@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pool of processes that draw frames, in order, for one caller."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+import os
+import selectors
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from ..carried_errors import unpacked
+from ..errors import ClosedError, Error, GLError, InvalidArgument
+from ..frames import Frame
+from ..gl import backend_for_children
+from ..gl.backends import (
+    backend_in_environment,
+    environment_for,
+    rendering_is_off,
+)
+from ..simulation.model_trust import with_all_models_trusted
+from .pool_worker import FRAME, PoolWorker
+from .views import PlainCamera, View, plain_camera
+
+logger = logging.getLogger(__name__)
+
+
+class WorkerPool:
+    """Draws frames in processes of their own, and gives them in order.
+
+    Of n workers, worker k draws frames k, k+n, k+2n ... of a job and writes them to its
+    pipe. Of each at most two frames are kept here that were not asked for yet, however
+    many are to come. One that dies is started again at the frame that it owes; the
+    second time at one frame is an error. One that hangs, having sent nothing for
+    `patience_s` while it was waited for, is ended and counts as dead; where it hung is
+    in the log.
+
+    The processes are started as they are needed, or by `start`, and stay until `close`,
+    garbage collection or the end of this process. Only one that is given up in the
+    midst of a job is ended, and started again for the next.
+
+    They use the backend that `MUJOCO_GL` names. Where it names none, or turns rendering
+    off (which is for the simulation), it is the first that works, as of `mjrec.use_gl`.
+
+    For one thread at a time.
+
+    ::
+
+        with WorkerPool(2) as pool:
+            for frame in pool.frames(path, range(100), View(height=48, width=64)):
+                ...
+
+    Args:
+        count: how many processes; more than one use one CPU each.
+        trust_models: whether they load compiled models that a stranger wrote; they do
+            in any case where `MJREC_TRUST_MODELS` says so here.
+
+    Raises:
+        InvalidArgument: `count` is not a whole number of at least 1.
+        UnknownName: `MUJOCO_GL` names no backend that there is.
+
+    Attributes:
+        limit: how many of them draw the next job, up to `count`. The others stay.
+        gl_facts: who draws, as `gl_strings.current_gl_facts`; empty before the first
+            frame.
+    """
+
+    def __init__(self, count: int, *, trust_models: bool = False) -> None:
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise InvalidArgument(
+                f"workers must be a whole number of at least 1, got {count!r}."
+            )
+        self._environ = _environment(os.environ, alone=count == 1)
+        if trust_models:
+            self._environ = with_all_models_trusted(self._environ)
+        self._workers = [PoolWorker() for _ in range(count)]
+        self.limit = count
+        self.gl_facts: dict[str, Any] = {}
+        self._has_drawn = False
+        # The number of the call whose frames are drawn.
+        self._call = 0
+        self._closed = False
+        self._process_id = os.getpid()
+
+    def start(self) -> None:
+        """Start the workers now, so that the first frame comes sooner.
+
+        Raises:
+            GLError: no backend works here.
+            Error: one cannot be started.
+        """
+        self._check_usable()
+        for worker in self._workers[: self.limit]:
+            self._start(worker)
+
+    def frames(
+        self,
+        trajectory: Path,
+        indices: Sequence[int],
+        view: View | None = None,
+        *,
+        cameras: Sequence[PlainCamera | None] | None = None,
+    ) -> Iterator[Frame]:
+        """Return the frames of a trajectory, in the order of `indices`.
+
+        The first is drawn before this returns. Each is a new array.
+
+        Args:
+            trajectory: its file.
+            indices: the numbers of the frames, from 0; in any order, also repeated.
+            view: how they are wanted; None is as recorded.
+            cameras: several in place of that of the view; None among them is as
+                recorded. A frame is then all that they show, in a grid.
+
+        Raises:
+            UnreadableFile: of the trajectory or its model.
+            InvalidArgument: there is no such frame, no such camera in the model, or a
+                size that the driver cannot draw.
+            GLError: no backend works here, or all that was tried hangs.
+            Error: a worker died twice at one frame; the message names the signal and
+                what the worker said. Errors at later frames are raised by the
+                iterator, at their places.
+        """
+        drawing: dict[str, Any] = {
+            "trajectory": str(Path(trajectory).absolute()),
+            "view": (view or View()).as_json(),
+        }
+        if cameras is not None:
+            drawing["cameras"] = [c if c is None else plain_camera(c) for c in cameras]
+        return self.frames_of(drawing, indices)
+
+    def frames_of(
+        self, drawing: Mapping[str, Any], indices: Sequence[int]
+    ) -> Iterator[Frame]:
+        """Return the frames of anything that `drawing.open_drawing` opens.
+
+        As `frames`. Frames that an earlier call has not given yet are given up.
+        """
+        self._check_usable()
+        self._call += 1
+        drawn = self._drawn(dict(drawing), indices, self._call)
+        first = list(itertools.islice(drawn, 1))
+        return itertools.chain(first, drawn)
+
+    def close(self) -> None:
+        """End the processes at once, whatever they are at. Idempotent."""
+        self._closed = True
+        for worker in self._workers:
+            worker.end()
+
+    def __enter__(self) -> WorkerPool:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc_value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _check_usable(self, call: int | None = None) -> None:
+        if call not in (None, self._call):
+            raise ClosedError("A later call has taken the workers over.")
+        if self._closed:
+            raise ClosedError("The pool of workers is closed.")
+        if os.getpid() != self._process_id:
+            raise ClosedError(
+                f"The pool of workers belongs to process {self._process_id}: make one "
+                "in the process that uses it."
+            )
+
+    def _start(self, worker: PoolWorker) -> None:
+        if "MUJOCO_GL" not in self._environ:
+            self._environ = environment_for(backend_for_children(), self._environ)
+        worker.start(self._environ)
+
+    def _drawn(
+        self, drawing: Mapping[str, Any], indices: Sequence[int], call: int
+    ) -> Iterator[Frame]:
+        workers = self._workers[: self.limit]
+        try:
+            for first, worker in enumerate(workers):
+                positions = range(first, len(indices), len(workers))
+                worker.take(drawing, indices, positions)
+            for position in range(len(indices)):
+                worker = workers[position % len(workers)]
+                while not worker.arrived:
+                    if worker.error is not None:
+                        raise worker.error
+                    self._wait_for_news(workers)
+                    self._check_usable(call)
+                frame = worker.arrived.popleft()
+                # Before the caller has it: it may be busy with it for long.
+                self._listen(workers, 0)
+                yield frame
+                self._check_usable(call)
+        finally:
+            if self._call == call:
+                for worker in workers:
+                    worker.leave()
+
+    def _wait_for_news(self, workers: Sequence[PoolWorker]) -> None:
+        """Wait until a worker says something; end those that have not for too long."""
+        for worker in workers:
+            if worker.may_send and worker.child is None:
+                self._start(worker)
+                worker.begin()
+        hungry = [worker for worker in workers if worker.may_send]
+        seconds = min(worker.patience.begin_slice() for worker in hungry)
+        heard = self._listen(hungry, seconds)
+        for worker in hungry:
+            worker.patience.end_slice()
+            if worker in heard:
+                worker.patience.renew()
+            elif worker.patience.is_over:
+                self._end_hanging(worker)
+
+    def _listen(
+        self, workers: Sequence[PoolWorker], seconds: float
+    ) -> list[PoolWorker]:
+        """Take in what the workers send, waiting so long for it; return who sent."""
+        with selectors.PollSelector() as selector:
+            for worker in workers:
+                if worker.child is not None and worker.may_send:
+                    selector.register(
+                        worker.child.answers, selectors.EVENT_READ, worker
+                    )
+            heard = [key.data for key, _ in selector.select(seconds)]
+        for worker in heard:
+            try:
+                self._take_in(worker)
+            except EOFError:
+                assert worker.child is not None
+                worker.lose("died", worker.child.last_words())
+            except BaseException:
+                # Ctrl-C, in the midst of a message: what follows makes no sense.
+                worker.end()
+                raise
+        return heard
+
+    def _take_in(self, worker: PoolWorker) -> None:
+        while worker.may_send and (message := worker.next_message()):
+            kind, content = message
+            if kind == FRAME:
+                self._has_drawn = True
+                worker.add(content)
+                continue
+            said = json.loads(content)
+            if "log" in said:
+                logger.log(said["log"][0], "%s", said["log"][1])
+            elif "error" in said:
+                worker.error = unpacked(said["error"])
+            else:
+                worker.shape = (*said["size"], 3)
+                self.gl_facts = said["gl"]
+
+    def _end_hanging(self, worker: PoolWorker) -> None:
+        assert worker.child is not None
+        seconds = worker.patience.seconds
+        logger.error(
+            "A drawing worker hangs: it has drawn nothing for %g seconds, and is "
+            "ended. What its threads were at:\n%s",
+            seconds,
+            worker.child.stacks(),
+        )
+        worker.child.kill()
+        how = (
+            f"it drew nothing for {seconds:g} seconds and was ended; where it hung is "
+            "in the log"
+        )
+        # Where nothing was ever drawn, it is not for the sake of this frame.
+        worker.lose("hung", how, kind=Error if self._has_drawn else GLError)
+
+
+def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
+    """Return the environment variables of workers.
+
+    Without `MUJOCO_GL` the worker has to choose a backend.
+    """
+    backend = None if rendering_is_off(environ) else backend_in_environment(environ)
+    changed = environment_for(backend, environ) if backend else dict(environ)
+    if not backend:
+        changed.pop("MUJOCO_GL", None)
+    if changed.get("LP_NATIVE_VECTOR_WIDTH") == "512":
+        logger.warning(
+            "Workers that draw go without LP_NATIVE_VECTOR_WIDTH=512: Mesa crashes "
+            "with it."
+        )
+        del changed["LP_NATIVE_VECTOR_WIDTH"]
+    if not alone:
+        # Mesa's rasteriser would start as many threads as there are CPUs, in each.
+        changed.setdefault("LP_NUM_THREADS", "1")
+    return changed
