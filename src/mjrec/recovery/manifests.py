@@ -88,7 +88,7 @@ def _has_anything(remains: Remains) -> bool:
         (
             *(files.journal, files.manifest, files.stats),
             *(files.trajectories, files.videos, files.metadata),
-            remains.clip_logs,
+            remains.clip_parts,
         )
     )
 
