@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import mjrec
+from mjrec.formats.span_reader import rows_size
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.trajectory_file import finish_trajectory
 
 from .children import call
@@ -87,10 +89,10 @@ def record_and_finish(name: str, steps: int) -> dict[str, float]:
             env = _recorded_dm_control(name, steps, directory)
         else:
             env = _recorded_gymnasium(name, steps, directory)
-        [log] = Path(directory).glob("openaigym.trajectory.*.log")
-        sizes = {"log": log.stat().st_size}
+        [recording] = recordings_in_flight(Path(directory))
+        sizes = {"log": rows_size(recording)}
         start = time.perf_counter()
-        finished = finish_trajectory(log)
+        finished = finish_trajectory(recording.path)
         seconds = time.perf_counter() - start
         sizes["finished"] = finished.stat().st_size
         # Which waits until the model is stored.

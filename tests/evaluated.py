@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from recordings import in_flight
+
 from mjrec.engines.work import AGAIN
 from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
@@ -62,6 +64,8 @@ def facts_of(path: Path) -> Mapping[str, Any]:
 
 def states_of(folder: Path, monitor: str | None, episode_id: int | None) -> Any:
     """Return the states of a recorded episode."""
-    [path] = folder.glob(f"openaigym.trajectory.{monitor}.episode{episode_id:06d}.*")
+    pattern = f"openaigym.trajectory.{monitor}.episode{episode_id:06d}.h5"
+    names = {*folder.glob(pattern), *in_flight(folder)}
+    [path] = [name for name in names if name.match(pattern)]
     with open_trajectory(path) as reader:
         return reader.states(0, reader.row_count)

@@ -12,9 +12,9 @@ import mjrec
 from mjrec.formats.trajectory_file import open_trajectory
 
 
-def is_usual(monitor: Any) -> bool:
-    """Tell whether the coming step may be recorded the usual way."""
-    return monitor._recorder.usual is not None
+def is_fast(monitor: Any) -> bool:
+    """Tell whether the coming step may be recorded the fast way."""
+    return monitor._recorder.fast is not None
 
 
 def trajectories(directory: Path) -> list[mjrec.Trajectory]:

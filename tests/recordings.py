@@ -10,6 +10,13 @@ from typing import Any
 
 import av
 
+from mjrec.formats.spans import recordings_in_flight
+
+
+def in_flight(directory: Path) -> list[Path]:
+    """Return what recordings that only logs have are called, sorted by name."""
+    return sorted(each.path for each in recordings_in_flight(directory))
+
 
 def manifest_of(directory: Path) -> dict[str, Any]:
     return _json("openaigym.manifest.*", directory)

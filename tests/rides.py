@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from trajectories_by_hand import add_row, new_logs
 
+from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.trajectory import ModelChange, TrajectoryHeader
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.simulation.cameras import Camera, resolve_camera
 from mjrec.simulation.model_fields import read_fields
 from mjrec.simulation.model_store import ModelStore
@@ -116,8 +117,9 @@ def record(
     }
     store.finish()
     source = SnapshotSource(model, data, layout)
-    path = directory / "openaigym.trajectory.0.1.episode000000.log"
-    writer = TrajectoryLogWriter(path, TrajectoryHeader(facts=known, snapshot=layout))
+    logs = new_logs(directory, Infix(0, "1"))
+    name = "openaigym.trajectory.0.1.episode000000"
+    span = logs.begin(name, TrajectoryHeader(facts=known, snapshot=layout))
     snapshot = np.empty(layout.size, np.uint8)
     seen = []
     with SceneRenderer(
@@ -134,13 +136,13 @@ def record(
             move(model, data, number)
             # Pictures are of every second step.
             for step in sorted({max(2 * number - 1, 0), 2 * number}):
-                writer.add_step(step, 0.0, False, False, ())
+                add_row(span, step)
             if names:
                 fields = read_fields(model, names)
-                writer.add_model_change(ModelChange(step=2 * number, fields=fields))
+                span.add_change(ModelChange(step=2 * number, fields=fields))
             source.take(snapshot)
-            writer.add_frame(2 * number, [snapshot.data])
+            add_row(span, 2 * number, snapshot=snapshot, is_step=False)
             renderer.model_changed()
             seen.append(renderer.render(data))
-    writer.close()
-    return Ride(path, seen)
+    logs.close()
+    return Ride(logs.path_of(name), seen)

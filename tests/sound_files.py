@@ -87,15 +87,13 @@ def video(directory: Path) -> Path:
     return path
 
 
-# Each with the reader of `hostile_reading` that it is for.
+# Each with the reader of `hostile_reading` that it is for. A recording in flight is
+# several files.
 FILES: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "manifest": ("manifest", manifest),
     "stats": ("stats", stats),
     "journal": ("journal", journal),
     "metadata": ("metadata", metadata),
-    "log": ("trajectory", write_log),
-    "log to be finished": ("finish", write_log),
-    "log to be rendered": ("rendering", write_log),
     "h5": ("trajectory", finished),
     "arrays of an h5": ("arrays", finished),
     "mjb.gz": ("model", compiled),

@@ -16,12 +16,11 @@ import gymnasium
 import pytest
 from parts import parametrize
 from recordings import frames_in, metadata_of, videos_in
+from trajectories_by_hand import write_log
 
 from mjrec import Monitor, load_results
 from mjrec.commands import main
 from mjrec.formats.journal import JournalEntry, JournalWriter
-from mjrec.formats.trajectory import TrajectoryHeader
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 
 PENDULUM = """
 <mujoco>
@@ -425,9 +424,7 @@ def test_list_says_which_videos_are_pending(mjrec: Any, tmp_path: Path) -> None:
             )
         )
     journal.close()
-    trajectory = tmp_path / "openaigym.trajectory.0.7.episode000001.log"
-    facts = {"video": {"recording": "deferred"}}
-    TrajectoryLogWriter(trajectory, TrajectoryHeader(facts=facts)).close()
+    trajectory = write_log(tmp_path, 1, steps=2)
     _, out, _ = mjrec("list", tmp_path)
     assert out.count("pending") == 1
     _, out, _ = mjrec("list", tmp_path, "--json")

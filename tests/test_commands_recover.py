@@ -36,8 +36,9 @@ def test_what_could_not_be_done_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The exit status says so too."""
-    log = write_log(tmp_path, 0)
-    log.write_bytes(log.read_bytes().replace(b"log 1", b"log 9", 1))
+    write_log(tmp_path, 0)
+    [log] = tmp_path.glob("*.spans")
+    log.write_bytes(log.read_bytes().replace(b'"version": 1', b'"version": 9', 1))
     assert main(["recover", str(tmp_path)]) == 1
     said = capsys.readouterr().out
     assert "Not recovered:\n" in said

@@ -158,7 +158,7 @@ def check_nothing_is_half(directory: Path) -> None:
     """No hidden file is left, no log, and whatever is there can be read."""
     hidden = [p.name for p in directory.glob(".*") if not p.name.endswith(".lock")]
     assert hidden == []
-    assert list(directory.glob("*.log")) == []
+    assert list(directory.glob("openaigym.states.*")) == []
     for path in directory.glob("*.json"):
         json.loads(path.read_text())
 

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from full_disk import file_size_limit
 from parts import parametrize
-from recordings import manifest_of
+from recordings import in_flight, manifest_of
 
 import mjrec
 from mjrec.commands import main
+from mjrec.formats.spans import add_facts, drop_recording
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.formats.trajectory_log_facts import append_facts
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.pending import key_of, look_at, recordings
 
@@ -92,8 +92,7 @@ def finish(directory: Path) -> list[Any]:
 
 def parts(directory: Path) -> list[str]:
     """Return the names of all logs of clips, without their beginnings."""
-    files = sorted(directory.glob("openaigym.clip.*"))
-    return [path.name.partition(".step")[2] for path in files]
+    return [path.name.partition(".step")[2] for path in in_flight(directory)]
 
 
 def hashes(directory: Path) -> dict[str, list[str]]:
@@ -202,7 +201,7 @@ def test_clips_wait_for_who_renders_them(tmp_path: Path) -> None:
         camera=["track", -1],
     )
     [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
-    assert parts(tmp_path) == [f"000000001.part{n:06d}.log" for n in range(3)]
+    assert parts(tmp_path) == [f"000000001.part{n:06d}" for n in range(3)]
     assert main(["render", str(tmp_path)]) == 0
     assert not parts(tmp_path)
     manifest = manifest_of(tmp_path)
@@ -253,7 +252,6 @@ def test_running_clip_is_its_monitors_business(tmp_path: Path) -> None:
     )
     with monitor:
         hop(monitor, 4)
-        monitor._recorder._clips._clip._part._log.flush()
         [key] = recordings(tmp_path)
         assert look_at(tmp_path, key) is None
     assert look_at(tmp_path, key) is not None
@@ -261,17 +259,15 @@ def test_running_clip_is_its_monitors_business(tmp_path: Path) -> None:
 
 # Takes more than five seconds: a process is killed, and its clips are drawn.
 def test_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> None:
-    """With all that was there a second before; and it is in the manifest then."""
+    """With all that was there; and it is in the manifest then."""
     script = (
-        "import os, signal, sys, time, glob\n"
+        "import os, signal, sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "import mjrec\n"
         "from test_deferred_clips import hop, hopper\n"
         f"env = mjrec.Monitor(hopper(), {str(tmp_path)!r}, video_length=99,\n"
         "    step_trigger=lambda step: step == 2, workers=0)\n"
         "hop(env, 13)\n"
-        f"while not glob.glob({str(tmp_path / '*.part000002.log')!r}):\n"
-        "    time.sleep(0.01)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run(
@@ -344,7 +340,7 @@ def test_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
     assert (outcome.name, outcome.failure) == (entry["video"], None)
     assert outcome.frame_count == 4
     [about] = told(tmp_path)
-    assert "part000000" in about["broken_reason"]
+    assert "states" in about["broken_reason"]
 
 
 def test_a_part_that_is_missing_is_told(tmp_path: Path) -> None:
@@ -357,8 +353,8 @@ def test_a_part_that_is_missing_is_told(tmp_path: Path) -> None:
         video_length=6,
         workers=0,
     )
-    [second] = tmp_path.glob("*.part000001.log")
-    second.unlink()
+    [second] = [p for p in in_flight(tmp_path) if p.name.endswith("part000001")]
+    drop_recording(second)
     [outcome] = finish(tmp_path)
     assert "part 1" in str(outcome.failure)
     assert len(parts(tmp_path)) == 2
@@ -393,9 +389,9 @@ def test_no_other_video_is_written_over(name: str | None, tmp_path: Path) -> Non
     """Logs may be anybody's: the name of a video has to be that of its own clip."""
     record(tmp_path, hopper(), 3, step_trigger=lambda step: step == 1, workers=0)
     [key] = recordings(tmp_path)
-    [log] = tmp_path.glob("openaigym.clip.*")
+    [log] = in_flight(tmp_path)
     named = None if name is None else name.format(infix=key.infix)
-    append_facts(log, {"video": {"recording": "deferred", "name": named or ""}})
+    add_facts(log, {"video": {"recording": "deferred", "name": named or ""}})
     before = sorted(tmp_path.iterdir())
     [outcome] = finish(tmp_path)
     assert "not that of its own" in str(outcome.failure)
@@ -407,3 +403,19 @@ def test_a_video_is_found_by_its_own_name(tmp_path: Path) -> None:
     record(tmp_path, hopper(), 3, step_trigger=lambda step: step == 1, workers=0)
     [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
     assert [key_of(entry["video"])] == recordings(tmp_path) == [key_of(entry["clip"])]
+
+
+def test_a_clip_is_written_at_the_rate_that_was_asked_for(tmp_path: Path) -> None:
+    """`fps` is that of the file, whichever frames `max_fps` leaves."""
+    record(
+        *(tmp_path, hopper(), 9),
+        step_trigger=lambda step: step == 1,
+        video_length=6,
+        workers=0,
+        fps=12,
+        max_fps=62.5,
+    )
+    assert not next(finish_pending(tmp_path, recordings(tmp_path), workers=1)).failure
+    [about] = told(tmp_path)
+    assert about["frame_count"] == 5
+    assert about["fps"] == "12"

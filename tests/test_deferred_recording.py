@@ -22,7 +22,7 @@ import pytest
 from gymnasium.envs.mujoco import MujocoEnv
 from parts import parametrize
 from processes import children
-from recordings import frames_in, manifest_of, metadata_of, videos_in
+from recordings import frames_in, in_flight, manifest_of, metadata_of, videos_in
 from touch_grid import TOUCH_GRID
 
 import mjrec
@@ -80,7 +80,7 @@ def test_close_leaves_a_rendered_directory(pendulum: Any, tmp_path: Path) -> Non
         steps(env, 2, seed=1)
     assert videos_in(tmp_path) == [0, 1]
     assert not list(tmp_path.glob(".*"))
-    assert not list(tmp_path.glob("*.log"))
+    assert not in_flight(tmp_path)
     assert len(list(tmp_path.glob("*.h5"))) == 2
     assert len(list(tmp_path.glob("openaigym.model.*.mjb.gz"))) == 1
     manifest = manifest_of(tmp_path)
@@ -177,7 +177,7 @@ def test_leaving_otherwise_renders_nothing(
     assert entry["episode_id"] == 0
     assert "1 video pending" in caplog.text
     assert videos_in(tmp_path) == []
-    assert len(list(tmp_path.glob("openaigym.trajectory.*"))) == 1
+    assert len(in_flight(tmp_path)) == 1
     assert len(list(tmp_path.glob("openaigym.model.*.mjb.gz"))) == 1
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium
 import pytest
-from recordings import frames_in, manifest_of, metadata_of, stats_of
+from recordings import frames_in, in_flight, manifest_of, metadata_of, stats_of
 
 import mjrec
 from mjrec import Monitor
@@ -214,7 +214,11 @@ def test_ways_of_ending_a_program(
     assert len(stats_of(tmp_path)["episode_lengths"]) == 1
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 2
     assert not list(tmp_path.glob("*.mp4"))
-    trajectory = mjrec.load_trajectory(next(tmp_path.glob("*episode000001.log")))
+    [trajectory] = [
+        mjrec.load_trajectory(path)
+        for path in in_flight(tmp_path)
+        if "episode000001" in path.name
+    ]
     assert trajectory.facts["complete"] is False
     assert trajectory.facts["reason"] == reason
     if reason == "exception":
@@ -288,7 +292,7 @@ def test_a_handlers_exception_between_a_step_and_its_row(
     monkeypatch.setattr(row, handler)
     with pytest.raises(ArithmeticError), monitor:
         steps(monitor, 1)
-    [path] = tmp_path.glob("*.log")
+    [path] = in_flight(tmp_path)
     facts = mjrec.load_trajectory(path).facts
     assert (facts["complete"], facts["reason"]) == (False, "exception")
     assert facts["exception"]["message"] == "the handler's"

@@ -119,3 +119,12 @@ def test_whether_there_may_be_a_trajectory_is_known_before(
 ) -> None:
     """So that nothing is taken down at a reset for nobody."""
     assert choice(**options).may_keep_trajectory(episode_type) is may
+
+
+def test_trajectories_are_asked_for_once_a_number() -> None:
+    """A reset that another one replaces has the same number."""
+    numbers: list[int] = []
+    chosen = choice(trajectory_callable=lambda number: numbers.append(number) or True)
+    for number in (0, 0, 1):
+        chosen.keeps_trajectory(number, episode_type="t", has_video=False)
+    assert numbers == [0, 1]

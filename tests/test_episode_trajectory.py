@@ -9,21 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 from full_disk import file_size_limit
+from trajectories_by_hand import INFIX, new_logs
 
 from mjrec import FileNotWritten
+from mjrec.formats.monitor_directory import trajectory_prefix
+from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.deferred_video import DeferredVideo
 from mjrec.recorder.episode_trajectory import EpisodeTrajectory
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
 
-# So large that each is written at once.
+# So large that the tail has room for four.
 ACTION = np.zeros(100_000, np.float32)
-LIMIT = 2_000_000
+LIMIT = 5_000_000
+NAME = trajectory_prefix(INFIX, 3)
 
 
 def trajectory(directory: Path, *, tolerated: bool) -> EpisodeTrajectory:
     """Return one of a simulation whose state cannot be seen, and that has a video."""
     recorder = TrajectoryRecorder(
-        directory / "t.log",
+        new_logs(directory),
+        NAME,
         facts={},
         states=None,
         start=None,
@@ -67,19 +72,18 @@ def test_a_full_disk_ends_the_trajectory_only(tmp_path: Path) -> None:
     assert 0 < of_episode.recorder.steps < 12
     assert of_episode.deferred is not None
     assert of_episode.deferred.broken
-    assert "t.log" in of_episode.deferred.metadata["broken_reason"]
+    assert "states" in of_episode.deferred.metadata["broken_reason"]
     assert of_episode.is_there
 
 
 def test_a_full_disk_is_an_error_otherwise(tmp_path: Path) -> None:
-    """And what could not be written at the end is, once there is room."""
+    """And all steps before it are there."""
     of_episode = trajectory(tmp_path, tolerated=False)
     with file_size_limit(LIMIT):
         with pytest.raises(FileNotWritten):
             take_steps(of_episode, 12)
         # Nothing more is recorded, which is no error.
         take_steps(of_episode, 1)
-        with pytest.raises(FileNotWritten):
-            of_episode.end({})
-    of_episode.end({})
-    assert of_episode.path.stat().st_size > LIMIT
+        of_episode.end({})
+    with open_trajectory(of_episode.path) as reader:
+        assert 0 < reader.step_count == of_episode.recorder.steps < 12

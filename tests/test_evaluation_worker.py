@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from gymnasium.envs.registration import registry
-from recordings import videos_in
+from recordings import in_flight, videos_in
 
 import mjrec
 from conftest import Corridor
@@ -225,8 +225,9 @@ def test_a_policy_that_fails_loses_its_episode_only(
     # What comes after it is not the beginning once more.
     begun = [_first_state(tmp_path, results[0, n]) for n in range(3)]
     assert len(set(begun)) == 3
-    path = f"*.{failed.monitor}.episode{failed.episode_id:06d}.log"
-    [trajectory] = (tmp_path / FOLDER).glob(path)
+    ending = f".{failed.monitor}.episode{failed.episode_id:06d}.h5"
+    folder = tmp_path / FOLDER
+    [trajectory] = [p for p in in_flight(folder) if p.name.endswith(ending)]
     facts = facts_of(trajectory)
     assert (facts["complete"], facts["length"]) == (False, 2)
     assert worker_of(tmp_path, plan)(run_job(plan, 0, again=True))["episodes"] == 0
@@ -258,7 +259,7 @@ def test_a_signal_is_no_failure(tmp_path: Path) -> None:
     with pytest.raises(Terminated):
         run_all(tmp_path, plan, Stumbling(told_to_end, 1))
     assert [*read_ledgers(tmp_path / FOLDER)] == [(0, 0)]
-    logs = sorted((tmp_path / FOLDER).glob("*.log"))
+    logs = in_flight(tmp_path / FOLDER)
     assert [facts_of(log)["complete"] for log in logs] == [True, False]
     assert worker_of(tmp_path, plan)(run_job(plan, 0, again=True))["episodes"] == 2
 
@@ -303,7 +304,7 @@ def test_without_videos_trajectories_are_final_at_once(tmp_path: Path) -> None:
     run_all(tmp_path, plan, Stumbling(_raise, 2))
     folder = tmp_path / FOLDER
     assert len(list(folder.glob("*.h5"))) == 3
-    assert not list(folder.glob("*.log"))
+    assert not in_flight(folder)
     left = worker_of(tmp_path, plan)({"kind": "recover", "folder": FOLDER})
     assert left == {"monitors": []}
 

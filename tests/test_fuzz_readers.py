@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import itertools
 import json
 import os
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,20 @@ from hostile_reading import Inspector, Outcome
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sound_files import compiled, finished, source
-from trajectories_by_hand import write_log
+from trajectories_by_hand import INFIX, write_log
 
 from mjrec import Error, UnreadableFile
 from mjrec.formats.journal import JournalEntry, JournalWriter, read_journal
 from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
+from mjrec.formats.model_changes import pack_change
+from mjrec.formats.monitor_directory import states_name, trajectory_prefix
+from mjrec.formats.row_log import TAIL_HEAD
+from mjrec.formats.span_reader import rows_size
+from mjrec.formats.span_writer import LOOK_PREFIX
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.stats_file import StatsFile, read_stats_file, write_stats_file
+from mjrec.formats.trajectory import ModelChange
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
-from mjrec.formats.trajectory_log_reader import TrajectoryLogReader
 from mjrec.formats.video_metadata import is_broken
 from mjrec.json_text import dumps, loads
 from mjrec.rendering.recorded_facts import open_for_rendering
@@ -298,35 +304,54 @@ def test_keys_that_are_no_texts_become_texts() -> None:
     assert loads(dumps(value)) == {"0": {"null": 2}, "true": 3, "4": 5, "a": 6}
 
 
-# --- the log of a trajectory ---------------------------------------------------------
+# --- a recording in flight -----------------------------------------------------------
 
+NAME = trajectory_prefix(INFIX, 0)
+SPANS = states_name(INFIX, 0)
+PARTS = (".spans", ".log", ".looks")
 
-def records_of(log: bytes) -> list[tuple[bytes, bytes]]:
-    records, at = [], 32
-    while at < len(log):
-        kind, _, length = struct.unpack_from("<4sIQ", log, at)
-        records.append((kind, log[at + 16 : at + 16 + length]))
-        at += 16 + -(-length // 8) * 8
-    return records
-
-
-def log_of(records: list[tuple[bytes, bytes]]) -> bytes:
-    """Return a log of records whose checksums are right."""
-    parts = [b"mjrec trajectory log 1".ljust(31) + b"\n"]
-    for kind, payload in records:
-        length = len(payload).to_bytes(8, "little")
-        checksum = zlib.crc32(payload, zlib.crc32(kind + length))
-        parts += [kind, checksum.to_bytes(4, "little"), length, payload]
-        parts.append(bytes(-len(payload) % 8))
-    return b"".join(parts)
+Files = dict[str, bytes]
 
 
 @pytest.fixture(scope="module")
-def sound_log(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    path = write_log(tmp_path_factory.mktemp("log"))
-    table = b'[{"name": "geom_rgba", "dtype": "<f4", "shape": [2, 2]}]'
-    change = struct.pack("<qQ", 1, len(table)) + table + bytes(16)
-    return log_of([*records_of(path.read_bytes()), (b"chng", change)])
+def sound_log(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    """The files of a recording, by their suffixes."""
+    directory = tmp_path_factory.mktemp("log")
+    write_log(directory)
+    spans = directory / SPANS
+    packed = pack_change(ModelChange(step=1, fields={"geom_rgba": np.ones((2, 2))}))
+    spans.with_suffix(".looks").write_bytes(LOOK_PREFIX.pack(1, len(packed)) + packed)
+    return {part: spans.with_suffix(part).read_bytes() for part in PARTS}
+
+
+_numbers = itertools.count()
+
+
+def put_log(tmp_path: Path, files: Files) -> Path:
+    """Write files into a directory of their own; return the recording's path."""
+    directory = tmp_path / str(next(_numbers))
+    directory.mkdir()
+    for part, content in files.items():
+        (directory / SPANS).with_suffix(part).write_bytes(content)
+    return directory / f"{NAME}.h5"
+
+
+def read_log(path: Path) -> Any:
+    """Return what is read, None where there is one error that names a file of it."""
+    refusal: UnreadableFile | None = None
+    try:
+        with open_trajectory(path) as reader:
+            content = reader.content()
+        with contextlib.suppress(UnreadableFile):
+            open_for_rendering(path).close()
+        for found in recordings_in_flight(path.parent):
+            rows_size(found)
+        return content
+    except UnreadableFile as error:
+        refusal = error
+    assert refusal.path.parent == path.parent
+    assert len(str(refusal)) < 2000 + len(str(path))
+    return None
 
 
 def read_everything(path: Path) -> Any:
@@ -339,72 +364,87 @@ def read_everything(path: Path) -> Any:
 
 @FEW
 @given(data=st.data())
-def test_any_log(tmp_path: Path, sound_log: bytes, data: st.DataObject) -> None:
-    """Records changed, with checksums that are right, left out, doubled, exchanged."""
-    records = records_of(sound_log)
+def test_any_list(tmp_path: Path, sound_log: Files, data: st.DataObject) -> None:
+    """Lines changed, left out, doubled, exchanged."""
+    lines = sound_log[".spans"].splitlines()
     for _ in range(data.draw(st.integers(1, 3))):
-        at = data.draw(st.integers(0, len(records) - 1))
-        kind, payload = records[at]
+        at = data.draw(st.integers(0, len(lines) - 1))
         what = data.draw(st.integers(0, 5))
         if what == 0:
-            records.insert(at, data.draw(st.sampled_from(records)))
-        elif what == 1 and len(records) > 1:
-            del records[at]
-        elif kind in (b"head", b"fact") and payload.startswith(b"{"):
-            with contextlib.suppress(ValueError):
-                payload = data.draw(mangled(json.loads(payload)))
-            records[at] = (kind, payload)
+            lines.insert(at, data.draw(st.sampled_from(lines)))
+        elif what == 1 and len(lines) > 1:
+            del lines[at]
         else:
-            records[at] = (kind, damaged(payload, data.draw(DAMAGE)))
-    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
-    path.write_bytes(log_of(records))
-    read_or_refuse(path, read_everything)
+            with contextlib.suppress(ValueError):
+                lines[at] = data.draw(mangled(json.loads(lines[at])))
+    content = b"".join(line + b"\n" for line in lines)
+    read_log(put_log(tmp_path, {**sound_log, ".spans": content}))
 
 
-@pytest.mark.parametrize("part", ["facts", "rows"])
-def test_every_header_with_one_thing_wrong(
-    tmp_path: Path, sound_log: bytes, part: str
+@pytest.mark.parametrize("number", range(4))
+def test_every_line_with_one_thing_wrong(
+    tmp_path: Path, sound_log: Files, number: int
 ) -> None:
-    """Of a log; what is relied on in rendering is looked at there."""
-    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
-    records = records_of(sound_log)
-    head = json.loads(records[0][1])
-    for value in spoilt(head[part]):
-        records[0] = (b"head", json.dumps({**head, part: value}).encode())
-        path.write_bytes(log_of(records))
-        read_or_refuse(path, read_everything)
+    """Of a list; what is relied on in rendering is looked at there."""
+    lines = sound_log[".spans"].splitlines()
+    assert len(lines) == 4
+    for value in spoilt(json.loads(lines[number])):
+        changed = [*lines[:number], json.dumps(value).encode(), *lines[number + 1 :]]
+        content = b"".join(line + b"\n" for line in changed)
+        read_log(put_log(tmp_path, {**sound_log, ".spans": content}))
 
 
 @FEW
-@given(damage=DAMAGE)
-def test_any_damaged_log(tmp_path: Path, sound_log: bytes, damage: Any) -> None:
-    """Bytes changed anywhere: what was read before the damage stays what it was."""
-    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
-    path.write_bytes(damaged(sound_log, damage))
-    found = read_or_refuse(path, read_everything)
+@given(part=st.sampled_from(PARTS), damage=DAMAGE)
+def test_any_damaged_log(
+    tmp_path: Path, sound_log: Files, part: str, damage: Any
+) -> None:
+    """Bytes changed anywhere in one of its files."""
+    content = damaged(sound_log[part], damage)
+    found = read_log(put_log(tmp_path, {**sound_log, part: content}))
     if found is not None:
+        assert len(found.states) <= 5
+        assert len(found.rewards) == max(0, len(found.states) - 1)
+        assert np.isin(found.frame_steps, np.arange(len(found.states))).all()
+        assert (np.diff(found.frame_steps) > 0).all()
+    if found is not None and part != ".log":
         assert (found.rewards == 0.5).all()
+
+
+@FEW
+@given(damage=DAMAGE, written=st.integers(0, 4))
+def test_any_damaged_tail(
+    tmp_path: Path, sound_log: Files, damage: Any, written: int
+) -> None:
+    """Rows are taken from it as far as they say that they are the next ones."""
+    rows = sound_log[".log"]
+    size = len(rows) // 5
+    head = struct.pack("=QQQ", 5, size // 8, 5).ljust(TAIL_HEAD, b"\0")
+    # Where it counts: most of a head is nothing.
+    place = [(p / 20 if p < 0.5 else p, *rest) for p, *rest in damage]
+    tail = damaged(head[:24] + rows, place)  # type: ignore[arg-type]
+    tail = tail[:24].ljust(TAIL_HEAD, b"\0") + tail[24:]
+    files = {**sound_log, ".log": rows[: written * size], ".tail": tail}
+    found = read_log(put_log(tmp_path, files))
+    assert found is None or written <= len(found.states) <= 5
 
 
 @pytest.mark.thorough
 @FEWER
 @given(data=st.data())
 def test_any_log_that_is_read_is_finished(
-    tmp_path: Path, sound_log: bytes, data: st.DataObject
+    tmp_path: Path, sound_log: Files, data: st.DataObject
 ) -> None:
     """As a file that holds the same."""
-    records = records_of(sound_log)
-    head = json.loads(records[0][1])
+    lines = sound_log[".spans"].splitlines()
+    head = json.loads(lines[0])
     facts = data.draw(changed(head["facts"]))
-    records[0] = (b"head", json.dumps({**head, "facts": facts}).encode())
-    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
-    path.write_bytes(log_of(records))
-    finished_path = path.with_suffix(".h5")
-    finished_path.unlink(missing_ok=True)
-    if read_or_refuse(path, read_everything) is None:
+    lines[0] = json.dumps({**head, "facts": facts}).encode()
+    content = b"".join(line + b"\n" for line in lines)
+    path = put_log(tmp_path, {**sound_log, ".spans": content})
+    before = read_log(path)
+    if before is None:
         return
-    with TrajectoryLogReader(path) as reader:
-        before = reader.content()
     after = read_everything(finish_trajectory(path))
     assert dumps(after.header.facts) == dumps(before.header.facts)
     assert np.array_equal(after.snapshots, before.snapshots)

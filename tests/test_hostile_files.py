@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -21,7 +22,7 @@ import h5py
 import mujoco
 import numpy as np
 import pytest
-from hostile_reading import Inspector
+from hostile_reading import SECONDS, Inspector
 from sound_files import (
     FILES,
     SPHERE,
@@ -34,14 +35,15 @@ from sound_files import (
     stats,
     stored,
 )
-from trajectories_by_hand import write_log
+from trajectories_by_hand import INFIX, add_row, new_logs, write_log
 
 from mjrec import UnreadableFile, load_trajectory
 from mjrec.formats.manifest import read_manifest
 from mjrec.formats.monitor_directory import Infix, episode_of, infix_of
+from mjrec.formats.span_writer import LOOK_PREFIX, SpanLogs
+from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import Array, ModelChange, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.json_text import dumps, loads
 from mjrec.rendering.rendered_manifests import reconcile
 from mjrec.simulation.model_trust import note_models
@@ -186,14 +188,11 @@ SPOILS = (nothing, noise, a_hole_of_a_terabyte, half_of_it)
 def test_other_content_is_refused(
     inspector: Inspector, directory: Path, kind: str, spoil: Callable[[Path], None]
 ) -> None:
-    """A log is read up to its hole; half of this one is no header."""
+    """Whatever the name says that it is."""
     reader, write = FILES[kind]
     path = write(directory)
     spoil(path)
-    if kind.startswith("log") and spoil is a_hole_of_a_terabyte:
-        assert inspector.read(reader, path).kind == "value"
-    else:
-        inspector.refuses(reader, path)
+    inspector.refuses(reader, path)
 
 
 @pytest.mark.parametrize("spoil", [nothing, noise, a_hole_of_a_terabyte, half_of_it])
@@ -442,11 +441,12 @@ def test_arrays_that_would_fill_the_memory_are_not_read(
 ) -> None:
     """Four gigabytes of observations out of four megabytes."""
     header = TrajectoryHeader(facts={}, observation=Array("<f8", (1 << 20,)))
-    path = directory / "openaigym.trajectory.0.7.episode000000.log"
-    with contextlib.closing(TrajectoryLogWriter(path, header)) as writer:
-        for step in range(2):
-            writer.add_step(step, 0.0, False, False, [bytes(8 << 20)])
-    path = finish_trajectory(path)
+    logs = new_logs(directory)
+    span = logs.begin(NAME, header)
+    for step in range(2):
+        add_row(span, step)
+    logs.close()
+    path = finish_trajectory(logs.path_of(NAME))
     rows = 500
     with h5py.File(path, "r+") as file:
         chunk = file["observations"].id.read_direct_chunk((0, 0))[1]
@@ -462,46 +462,176 @@ def test_arrays_that_would_fill_the_memory_are_not_read(
     assert "claims to hold 4 GiB" in inspector.refuses("arrays", path)
 
 
-def record(kind: bytes, payload: bytes) -> bytes:
-    length = len(payload).to_bytes(8, "little")
-    checksum = zlib.crc32(payload, zlib.crc32(kind + length)).to_bytes(4, "little")
-    return kind + checksum + length + payload + bytes(-len(payload) % 8)
+# --- recordings in flight ------------------------------------------------------------
+
+READERS = ["trajectory", "finish", "rendering"]
+PARTS = [".spans", ".log", ".tail", ".looks"]
+NAME = "openaigym.trajectory.0.7.episode000000"
+
+
+def in_flight(directory: Path) -> tuple[Path, Path]:
+    """Record an episode and be killed; return its path, and that of its list."""
+    header = TrajectoryHeader(facts={}, observation=Array("<f8", (9,)))
+    logs = SpanLogs(directory, INFIX, numbers=itertools.count(), tail_bytes=1)
+    span = logs.begin(NAME, header)
+    for step in range(10):
+        if step == 5:
+            span.add_change(ModelChange(step=5, fields={"geom_rgba": np.ones(4)}))
+        add_row(span, step, observation=step)
+    span.note({"rate": "20"})
+    logs.release()
+    [spans] = list_paths(directory)
+    return directory / f"{NAME}.h5", spans
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_sound_recording_is_read(
+    inspector: Inspector, directory: Path, reader: str
+) -> None:
+    """So that what is refused below is refused for its harm."""
+    path, spans = in_flight(directory)
+    assert all(spans.with_suffix(part).exists() for part in PARTS)
+    outcome = inspector.read(reader, path)
+    assert outcome.kind == "value", outcome
+
+
+def refuses(inspector: Inspector, reader: str, path: Path, spans: Path) -> str:
+    """Check that reading is one error of ours that names a file of the recording."""
+    outcome = inspector.read(reader, path)
+    assert outcome.kind == "refused", outcome
+    named = Path(outcome.names or "")
+    assert named == path or named.with_suffix(".spans") == spans, outcome
+    assert outcome.seconds < SECONDS / 2, outcome
+    assert len(outcome.said) < 2000 + len(str(path)), outcome.said[:4000]
+    return outcome.said
+
+
+@pytest.mark.parametrize("put", PUT)
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("reader", READERS)
+def test_only_regular_files_of_a_recording_are_opened(
+    inspector: Inspector,
+    directory: Path,
+    reader: str,
+    part: str,
+    put: Callable[[Path, Path], None],
+) -> None:
+    """As of all others; nothing of the recording is removed."""
+    path, spans = in_flight(directory)
+    file = spans.with_suffix(part)
+    outside = directory.with_name("ours") / file.name
+    outside.parent.mkdir()
+    file.rename(outside)
+    os.utime(outside, (0, outside.stat().st_mtime))
+    put(file, outside)
+    before = sorted(directory.iterdir())
+    refuses(inspector, reader, path, spans)
+    assert outside.stat().st_atime == 0
+    assert sorted(directory.iterdir()) == before
+
+
+@pytest.mark.parametrize("spoil", SPOILS)
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("reader", READERS)
+def test_other_content_of_a_recording_is_refused_or_passed_over(
+    inspector: Inspector,
+    directory: Path,
+    reader: str,
+    part: str,
+    spoil: Callable[[Path], None],
+) -> None:
+    """Without its list nothing is known of it; of the rest there is what is whole."""
+    path, spans = in_flight(directory)
+    spoil(spans.with_suffix(part))
+    if part == ".spans" and spoil is not a_hole_of_a_terabyte:
+        refuses(inspector, reader, path, spans)
+        return
+    outcome = inspector.read(reader, path)
+    assert outcome.kind == "value", outcome
+    assert outcome.seconds < SECONDS / 2, outcome
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_json_bombs_in_a_list_are_refused_or_passed_over(
+    inspector: Inspector, directory: Path, bomb: str
+) -> None:
+    """One that begins it is refused; behind the beginning it says nothing."""
+    path, spans = in_flight(directory)
+    sound = spans.read_bytes()
+    spans.write_bytes(sound + BOMBS[bomb] + b"\n")
+    outcome = inspector.read("trajectory", path)
+    assert outcome.kind == "value", outcome
+    assert outcome.seconds < SECONDS / 2, outcome
+    spans.write_bytes(BOMBS[bomb] + b"\n" + sound)
+    refuses(inspector, "trajectory", path, spans)
+
+
+def note(facts: str) -> bytes:
+    return f'{{"note": "{NAME}", "facts": {facts}}}\n'.encode()
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        note("[" * 1_000_000),
+        note('{"complete": true, "complete": false}'),
+        note('{"a": "%s"}' % ("a" * (30 << 20))) * 3,
+        b"a" * (200 << 20),
+        b"{\n" * 50_000,
+    ],
+    ids=["nested", "a fact twice", "large facts", "an endless line", "no lines"],
+)
+def test_hostile_lines_of_a_list_take_little(
+    inspector: Inspector, directory: Path, lines: bytes
+) -> None:
+    """Time and memory; what was said before counts."""
+    path, spans = in_flight(directory)
+    with spans.open("ab") as file:
+        file.write(lines)
+    outcome = inspector.read("trajectory", path)
+    assert outcome.kind == "value", outcome
+    assert outcome.seconds < SECONDS / 2, outcome
 
 
 def change(step: int, table: str, content: bytes) -> bytes:
-    return record(
-        b"chng", struct.pack("<qQ", step, len(table)) + table.encode() + content
-    )
+    return struct.pack("<qQ", step, len(table)) + table.encode() + content
 
 
 ONE = '{"name": "geom_rgba", "dtype": "|u1", "shape": [1]}'
 
 
 @pytest.mark.parametrize(
-    "records",
+    "packed",
     [
         change(-1, f"[{ONE}]", b"a"),
         change(0, f"[{ONE}, {ONE}]", b"ab"),
         change(0, '[{"name": "x", "dtype": "|O", "shape": [1]}]', bytes(8)),
         change(0, '[{"name": "x", "dtype": "<f8", "shape": [1099511627776]}]', b""),
         change(0, "[" * 1_000_000, b""),
-        record(b"fact", b"[" * 1_000_000),
-        record(b"fact", b'{"complete": true, "complete": false}'),
-        record(b"fact", b'{"a": "%s"}' % (b"a" * (30 << 20))) * 3,
     ],
-    ids=[
-        *("no step", "a field twice", "objects", "a terabyte", "nested change"),
-        *("nested facts", "a fact twice", "facts without end"),
-    ],
+    ids=["no step", "a field twice", "objects", "a terabyte", "nested"],
 )
-def test_hostile_records_of_a_log_are_refused(
-    inspector: Inspector, directory: Path, records: bytes
+def test_hostile_changes_of_a_model_are_refused(
+    inspector: Inspector, directory: Path, packed: bytes
 ) -> None:
-    """Their checksums are right."""
-    path = write_log(directory)
-    with path.open("ab") as file:
-        file.write(records)
-    inspector.refuses("trajectory", path)
+    """Before memory is taken for what they say."""
+    path, spans = in_flight(directory)
+    spans.with_suffix(".looks").write_bytes(LOOK_PREFIX.pack(0, len(packed)) + packed)
+    assert ".looks" in refuses(inspector, "trajectory", path, spans)
+
+
+def test_a_change_that_is_longer_than_any_is_not_read(
+    inspector: Inspector, directory: Path
+) -> None:
+    """A file of a terabyte takes no room on the disk."""
+    path, spans = in_flight(directory)
+    looks = spans.with_suffix(".looks")
+    looks.write_bytes(LOOK_PREFIX.pack(0, 1 << 39))
+    os.truncate(looks, 1 << 40)
+    assert inspector.read("trajectory", path).kind == "value"
+
+
+# --- what trajectories say -----------------------------------------------------------
 
 
 def test_an_environment_in_a_file_is_text(directory: Path) -> None:
@@ -536,11 +666,12 @@ def test_what_a_trajectory_says_of_its_model_is_checked(
 
 def test_a_model_change_that_fits_nothing_names_the_file(directory: Path) -> None:
     """And not the field alone."""
-    path = directory / "openaigym.trajectory.0.7.episode000000.log"
     header = TrajectoryHeader(facts={"model": {**stored(directory)}})
-    with contextlib.closing(TrajectoryLogWriter(path, header)) as writer:
-        writer.add_model_change(ModelChange(step=0, fields={"geom_rgba": np.ones(3)}))
-        writer.add_step(0, 0.0, False, False, ())
+    logs = new_logs(directory)
+    span = logs.begin(NAME, header)
+    span.add_change(ModelChange(step=0, fields={"geom_rgba": np.ones(3)}))
+    add_row(span, 0)
+    path = logs.path_of(NAME)
     with pytest.raises(UnreadableFile, match="belongs to another model") as error:
         load_trajectory(path).model()
     assert error.value.path == path

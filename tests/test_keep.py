@@ -18,7 +18,14 @@ import gymnasium
 import pytest
 from full_disk import file_size_limit
 from parts import parametrize
-from recordings import frames_in, journal_of, manifest_of, metadata_of, videos_in
+from recordings import (
+    frames_in,
+    in_flight,
+    journal_of,
+    manifest_of,
+    metadata_of,
+    videos_in,
+)
 
 import mjrec
 from conftest import Corridor
@@ -102,13 +109,15 @@ def h5_of(directory: Path) -> list[int]:
 
 
 def logs_of(directory: Path) -> list[int]:
-    """Return the numbers of the episodes with a log."""
-    return held(directory, "*.log")
+    """Return the numbers of the episodes in flight."""
+    return [int(path.stem[-6:]) for path in in_flight(directory)]
 
 
 def facts_of(directory: Path, episode: int) -> dict[str, Any]:
     """Return the facts of a trajectory."""
-    [path] = directory.glob(f"*.episode{episode:06d}.*")
+    finished = directory.glob("*.h5")
+    ending = f".episode{episode:06d}.h5"
+    [path] = {p for p in (*finished, *in_flight(directory)) if p.name.endswith(ending)}
     with open_trajectory(path) as reader:
         return dict(reader.header.facts)
 
@@ -455,11 +464,11 @@ def test_interrupted_deletion_is_taken_up_again(
     env = mjrec.Monitor(pendulum(), tmp_path, keep="worst:1", workers=0)
     run(env, 1)
 
-    def interrupted(paths: Any) -> None:
+    def interrupted(trajectory: Path) -> None:
         monkeypatch.undo()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(kept_videos, "_remove", interrupted)
+    monkeypatch.setattr(kept_videos, "drop_recording", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(env, 1)
     assert logs_of(tmp_path) == [0, 1]
@@ -496,8 +505,8 @@ def test_full_disk_at_the_end_loses_no_chosen_video(
         pendulum(), tmp_path, keep="worst:2", workers=0, on_error=on_error
     )
     run(env, 8)
-    size = max(path.stat().st_size for path in tmp_path.glob("*.log"))
-    # Enough for all but what is added to the longer log.
+    size = max(path.stat().st_size for path in tmp_path.glob("*.spans"))
+    # Enough for all but what is added to the longer list.
     with file_size_limit(size + 20):
         if on_error == "raise":
             with pytest.raises(mjrec.FileNotWritten):
@@ -655,7 +664,7 @@ def test_what_is_decided_elsewhere_is_left_without_a_word(
             monitor.reset(seed=1)
             monitor.step(monitor.action_space.sample())
     assert caplog.text == ""
-    logs = sorted(tmp_path.glob("*.log"))
+    logs = in_flight(tmp_path)
     assert len(logs) == 2
     for log, complete in zip(logs, (True, False), strict=True):
         with open_trajectory(log) as reader:

@@ -14,11 +14,12 @@ from processes import children
 from trajectories_by_hand import write_log
 
 from mjrec import Error, FileNotWritten, UnreadableFile
+from mjrec.formats.spans import is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import log_finishing
 from mjrec.rendering.log_finishing import finish_log
 
-LOG = "openaigym.trajectory.0.7.episode000000.log"
+NAME = "openaigym.trajectory.0.7.episode000000.h5"
 
 # Finishes argv[1], whatever its size, and prints how.
 PROGRAM = """
@@ -56,9 +57,9 @@ def test_a_long_log_is_finished_in_another_process(
     """With the same result, which the log makes room for; also by a relative path."""
     write_log(tmp_path, steps=4)
     monkeypatch.chdir(tmp_path)
-    finished = finish_log(Path(LOG))
-    assert finished == Path(LOG).with_suffix(".h5")
-    assert names(tmp_path) == [finished.name]
+    finished = finish_log(Path(NAME))
+    assert finished == Path(NAME)
+    assert names(tmp_path) == [NAME]
     with open_trajectory(finished) as reader:
         assert reader.step_count == 4
 
@@ -66,23 +67,24 @@ def test_a_long_log_is_finished_in_another_process(
 @pytest.mark.usefixtures("elsewhere")
 def test_errors_come_home(tmp_path: Path) -> None:
     """With their class, their words and their attributes; the log stays."""
-    log = tmp_path / LOG
-    log.write_bytes(b"no log")
-    with pytest.raises(UnreadableFile, match="it is no trajectory") as caught:
+    log = write_log(tmp_path)
+    [changes] = [path.with_suffix(".looks") for path in tmp_path.glob("*.log")]
+    changes.mkdir()
+    with pytest.raises(UnreadableFile, match="regular file") as caught:
         finish_log(log)
-    assert caught.value.path == log
-    assert log.exists()
-    write_log(tmp_path)
-    (tmp_path / LOG).with_suffix(".h5").mkdir()
+    assert caught.value.path == changes.with_suffix(".log")
+    assert is_in_flight(log)
+    changes.rmdir()
+    log.mkdir()
     with pytest.raises(FileNotWritten):
         finish_log(log)
-    assert log.exists()
+    assert is_in_flight(log)
 
 
 def test_a_log_that_is_not_there(tmp_path: Path) -> None:
     """As `finish_trajectory` has it."""
     with pytest.raises(UnreadableFile):
-        finish_log(tmp_path / LOG)
+        finish_log(tmp_path / NAME)
 
 
 @pytest.mark.usefixtures("elsewhere")
@@ -97,7 +99,7 @@ def test_a_process_that_dies_is_told(
     log = write_log(tmp_path)
     with pytest.raises(Error, match=r"signal 9[^$]*last words"):
         finish_log(log)
-    assert log.exists()
+    assert is_in_flight(log)
 
 
 @pytest.mark.usefixtures("no_process_is_left")
@@ -123,7 +125,7 @@ def test_a_process_that_hangs_is_ended(
     log = write_log(tmp_path)
     with pytest.raises(Error, match="did nothing for 3 seconds"):
         finish_log(log)
-    assert log.exists()
+    assert is_in_flight(log)
     assert "in wait_for_a_disk" in caplog.text
 
 
@@ -151,9 +153,10 @@ def test_ctrl_c_leaves_no_process_and_no_half_file(
 
     monkeypatch.setattr(log_finishing, "_result", interrupted)
     log = write_log(tmp_path)
+    before = names(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         finish_log(log)
-    assert names(tmp_path) == [log.name]
+    assert names(tmp_path) == before
 
 
 def test_being_ended_leaves_no_half_file(
@@ -170,9 +173,10 @@ def test_being_ended_leaves_no_half_file(
     directory = tmp_path / "recordings"
     directory.mkdir()
     log = write_log(directory)
+    before = names(directory)
     with pytest.raises(Error, match="ended with 1"):
         finish_log(log)
-    assert names(directory) == [log.name]
+    assert names(directory) == before
 
 
 def _finish_in_daemon(log: Path) -> None:
@@ -189,7 +193,7 @@ def test_it_works_in_a_daemonic_process(tmp_path: Path) -> None:
     process.start()
     process.join(60)
     assert process.exitcode == 0
-    assert log.with_suffix(".h5").exists()
+    assert log.exists()
 
 
 def test_a_script_without_a_guard_is_not_run_again(tmp_path: Path) -> None:
@@ -200,4 +204,4 @@ def test_a_script_without_a_guard_is_not_run_again(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, script, log], capture_output=True, text=True, check=False
     )
-    assert (done.stdout, done.stderr) == (f"{log.with_suffix('.h5')}\n", "")
+    assert (done.stdout, done.stderr) == (f"{log}\n", "")

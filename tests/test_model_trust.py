@@ -24,6 +24,7 @@ from sound_files import stored
 import mjrec
 from mjrec import UnreadableFile, UntrustedModel, load_trajectory
 from mjrec.commands import main
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering.video_jobs import VideoWorker
 from mjrec.simulation.model_store import load_model
 from mjrec.simulation.model_trust import (
@@ -520,7 +521,7 @@ def test_sources_show_what_the_environment_showed(
     shown = recorded(env, directory)
     become_another_user(monkeypatch, tmp_path)
     forbid_compiled_models(monkeypatch, directory)
-    [path] = directory.glob("*.trajectory.*")
+    [path] = (recording.path for recording in recordings_in_flight(directory))
     np.testing.assert_array_equal(list(mjrec.render(path)), shown)
     again = load_trajectory(path).model()
     np.testing.assert_array_equal(again.geom_rgba, model.geom_rgba)
@@ -545,7 +546,7 @@ def test_composers_sources_show_what_the_task_showed(
     shown.append(env.physics.render(**size))
     monitor.close(wait=False)
     become_another_user(monkeypatch, tmp_path)
-    [path] = directory.glob("*.trajectory.*")
+    [path] = (recording.path for recording in recordings_in_flight(directory))
     np.testing.assert_array_equal(list(mjrec.render(path)), shown)
 
 

@@ -22,7 +22,10 @@ VISIBLE = {
     "openaigym.video.0.1.video000027.mp4": ("0.1", 27),
     "openaigym.video.0.1.video000027.meta.json": ("0.1", 27),
     "openaigym.trajectory.0.1.episode000027.h5": ("0.1", 27),
-    "openaigym.clip.0.1.step000000137.part000000.log": ("0.1", None),
+    **{
+        f"openaigym.states.0.1.000000.{end}": ("0.1", None)
+        for end in ("spans", "log", "tail", "looks", "spans.damaged")
+    },
     "openaigym.model.0123456789abcdef.zip": (None, None),
     "openaigym.results.0.1.monitor.csv": ("0.1", None),
 }
@@ -41,6 +44,7 @@ FOREIGN = (
     "openaigym..manifest.json",
     "mjrec.evaluation.0.1.jsonl",
     "openaigym.video.0.1.video27.mp4",
+    "openaigym.states.0.1.log",
     "notes",
 )
 
@@ -49,6 +53,14 @@ FOREIGN = (
 def test_name_says_monitor_and_episode(name: str) -> None:
     """As far as it has them."""
     assert (infix_of(name), episode_of(name)) == {**VISIBLE, **HIDDEN}[name]
+
+
+def test_a_clips_part_says_its_monitor_and_is_no_file(tmp_path: Path) -> None:
+    """It is only ever in a log; its number is not that of an episode."""
+    name = "openaigym.clip.0.1.step000000137.part000000"
+    (tmp_path / name).touch()
+    assert (infix_of(name), episode_of(name)) == ("0.1", None)
+    assert list(iter_monitor_files(tmp_path, hidden=True)) == []
 
 
 @pytest.mark.parametrize("name", FOREIGN)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from trajectories_by_hand import write_log
 
 import mjrec
 from mjrec import (
@@ -327,15 +328,23 @@ def test_joining_takes_nobody_elses_name(tmp_path: Path) -> None:
 
 
 def test_a_monitor_that_joins_leaves_dead_ones_as_they_are(
-    tmp_path: Path, make_corridor: Any, play: Callable[..., None]
+    tmp_path: Path,
+    make_corridor: Any,
+    play: Callable[..., None],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Putting them in order is left to others."""
-    dead = tmp_path / "openaigym.trajectory.0.1.episode000000.log"
-    dead.write_bytes(b"x")
+    env_id = ENV_INFO["env_id"]
+    dead = write_log(tmp_path, infix=Infix(0, "1"), ended=False, env_id=env_id)
+    left = [path for path in tmp_path.iterdir() if ".states." in path.name]
+    before = [path.read_bytes() for path in left]
     record(tmp_path, make_corridor, play, resume="join")
-    assert dead.read_bytes() == b"x"
-    record(tmp_path, make_corridor, play, resume=True)
+    assert [path.read_bytes() for path in left] == before
     assert not dead.exists()
+    record(tmp_path, make_corridor, play, resume=True)
+    assert not any(path.exists() for path in left)
+    assert dead.exists()
+    assert "Not recovered" not in caplog.text
 
 
 @pytest.mark.parametrize("resume", ["yes", 1, None])

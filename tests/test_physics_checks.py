@@ -26,6 +26,7 @@ from forged_episodes import (
     verdicts,
 )
 from parts import parametrize
+from trajectories_by_hand import write_log
 
 from mjrec.evidence.verification import Verdict
 from mjrec.formats.trajectory import ModelChange
@@ -500,9 +501,9 @@ def test_a_forged_state_fails_without_its_environment(forged: Path) -> None:
 
 
 def test_an_unfinished_log_is_not_checkable(tmp_path: Path) -> None:
-    """What a killed process has left is said, and not read."""
-    name = "openaigym.trajectory.0.7.episode000003.log"
-    (tmp_path / name).write_bytes(b"anything")
+    """What a killed process has left is said, and its rows are not read."""
+    write_log(tmp_path, 3, ended=False)
+    next(tmp_path.glob("*.log")).write_bytes(b"anything")
     [check] = physics_of(tmp_path)
     assert check.verdict is Verdict.NOT_CHECKABLE
     assert check.subject == "episode 3 of 0.7"

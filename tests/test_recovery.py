@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from recordings import (
     frames_in,
+    in_flight,
     journal_of,
     manifest_of,
     metadata_of,
@@ -32,6 +33,7 @@ from mjrec.formats.locks import Lock, try_lock
 from mjrec.formats.monitor_directory import (
     journal_name,
     lock_name,
+    states_name,
     video_lock_name,
     video_prefix,
 )
@@ -115,7 +117,9 @@ def assert_in_order(directory: Path) -> None:
     assert not again
     assert str(again) == f"Nothing to recover in {directory}."
     assert {path.name: path.read_bytes() for path in directory.iterdir()} == before
-    assert not [n for n in before if n.startswith(".") or n.endswith(".log")]
+    hidden = [name for name in before if name.startswith(".")]
+    in_flight = [name for name in before if name.endswith((".spans", ".log", ".tail"))]
+    assert not hidden + in_flight
 
 
 def expected(frame: int) -> Any:
@@ -143,9 +147,8 @@ def test_a_live_video_cut_off_in_mid_episode_is_whole_up_to_there(
     whole = metadata_of(directory, 0)
     assert (metadata["complete"], metadata["reason"]) == (False, "killed")
     assert (metadata["frame_count"], metadata["frame_steps"]) == (8, [[0, 7]])
-    assert set(whole) - set(metadata) == {
-        *("length", "reward", "terminated", "truncated")
-    }
+    assert set(whole) - set(metadata) == {"terminated", "truncated"}
+    assert metadata["length"] == 7
     differs = {key for key in whole if metadata.get(key) != whole[key]}
     assert differs - {"length", "reward", "terminated", "truncated"} == {
         *("episode_id", "complete", "frame_count", "frame_steps", "encoder_version"),
@@ -219,8 +222,7 @@ def test_deferred_episodes_become_trajectories_and_stay_pending(
     """The one in flight too, marked as killed; rendered, it shows what was recorded."""
     directory = killed(
         "env = cheetah(workers=0)\nrun(env)\nrun(env, 6)\n"
-        "env._recorder._states.finish()\n"
-        "env._recorder._trajectory.recorder._log.flush()\ndie()"
+        "env._recorder._states.finish()\ndie()"
     )
     before = results_of(directory)
     mjrec.recover(directory)
@@ -452,13 +454,13 @@ def test_a_log_whose_episode_is_in_the_journal_is_complete(tmp_path: Path) -> No
 
 
 def test_logs_that_hold_nothing_do_not_come_back(tmp_path: Path) -> None:
-    """An empty one is removed, and one that nobody can read is set aside."""
-    good = write_log(tmp_path, 0)
-    empty, garbage = (Path(str(good).replace("000000", f"00000{n}")) for n in (1, 2))
+    """An empty list is removed, and one that nobody can read is set aside."""
+    write_log(tmp_path, 0)
+    empty, garbage = (tmp_path / states_name(INFIX, number) for number in (1, 2))
     empty.touch()
-    garbage.write_bytes(b"mjrec trajectory log 1" + bytes(200))
+    garbage.write_bytes(b'{"format": "else"}\n' + bytes(203))
     recovery = mjrec.recover(tmp_path)
-    assert f"{empty.name}: empty, removed" in str(recovery)
+    assert f"{empty.name}: nothing in flight, removed" in str(recovery)
     assert f"{garbage.name}.damaged" in str(recovery)
     assert not empty.exists()
     assert garbage.with_name(f"{garbage.name}.damaged").stat().st_size == 222
@@ -467,10 +469,22 @@ def test_logs_that_hold_nothing_do_not_come_back(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_rows_that_nothing_describes_are_kept(tmp_path: Path) -> None:
+    """A machine that failed may have lost the list's first line, and no row."""
+    write_log(tmp_path, 0)
+    [spans] = tmp_path.glob("*.spans")
+    spans.write_bytes(b"")
+    recovery = mjrec.recover(tmp_path)
+    assert f"{spans.name}.damaged" in str(recovery)
+    assert spans.with_suffix(".log").stat().st_size
+    assert not mjrec.recover(tmp_path)
+
+
 def test_a_log_of_a_newer_version_is_left_as_it_is(tmp_path: Path) -> None:
     """It is not damaged, and a newer mjrec can recover it."""
-    log = write_log(tmp_path, 0)
-    content = log.read_bytes().replace(b"log 1", b"log 9", 1)
+    write_log(tmp_path, 0)
+    [log] = tmp_path.glob("*.spans")
+    content = log.read_bytes().replace(b'"version": 1', b'"version": 9', 1)
     log.write_bytes(content)
     recovery = mjrec.recover(tmp_path)
     assert [file.name for file in recovery.failures] == [log.name]
@@ -636,10 +650,10 @@ def test_logs_of_a_monitor_that_did_not_wait(
         "env = cheetah(workers=0)\nrun(env)\nenv.close(wait=False)\ndie()"
     )
     manifest = manifest_of(directory)
-    [log] = directory.glob("*.log")
+    [path] = in_flight(directory)
     assert mjrec.recover(directory)
-    assert not log.exists()
-    assert log.with_suffix(".h5").exists()
+    assert path.exists()
+    assert not list(directory.glob("openaigym.states.*"))
     assert manifest_of(directory) == manifest
     assert not mjrec.recover(directory)
 
@@ -657,3 +671,16 @@ def test_a_damaged_manifest_is_made_again(killed: Callable[[str], Path]) -> None
     assert after["episode_rewards"] == before["episode_rewards"]
     assert len(manifest_of(directory)["mjrec"]["pending"]) == 1
     assert not mjrec.recover(directory)
+
+
+def test_provenance_of_a_manifest_is_kept(killed: Callable[[str], Path]) -> None:
+    """Packages, machine and policy stay known though the monitor was killed later."""
+    directory = killed(
+        "env = monitor(write_upon_reset=True)\nrun(env)\n"
+        "env._recorder._manifest._surroundings.found(wait=True)\n"
+        "run(env)\nrun(env)\ndie(env)"
+    )
+    before = manifest_of(directory)["mjrec"]["surroundings"]
+    assert before["packages"]
+    assert mjrec.recover(directory)
+    assert manifest_of(directory)["mjrec"]["surroundings"] == before

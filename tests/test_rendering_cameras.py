@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -21,7 +22,9 @@ from rides import record as record_ride
 from trajectories_by_hand import (
     INFIX,
     Painter,
+    add_row,
     grey,
+    new_logs,
     write_finished,
     write_log,
     write_pending_manifest,
@@ -30,6 +33,8 @@ from trajectories_by_hand import (
 from mjrec import BlankVideo, Monitor, UnreadableFile, recover
 from mjrec.annotation import Caption, annotated
 from mjrec.formats.frame_hashes import frame_hash_path
+from mjrec.formats.monitor_directory import trajectory_prefix
+from mjrec.formats.trajectory import StateComponent
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_metadata import is_done, metadata_path
 from mjrec.rendering import again, shared_pool
@@ -238,20 +243,15 @@ def test_captions_tell_time_by_what_is_known(tmp_path: Path) -> None:
 
 def test_the_clock_counts_from_the_reset(tmp_path: Path) -> None:
     """Also where the simulation's begins elsewhere, and rewards are added up."""
-    import trajectories_by_hand
-
-    trajectory = write_log(tmp_path, steps=2)
-    with open_trajectory(trajectory) as reader:
+    with open_trajectory(write_log(tmp_path, 1)) as reader:
         header = reader.header
-    clock = trajectories_by_hand.StateComponent("time", 0, 1)
-    trajectory.unlink()
-    header = type(header)(facts=header.facts, state=(clock,), snapshot=header.snapshot)
-    writer = trajectories_by_hand.TrajectoryLogWriter(trajectory, header)
+    clock = StateComponent("time", 0, 1)
+    logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
+    span = logs.begin(name, dataclasses.replace(header, state=(clock,)))
     for step, (time, reward) in enumerate([(7.0, 0), (7.5, 0.25), (9.0, -1)]):
-        writer.add_step(step, reward, False, False, [np.float64(time).tobytes()])
-        writer.add_frame(step, [bytes([grey(step)])])
-    writer.close()
-    with open_trajectory(trajectory) as reader:
+        add_row(span, step, reward=reward, state=time, snapshot=grey(step))
+    logs.close()
+    with open_trajectory(logs.path_of(name)) as reader:
         captions = list(Captions(reader, [0, 1, 2]))
     assert [c.time for c in captions] == [0.0, 0.5, 2.0]
     assert [c.reward for c in captions] == [0.0, 0.25, -0.75]

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from parts import parametrize
 from rides import FRAMES, HEIGHT, WIDTH, Ride, move, record, start
+from trajectories_by_hand import INFIX, add_row, new_logs, write_log
 
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
+from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import Array, RowLayout, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.rendering.drawing import Drawing, trajectory_drawing
 from mjrec.rendering.views import View
 from mjrec.simulation.canvas import KeptCanvas
@@ -210,11 +211,8 @@ def test_a_picture_that_is_not_there(drawing: Drawing) -> None:
 
 def test_a_trajectory_without_snapshots(tmp_path: Path) -> None:
     """The reason of the recording is told, and another way."""
-    path = tmp_path / "openaigym.trajectory.0.1.episode000000.log"
     facts = {"scene": None, "refusal": "a plugin draws"}
-    writer = TrajectoryLogWriter(path, TrajectoryHeader(facts=facts))
-    writer.add_step(0, 0.0, False, False, ())
-    writer.close()
+    path = write_log(tmp_path, frames=False, **facts)
 
     with pytest.raises(NoPictures, match=r"a plugin draws.*render_states"):
         trajectory_drawing(path, View())
@@ -271,13 +269,13 @@ def test_a_recorded_camera_that_the_model_lacks(
 
 def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:
     """The arrays do not fit."""
-    path = tmp_path / "openaigym.trajectory.0.1.episode000000.log"
     header = header_of(ride)
     layout = RowLayout.packed([("geom_xpos", Array("<f8", (1, 3)))])
-    writer = TrajectoryLogWriter(path, dataclasses.replace(header, snapshot=layout))
-    writer.add_step(0, 0.0, False, False, ())
-    writer.add_frame(0, [bytes(layout.size)])
-    writer.close()
+    logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
+    path = logs.path_of(name)
+    span = logs.begin(name, dataclasses.replace(header, snapshot=layout))
+    add_row(span, 0, snapshot=0)
+    logs.close()
     [model] = ride.path.parent.glob("openaigym.model.*")
     (tmp_path / model.name).write_bytes(model.read_bytes())
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import subprocess
 import time
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from trajectories_by_hand import Painter, write_log, write_pending_manifest
 
 from mjrec import BlankVideo, FileNotWritten, Monitor, RenderError, VideoRecorder
 from mjrec.formats.ffmpeg import ffmpeg_executable
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.trajectory_file import (
     find_trajectory,
     finish_trajectory,
@@ -31,6 +33,7 @@ from mjrec.formats.trajectory_file import (
 )
 from mjrec.formats.video_metadata import metadata_path
 from mjrec.rendering import shared_pool
+from mjrec.rendering.directory_videos import render_videos
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.outcomes import Outcome
 from mjrec.rendering.pending import recorded_episodes
@@ -203,8 +206,9 @@ def test_a_full_disk_is_one_clear_error_wherever_it_comes(
 ) -> None:
     """Be it at the trajectory, the hashes, the video, its metadata or the manifest."""
     if finished:
-        for log in two.glob("*.log"):
-            finish_trajectory(log)
+        for recording in recordings_in_flight(two):
+            finish_trajectory(recording.path)
+        assert not list(two.glob("*.states.*"))
     with file_size_limit(room):
         failures = [str(outcome.failure) for outcome in finish(two)]
     for failure in failures:
@@ -234,11 +238,17 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("pages", [0, 1, 3, 4, 6])
-def test_a_really_full_disk(pages: int, small_disk: Path, painter: Painter) -> None:
+def test_a_really_full_disk(
+    pages: int, small_disk: Path, tmp_path: Path, painter: Painter
+) -> None:
     """As before, with the system's own refusal."""
+    # As long as they are written, logs take more.
+    recorded = tmp_path / "recorded"
+    recorded.mkdir()
     for episode_id in range(2):
-        write_log(small_disk, episode_id)
-    write_pending_manifest(small_disk, 0, 1)
+        write_log(recorded, episode_id)
+    write_pending_manifest(recorded, 0, 1)
+    shutil.copytree(recorded, small_disk, dirs_exist_ok=True)
     ballast = small_disk / "ballast"
     with ballast.open("wb", buffering=0) as file:
         with contextlib.suppress(OSError):
@@ -257,6 +267,38 @@ def test_a_really_full_disk(pages: int, small_disk: Path, painter: Painter) -> N
     ballast.unlink()
     check_nothing_is_half(small_disk)
     check_all_is_there_after_another_try(small_disk)
+
+
+# Damaged logs
+
+
+@pytest.mark.parametrize(
+    "damage", [b"?\n", b'{"format": "mjrec spans", "version": 99}\n']
+)
+def test_a_list_that_cannot_be_read_is_told_and_costs_no_other(
+    damage: bytes, two: Path
+) -> None:
+    """Nobody knows what it was of; it stays."""
+    damaged = min(two.glob("*.spans"))
+    damaged.write_bytes(damage)
+    rendered = render_videos(two, workers=1)
+    assert list(rendered.videos) == [VIDEO.format(1)]
+    assert list(rendered.failures) == [damaged.name]
+    assert "Cannot read" in rendered.failures[damaged.name]
+    assert damaged.read_bytes() == damage
+    assert list(reasons_in(two)) == [VIDEO.format(0)]
+
+
+def test_rows_that_are_not_there_cost_their_own_video_only(two: Path) -> None:
+    """The manifest says why; with the rows it is rendered."""
+    rows = min(two.glob("*.log"))
+    hidden = rows.rename(two.parent / "hidden")
+    first, second = finish(two)
+    assert "Cannot read" in str(first.failure)
+    assert second.is_video
+    assert list(reasons_in(two).values()) == [first.failure]
+    hidden.rename(rows)
+    check_all_is_there_after_another_try(two)
 
 
 # The whole way, with workers, a simulation and OpenGL

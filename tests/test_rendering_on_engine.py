@@ -28,6 +28,7 @@ from mjrec import GLError, LocalEngine, Monitor
 from mjrec.engines.work import Job, JobOutcome, Work
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import Infix
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering import shared_pool, video_jobs
 from mjrec.rendering.again import Variant, render_again
 from mjrec.rendering.finishing import finish_pending
@@ -162,13 +163,19 @@ def copy_of(recorded: Path, place: Path) -> Path:
     return shutil.copytree(recorded, place)
 
 
+def logs_in(directory: Path) -> list[Path]:
+    """Return what its episodes in flight will become."""
+    paths = (recording.path for recording in recordings_in_flight(directory))
+    return sorted(path for path in paths if path.suffix == ".h5")
+
+
 @pytest.mark.thorough
 def test_two_workers_make_the_files_that_this_process_makes(
     recorded: Path, tmp_path: Path
 ) -> None:
     """Byte for byte: videos, metadata, frame hashes, manifests, trajectories."""
     here, there = (copy_of(recorded, tmp_path / name) for name in ("here", "there"))
-    assert len(list(here.glob("*.episode*.log"))) == 3
+    assert len(logs_in(here)) == 3
     own = list(finish_pending(here, recordings(here), workers=1))
     assert len(own) == 4
     others = finish(LocalEngine(2), there)
@@ -191,9 +198,8 @@ def test_another_view_is_the_same_file_too(recorded: Path, tmp_path: Path) -> No
         max_fps=Fraction(30000, 1001),
         fps=12.5,
     )
-    list(render_again(sorted(here.glob("*.episode*.log")), variant, workers=1))
-    paths = sorted(there.glob("*.episode*.log"))
-    outcomes = list(render_again_on_engine(LocalEngine(2), paths, variant))
+    list(render_again(logs_in(here), variant, workers=1))
+    outcomes = list(render_again_on_engine(LocalEngine(2), logs_in(there), variant))
     assert [each.failure for each in outcomes] == [None] * 3
     assert len(list(there.glob("*.12%2E5fps.mp4"))) == 3
     assert content_of(there) == content_of(here)

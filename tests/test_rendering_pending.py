@@ -21,8 +21,8 @@ from trajectories_by_hand import (
 from mjrec import GLError, load_results
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import Infix, lock_name, video_lock_name
+from mjrec.formats.spans import add_facts, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.formats.trajectory_log_facts import append_facts
 from mjrec.formats.video_metadata import is_done
 from mjrec.rendering import shared_pool
 from mjrec.rendering.finishing import EpisodeFinisher, finish_pending
@@ -58,8 +58,7 @@ def test_episodes_are_in_their_order(tmp_path: Path) -> None:
     for infix in (Infix(10, "a"), Infix(2, "a")):
         for episode_id in (1, 0):
             write_log(tmp_path, episode_id, infix=infix)
-    log = write_log(tmp_path, 5, infix=Infix(2, "a"))
-    log.with_suffix(".h5").write_bytes(b"")
+    write_log(tmp_path, 5, infix=Infix(2, "a")).write_bytes(b"")
     assert [
         (key.infix.monitor_id, key.episode_id) for key in recorded_episodes(tmp_path)
     ] == [
@@ -105,15 +104,15 @@ def test_a_finished_trajectory_without_a_deferred_video_is_done(
 
 
 def test_a_log_without_a_video_gets_its_final_form_only(
-    tmp_path: Path, painter: Painter
+    tmp_path: Path, painter: Painter, names: Callable[[Path], list[str]]
 ) -> None:
     """And nobody draws."""
     log = write_log(tmp_path, video=None)
     [outcome] = finish(tmp_path)
     assert not outcome.is_video
     assert outcome.failure is None
-    assert outcome.name == log.with_suffix(".h5").name
-    assert not log.exists()
+    assert outcome.name == log.name
+    assert names(tmp_path) == [log.name]
     assert painter.asked == []
 
 
@@ -130,10 +129,10 @@ def test_an_undecided_episode_is_its_monitors(tmp_path: Path) -> None:
     log = write_log(tmp_path, candidate=True)
     lock = Lock(tmp_path / lock_name(INFIX), "")
     assert finish(tmp_path) == []
-    assert log.exists()
-    append_facts(log, {"candidate": False})
+    assert is_in_flight(log)
+    add_facts(log, {"candidate": False})
     assert look_at(tmp_path, KEY) is not None
-    append_facts(log, {"candidate": True})
+    add_facts(log, {"candidate": True})
     lock.release()
     [outcome] = finish(tmp_path)
     assert outcome.is_video
@@ -176,7 +175,7 @@ def test_a_trajectory_that_is_not_kept_stays_while_its_video_fails(
     log = write_log(tmp_path, kept=False, frames=False)
     [outcome] = finish(tmp_path)
     assert outcome.failure is not None
-    assert log.exists()
+    assert is_in_flight(log)
 
 
 def test_an_episode_that_another_has_is_left_to_him(
@@ -247,7 +246,7 @@ def test_without_gl_every_video_fails_at_once(
     outcomes = finish(tmp_path)
     assert [outcome.failure for outcome in outcomes] == ["nothing renders here"] * 3
     assert len(tries) == 1
-    assert [log.with_suffix(".h5").exists() for log in logs] == [True] * 3
+    assert [log.exists() for log in logs] == [True] * 3
 
 
 def test_an_unforeseen_error_is_told_with_its_kind(
@@ -383,27 +382,27 @@ def test_results_list_the_rendered_videos(tmp_path: Path) -> None:
 def test_a_log_beside_its_finished_trajectory_goes(tmp_path: Path) -> None:
     """Somebody died between making one and removing the other."""
     log = write_log(tmp_path)
-    content = log.read_bytes()
+    rows = {path: path.read_bytes() for path in tmp_path.glob("*.states.*")}
     finish(tmp_path)
-    log.write_bytes(content)
-    [outcome] = finish(tmp_path)
-    assert outcome.failure is None
-    assert not log.exists()
-    with open_trajectory(log.with_suffix(".h5")) as reader:
+    for path, content in rows.items():
+        path.write_bytes(content)
+    assert finish(tmp_path) == []
+    assert not any(path.exists() for path in rows)
+    with open_trajectory(log) as reader:
         assert reader.step_count == 4
 
 
 def test_the_manifest_says_why_a_video_is_still_pending(tmp_path: Path) -> None:
     """What became of the latest try; a try that succeeds takes it away."""
-    good = write_log(tmp_path, 0)
-    content = good.read_bytes()
+    write_log(tmp_path, 0)
     write_pending_manifest(tmp_path, 0)
-    good.write_bytes(b"not a log")
+    [rows] = tmp_path.glob("*.log")
+    hidden = rows.rename(tmp_path / "hidden")
     [outcome] = finish(tmp_path)
     [entry] = manifest_in(tmp_path)["mjrec"]["pending"]
     assert entry["reason"] == outcome.failure
     assert "Cannot read" in entry["reason"]
-    good.write_bytes(content)
+    hidden.rename(rows)
     assert [outcome.failure for outcome in finish(tmp_path)] == [None]
     assert manifest_in(tmp_path)["mjrec"]["pending"] == []
     assert len(manifest_in(tmp_path)["videos"]) == 1

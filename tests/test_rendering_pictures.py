@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 from processes import children
 from rides import HEIGHT, WIDTH, Ride, move, record, start
+from trajectories_by_hand import write_log
 
 import mjrec
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
-from mjrec.formats.trajectory import TrajectoryHeader
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.rendering.recorded_pictures import chosen_frames
 
 SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -138,12 +137,8 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
     """One error each."""
     with pytest.raises(UnreadableFile, match=r"lost\.h5"):
         mjrec.render(tmp_path / "lost.h5")
-    path = tmp_path / "openaigym.trajectory.0.1.episode000000.log"
-    writer = TrajectoryLogWriter(path, TrajectoryHeader(facts={"scene": None}))
-    writer.add_step(0, 0.0, False, False, ())
-    writer.close()
     with pytest.raises(NoPictures, match="no snapshots"):
-        mjrec.render(path)
+        mjrec.render(write_log(tmp_path, frames=False, scene=None))
     with pytest.raises(InvalidArgument, match="trajectory is a path"):
         mjrec.render(3)  # type: ignore[arg-type]  that is the test
 

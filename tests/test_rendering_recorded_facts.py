@@ -9,11 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from trajectories_by_hand import Painter, grey, write_finished
+from trajectories_by_hand import (
+    INFIX,
+    Painter,
+    add_row,
+    grey,
+    new_logs,
+    write_finished,
+)
 
 from mjrec import UnreadableFile
+from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.rendering import again
 from mjrec.rendering.again import Variant, render_again
 from mjrec.rendering.recorded_facts import open_for_rendering
@@ -26,12 +33,12 @@ def write_saying(directory: Path, **facts: Any) -> Path:
         header = reader.header
     usual.unlink()
     header = dataclasses.replace(header, facts={**header.facts, **facts})
-    writer = TrajectoryLogWriter(usual.with_suffix(".log"), header)
+    logs = new_logs(directory)
+    span = logs.begin(trajectory_prefix(INFIX, 1), header)
     for step in range(2):
-        writer.add_step(step, 0.0, False, False, [bytes(8)])
-        writer.add_frame(step, [bytes([grey(step)])])
-    writer.close()
-    return usual.with_suffix(".log")
+        add_row(span, step, snapshot=grey(step))
+    logs.close()
+    return usual
 
 
 VIDEO = {"name": "x.mp4", "recording": "deferred"}

@@ -25,17 +25,19 @@ from trajectories_by_hand import write_log
 from waiting import wait_until
 
 from mjrec import Error, InvalidArgument, Monitor
+from mjrec.formats.spans import find_recording, is_in_flight, recordings_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.render_service import Progress, RenderService
 
 # A program around a service, with the directory at argv[1].
 PROGRAM = """
 import pathlib, sys
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering.render_service import RenderService
 directory = pathlib.Path(sys.argv[1])
 service = RenderService(directory, workers=1)
-for log in sorted(directory.glob("*.log")):
-    service.submit(log)
+for recording in recordings_in_flight(directory):
+    service.submit(recording.path)
 """
 
 
@@ -81,8 +83,14 @@ def others() -> set[int]:
     return children()
 
 
+def logs_in(directory: Path) -> list[Path]:
+    """Return what its recordings in flight will become."""
+    return [recording.path for recording in recordings_in_flight(directory)]
+
+
 def finished(logs: list[Path]) -> list[bool]:
-    return [log.with_suffix(".h5").exists() and not log.exists() for log in logs]
+    """Tell of each whether it is there, and its rows are not."""
+    return [log.exists() and find_recording(log) is None for log in logs]
 
 
 def test_trajectories_get_their_final_form(
@@ -108,7 +116,7 @@ def test_videos_are_rendered(
     recorded: Path, start: Callable[..., RenderService]
 ) -> None:
     """By workers of their own, and every frame is shown to be drawn."""
-    logs = sorted(recorded.glob("*.log"))
+    logs = logs_in(recorded)
     service = start(recorded, workers=None)
     seen: list[Progress] = []
     for log in logs:
@@ -162,7 +170,7 @@ def test_submitting_never_waits(
     service.submit(log)
     [server] = children() - others
     os.kill(server, signal.SIGSTOP)
-    missing = [tmp_path / f"{log.stem[:-6]}{k:06d}.log" for k in range(1, 3000)]
+    missing = [tmp_path / f"{log.stem[:-6]}{k:06d}.h5" for k in range(1, 3000)]
     for path in missing:
         service.submit(path)
     os.kill(server, signal.SIGCONT)
@@ -177,13 +185,13 @@ def test_what_fails_is_told_and_stops_nothing_else(
     """By the name of the video; the trajectory stays."""
     service = start()
     bad, good = write_log(tmp_path, 0), write_log(tmp_path, 1, video=None)
-    bad.write_bytes(b"not a log")
+    min(tmp_path.glob("*.log")).unlink()
     for log in (bad, good):
         service.submit(log)
     service.wait()
     assert list(service.failures) == ["openaigym.video.0.7.video000000.mp4"]
     assert "Cannot read" in next(iter(service.failures.values()))
-    assert bad.exists()
+    assert logs_in(tmp_path) == [bad]
     assert finished([good]) == [True]
 
 
@@ -193,7 +201,7 @@ def test_a_model_that_is_still_being_written_is_waited_for(
     """It is compressed beside the simulation, and a short episode ends before."""
     [model] = recorded.glob("*.mjb.gz")
     hidden = model.rename(model.with_name("hidden"))
-    first, second = sorted(recorded.glob("*.log"))
+    first, second = logs_in(recorded)
     later = write_log(recorded, video=None)
     service = start(recorded)
     service.submit(first)
@@ -214,7 +222,7 @@ def test_a_model_that_never_comes_is_an_error(
     for model in recorded.glob("*.model.*"):
         model.unlink()
     service = start(recorded)
-    service.submit(next(recorded.glob("*000000.log")))
+    service.submit(logs_in(recorded)[0])
     service.wait()
     [reason] = service.failures.values()
     assert "model" in reason
@@ -226,7 +234,8 @@ def test_stopping_leaves_what_is_not_done(
     """At once, in the midst of a video; no process and no temporary file stays."""
     before = children()
     service = start(recorded)
-    for log in sorted(recorded.glob("*.log")):
+    logs = logs_in(recorded)
+    for log in logs:
         service.submit(log)
     wait_until(stuck_encoder.exists)
     began = time.monotonic()
@@ -236,7 +245,7 @@ def test_stopping_leaves_what_is_not_done(
     assert children() == before
     assert not list(recorded.glob("*.meta.json"))
     assert not list(recorded.glob(".*"))
-    assert len(list(recorded.glob("*.trajectory.*"))) == 2
+    assert [log.exists() or is_in_flight(log) for log in logs] == [True] * 2
 
 
 def test_one_worker_beside_a_simulation_uses_one_cpu(
@@ -268,7 +277,7 @@ def test_nothing_is_begun_after_a_stop(
     log = write_log(tmp_path, video=None)
     service.submit(log)
     service.wait()
-    assert log.exists()
+    assert is_in_flight(log)
     assert service.failures == {}
 
 
@@ -277,7 +286,7 @@ def test_a_wait_can_be_interrupted(
 ) -> None:
     """Ctrl-C while it waits; another wait goes on, with what came in between."""
     service = start(recorded)
-    service.submit(next(recorded.glob("*.log")))
+    service.submit(logs_in(recorded)[0])
 
     def interrupt(progress: Progress) -> None:
         raise KeyboardInterrupt
@@ -316,7 +325,7 @@ def test_a_second_server_goes_on_for_a_dead_one(
     It dies once in the midst of a video, and once before anything has begun.
     """
     service = start(recorded)
-    for log in sorted(recorded.glob("*.log")):
+    for log in logs_in(recorded):
         service.submit(log)
     [server] = children() - others
     if signum == signal.SIGKILL:
@@ -388,7 +397,7 @@ def test_a_server_that_hangs_is_ended(
     assert "hung for 2.1 seconds" in service.failures[log.name]
     assert "in wait_for_a_disk_that_does_not_answer" in caplog.text
     assert caplog.text.count("What its threads were at") == 2
-    assert log.exists()
+    assert is_in_flight(log)
     pids = [int(pid) for pid in (tmp_path / "pids").read_text().split()]
     assert len(pids) == 2
     wait_until(lambda: all(map(_has_ended, pids)))
@@ -428,7 +437,7 @@ def test_what_failed_is_known_after_a_stop(
     """The manifest is to say it, though nobody waits."""
     service = start()
     bad = write_log(tmp_path)
-    bad.write_bytes(b"not a log")
+    next(tmp_path.glob("*.log")).unlink()
     service.submit(bad)
     good = write_log(tmp_path, 1, video=None)
     service.submit(good)
@@ -544,7 +553,7 @@ def test_a_forked_child_leaves_the_server_alone(
 
 def test_the_server_ends_with_its_parent(tmp_path: Path) -> None:
     """However that ends, and though it has forked a child that lives on."""
-    write_log(tmp_path, model={"mjb": "none"})
+    log = write_log(tmp_path, model={"mjb": "none"})
     code = (
         "import os, time\nif os.fork() == 0:\n    time.sleep(60)\n    os._exit(0)\n"
         "print(service._server.child.pid, flush=True)\ntime.sleep(60)\n"
@@ -561,7 +570,7 @@ def test_the_server_ends_with_its_parent(tmp_path: Path) -> None:
         wait_until(lambda: _has_ended(server))
         # The child, which has nothing to do with it.
         os.killpg(program.pid, signal.SIGKILL)
-    with open_trajectory(next(tmp_path.glob("*.episode*"))) as reader:
+    with open_trajectory(log) as reader:
         assert reader.step_count == 4
 
 
@@ -592,7 +601,7 @@ def test_any_program_can_have_a_service(way: str, tmp_path: Path) -> None:
 
 def _serve(directory: Path) -> None:
     service = RenderService(directory, workers=1)
-    for log in directory.glob("*.log"):
+    for log in logs_in(directory):
         service.submit(log)
     service.wait()
 

@@ -7,14 +7,15 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
+from trajectories_by_hand import write_log
 
 import mjrec
 from mjrec.errors import UnreadableFile
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.manifest import Manifest, write_manifest
+from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.stats_file import StatsFile, write_stats_file
-from mjrec.formats.trajectory import TrajectoryHeader
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
+from mjrec.formats.trajectory_file import finish_trajectory
 
 
 def entry(episode_id: int, options: object = None) -> JournalEntry:
@@ -64,11 +65,10 @@ def video(directory: Path, infix: str, episode_id: int, suffix: str) -> Path:
 
 
 def log(directory: Path, infix: str, episode_id: int, recording: str | None) -> Path:
-    """Write the log of an episode whose video is made in that way, or not at all."""
-    path = directory / f"openaigym.trajectory.{infix}.episode{episode_id:06d}.log"
-    facts = {"video": None if recording is None else {"recording": recording}}
-    TrajectoryLogWriter(path, TrajectoryHeader(facts=facts)).close()
-    return path
+    """Record an episode whose video is made in that way, or not at all."""
+    known = Infix.parse(infix)
+    assert known is not None
+    return write_log(directory, episode_id, infix=known, video=recording)
 
 
 def pending_of(directory: Path) -> list[bool]:
@@ -78,21 +78,24 @@ def pending_of(directory: Path) -> list[bool]:
 def test_an_episode_has_its_trajectory(tmp_path: Path) -> None:
     """The finished one where both are there, because somebody died in between."""
     write_journal(tmp_path, "0.7", entry(1), entry(2), entry(3))
-    logs = [log(tmp_path, "0.7", number, None) for number in (1, 2)]
-    finished = logs[1].with_suffix(".h5")
+    in_flight, finished = (log(tmp_path, "0.7", number, None) for number in (1, 2))
     finished.touch()
     log(tmp_path, "1.7", 3, None)
     found = [episode.trajectory for episode in mjrec.iter_episodes(tmp_path)]
-    assert found == [logs[0], finished, None]
+    assert found == [in_flight, finished, None]
+    assert not in_flight.exists()
 
 
-@pytest.mark.parametrize("suffix", [".log", ".h5"])
-def test_a_manifest_says_which_videos_are_pending(tmp_path: Path, suffix: str) -> None:
+@pytest.mark.parametrize("is_finished", [False, True])
+def test_a_manifest_says_which_videos_are_pending(
+    tmp_path: Path, is_finished: bool
+) -> None:
     """Neither those that are there now, nor those that failed, nor those not wanted."""
     write_journal(tmp_path, "0.7", *(entry(number) for number in range(4)))
     for number in range(4):
         path = log(tmp_path, "0.7", number, "deferred")
-        path.rename(path.with_suffix(suffix))
+        if is_finished:
+            finish_trajectory(path)
     promised = [{"episode_id": number} for number in (0, 1, 2)]
     details = {"next_episode_id": 4, "pending": promised}
     path = tmp_path / "openaigym.manifest.0.7.manifest.json"
@@ -111,10 +114,9 @@ def test_of_a_killed_monitor_the_trajectories_say_it(
     write_journal(tmp_path, "0.7", *(entry(number) for number in range(5)))
     for number, kind in enumerate(kinds):
         log(tmp_path, "0.7", number, kind)
-    log(tmp_path, "0.7", 3, "deferred").with_suffix(".log").write_bytes(b"?")
-    log(tmp_path, "0.7", 4, "deferred").rename(
-        tmp_path / "openaigym.trajectory.0.7.episode000004.h5"
-    )
+    log(tmp_path, "0.7", 3, "deferred")
+    max(tmp_path.glob("*.spans")).write_bytes(b"?\n")
+    log(tmp_path, "0.7", 4, "deferred").touch()
     if manifest is not None:
         path = tmp_path / "openaigym.manifest.0.7.manifest.json"
         write_manifest(path, Manifest("stats.json", (), {}, manifest))

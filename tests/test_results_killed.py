@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from trajectories_by_hand import write_log
 
 import mjrec
 from mjrec.errors import UnreadableFile
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.manifest import Manifest, write_manifest
 from mjrec.formats.stats_file import StatsFile, write_stats_file
-from mjrec.formats.trajectory import TrajectoryHeader
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 
 TESTS = Path(__file__).parent
 ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
@@ -276,9 +275,7 @@ def test_without_a_manifest_something_else_says_what_was_recorded(
         lock = tmp_path / ".openaigym.0.7.lock"
         lock.write_text(json.dumps({"pid": 1, "env_info": ENV_INFO}))
     elif witness == "log":
-        path = tmp_path / "openaigym.trajectory.0.7.episode000001.log"
-        facts = {"env_id": ENV_INFO["env_id"]}
-        TrajectoryLogWriter(path, TrajectoryHeader(facts=facts)).close()
+        write_log(tmp_path, 1, env_id=ENV_INFO["env_id"])
     elif witness == "metadata":
         path = tmp_path / "openaigym.video.0.7.video000001.meta.json"
         path.write_text(json.dumps({"env_id": ENV_INFO["env_id"]}))

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.mujoco.inverted_pendulum_v5 import InvertedPendulumEnv
 from parts import parametrize
-from recordings import frames_in, metadata_of
+from recordings import frames_in, in_flight, metadata_of
 from robots import robotics_ids, robots_that_reset
 
 import mjrec
@@ -76,7 +76,9 @@ def differences(
     """Return which frames of a recording are not the pictures of their moments."""
     found = []
     for episode, frames in enumerate(live):
-        [path] = directory.glob(f"*.trajectory.*.episode{episode:06d}.*")
+        ending = f".episode{episode:06d}.h5"
+        names = {*directory.glob("*.h5"), *in_flight(directory)}
+        [path] = [name for name in names if name.name.endswith(ending)]
         with open_trajectory(path) as trajectory:
             assert trajectory.frame_count == len(frames)
         for crew in crews:

@@ -13,7 +13,7 @@ from typing import Any
 
 import gymnasium
 import pytest
-from recordings import videos_in
+from recordings import in_flight, videos_in
 
 import mjrec
 from evaluated import FOLDER, PENDULUM, facts_of, plan_of, run_job, worker_of
@@ -86,7 +86,7 @@ def check_settled(folder: Path, best: EpisodeResult) -> None:
     assert {key for key, video in promises.items() if video} == {
         (best.monitor, best.episode_id)
     }
-    assert not list(folder.glob("*.log"))
+    assert not in_flight(folder)
     assert unsettled_monitors(folder) == []
     for infix, details in manifests_of(folder).items():
         chosen = [best.episode_id] if infix == best.monitor else []
@@ -101,7 +101,7 @@ def test_before_it_all_are_candidates_that_recovery_leaves_alone(folder: Path) -
     """The logs of monitors that closed in order wait, whoever comes by."""
     before = content_of(folder)
     assert len(unsettled_monitors(folder)) == 2
-    assert {facts_of(log)["candidate"] for log in folder.glob("*.log")} == {True}
+    assert {facts_of(log)["candidate"] for log in in_flight(folder)} == {True}
     for details in manifests_of(folder).values():
         assert details["keep"]["decided"] is False
     assert not mjrec.recover(folder)
@@ -146,17 +146,13 @@ def test_trajectories_that_are_final_already_are_settled_too(
     folder: Path, finished: int
 ) -> None:
     """As they are after a recovery, or where somebody was killed in between."""
-    logs = sorted(folder.glob("*.log"))
-    kept = logs[0].read_bytes()
-    for log in logs[:finished]:
-        finish_trajectory(log)
-    # Killed between making the file and removing the log.
-    logs[0].write_bytes(kept)
+    for path in in_flight(folder)[:finished]:
+        finish_trajectory(path)
     check_settled(folder, settle_best(folder))
 
 
 @pytest.mark.parametrize(
-    "step", ["append_facts", "finish_log", "write_manifest", "update_manifest"]
+    "step", ["add_facts", "finish_log", "write_manifest", "update_manifest"]
 )
 @pytest.mark.parametrize("times", [0, 1])
 def test_it_goes_on_where_it_was_killed(
@@ -219,7 +215,7 @@ def test_a_monitor_that_is_open_is_left_alone(folder: Path) -> None:
         best = settle_best(folder)
         infix = monitor.infix
     assert unsettled_monitors(folder) == [infix]
-    [log] = folder.glob("*.log")
+    [log] = in_flight(folder)
     assert facts_of(log)["candidate"] is True
     settle(folder, {}, rule=RULE)
     assert unsettled_monitors(folder) == []

@@ -13,12 +13,13 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from trajectories_by_hand import INFIX, add_row, new_logs
 
 import mjrec
 from mjrec.errors import InvalidArgument, UnknownName, UnreadableFile
+from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.simulation.integration_state import STATE_SPEC, state_components
 from mjrec.simulation.model_store import ModelStore
 
@@ -79,14 +80,14 @@ class Recording:
             observation=Array("<f4", (3,)),
         )
         store.finish()
-        self.path = directory / "openaigym.trajectory.0.7.episode000003.log"
-        self._writer = TrajectoryLogWriter(self.path, header)
-        for step, fields in (changes or {}).items():
-            values = {name: np.asarray(value) for name, value in fields.items()}
-            self._writer.add_model_change(ModelChange(step=step, fields=values))
+        logs = new_logs(directory)
+        name = trajectory_prefix(INFIX, 3)
+        self.path = logs.path_of(name)
+        self._span = logs.begin(name, header)
+        self._changes = changes or {}
         self._simulate(model, steps)
-        self._writer.add_facts({"complete": True})
-        self._writer.close()
+        self._span.end({"complete": True})
+        logs.close()
 
     def _simulate(self, model: Any, steps: int) -> None:
         data = mujoco.MjData(model)
@@ -99,13 +100,15 @@ class Recording:
             self._add(model, data, step)
 
     def _add(self, model: Any, data: Any, step: int) -> None:
+        if step in self._changes:
+            fields = {k: np.asarray(v) for k, v in self._changes[step].items()}
+            self._span.add_change(ModelChange(step=step, fields=fields))
         self.states.append(state(model, data))
-        action = self.actions[max(step - 1, 0)]
-        observation = np.full(3, step, np.float32)
-        parts = [bytes(part) for part in (self.states[-1], action, observation)]
-        self._writer.add_step(step, 0.5 * step, step == 12, False, parts)
+        values = {"state": self.states[-1], "action": self.actions[max(step - 1, 0)]}
         if step % 2 == 0:
-            self._writer.add_frame(step, [np.full((2, 3), step, np.float64).tobytes()])
+            values["snapshot"] = np.full(6, step, np.float64).view(np.uint8)
+        ending = {"reward": 0.5 * step, "terminated": step == 12}
+        add_row(self._span, step, observation=step, **values, **ending)
 
 
 def model_of(name: str) -> Any:
@@ -122,7 +125,7 @@ def as_is(recording: Recording) -> Path:
 
 @pytest.mark.parametrize("form", [as_is, finished])
 def test_everything_is_there_as_arrays(tmp_path: Path, form: Any) -> None:
-    """Of the log and of the finished file alike, with the documented shapes."""
+    """In flight and in the finished file alike, with the documented shapes."""
     environment = {"framework": "gymnasium", "id": "Heap-v0", "kwargs": {}}
     facts = {"episode_id": 3, "seed": 7, "environment": environment}
     recording = Recording(tmp_path, model_of("heap"), **facts)
@@ -237,14 +240,30 @@ def test_data_of_another_model_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_killed_recording_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
-    """Torn rows are counted, and it is incomplete."""
-    path = Recording(tmp_path, model_of("heap")).path
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    trajectory = mjrec.load_trajectory(path)
+    """To its last whole row, and it is incomplete."""
+    recording = Recording(tmp_path, model_of("heap"))
+    [spans], [rows] = tmp_path.glob("*.spans"), tmp_path.glob("*.log")
+    spans.write_bytes(spans.read_bytes()[: spans.read_bytes().index(b'{"end"')])
+    rows.write_bytes(rows.read_bytes()[: rows.stat().st_size // 2])
+    trajectory = mjrec.load_trajectory(recording.path)
     assert not trajectory.complete
-    assert len(trajectory.states) < 13
+    assert len(trajectory.states) == 6
+    np.testing.assert_array_equal(trajectory.states, recording.states[:6])
+    assert trajectory.frame_steps.tolist() == [0, 2, 4]
     assert "incomplete" in repr(trajectory)
+
+
+def test_rows_that_never_reached_the_disk_are_counted(tmp_path: Path) -> None:
+    """As after a crash of the machine: pages without what was written into them."""
+    recording = Recording(tmp_path, model_of("heap"))
+    [rows] = tmp_path.glob("*.log")
+    whole = bytearray(rows.read_bytes())
+    size = len(whole) // 13
+    whole[9 * size : 10 * size] = bytes(size)
+    rows.write_bytes(whole)
+    trajectory = mjrec.load_trajectory(recording.path)
+    assert len(trajectory.states) == 9
+    assert trajectory.dropped == 4
 
 
 def test_a_log_that_was_finished_meanwhile_goes_on(tmp_path: Path) -> None:
@@ -252,18 +271,18 @@ def test_a_log_that_was_finished_meanwhile_goes_on(tmp_path: Path) -> None:
     recording = Recording(tmp_path, model_of("heap"))
     trajectory = mjrec.load_trajectory(recording.path)
     finished(recording)
+    assert not list(tmp_path.glob("*.states.*"))
     assert len(trajectory.snapshots["geom_xpos"]) == 7
     assert trajectory.model().ngeom == 4
 
 
 def test_a_recording_without_a_simulation_has_no_model(tmp_path: Path) -> None:
     """Its rewards are there all the same."""
-    path = tmp_path / "openaigym.trajectory.0.7.episode000000.log"
-    writer = TrajectoryLogWriter(path, TrajectoryHeader(facts={"model": None}))
-    writer.add_step(0, 0.0, False, False, ())
-    writer.add_step(1, 2.5, True, False, ())
-    writer.close()
-    trajectory = mjrec.load_trajectory(path)
+    logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
+    span = logs.begin(name, TrajectoryHeader(facts={"model": None}))
+    add_row(span, 0)
+    add_row(span, 1, reward=2.5, terminated=True)
+    trajectory = mjrec.load_trajectory(logs.path_of(name))
     assert trajectory.rewards.tolist() == [2.5]
     assert trajectory.time is None
     assert trajectory.actions is None

@@ -20,11 +20,13 @@ import h5py
 import numpy as np
 import pytest
 from full_disk import file_size_limit
+from trajectories_by_hand import add_row, new_logs
 
 import mjrec.formats.trajectory_file as trajectory_file
 import mjrec.formats.trajectory_hdf5 as trajectory_hdf5
 from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
 from mjrec.formats.monitor_directory import Infix, trajectory_prefix
+from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import (
     Array,
     ModelChange,
@@ -39,7 +41,6 @@ from mjrec.formats.trajectory_file import (
     finish_trajectory,
     open_trajectory,
 )
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.formats.trajectory_reader import added_up
 
 HEADER = TrajectoryHeader(
@@ -63,7 +64,8 @@ HEADER = TrajectoryHeader(
     action=Array("<f4", (3,)),
     observation=Array("|u1", (2, 2)),
 )
-NAME = f"{trajectory_prefix(Infix(0, '1'), 27)}.log"
+INFIX = Infix(0, "1")
+NAME = trajectory_prefix(INFIX, 27)
 CHANGES = (
     ModelChange(
         step=0,
@@ -78,34 +80,49 @@ CHANGES = (
 
 
 @pytest.fixture
-def log(tmp_path: Path) -> Path:
-    return tmp_path / NAME
+def path(tmp_path: Path) -> Path:
+    """The file of the episode, which is not there yet."""
+    return tmp_path / f"{NAME}.h5"
 
 
-def row_size(header: TrajectoryHeader) -> int:
-    arrays = [array for array in (header.action, header.observation) if array]
-    return 8 * header.state_length + sum(array.size for array in arrays)
+def row_log(path: Path) -> Path:
+    """Return the log that has the rows of the episode."""
+    [spans] = list_paths(path.parent, INFIX)
+    return spans.with_suffix(".log")
+
+
+def random_array(chance: random.Random, kind: Array | None) -> Any:
+    data = b"" if kind is None else chance.randbytes(kind.size)
+    return 0 if kind is None else np.frombuffer(data, kind.dtype).reshape(kind.shape)
 
 
 def write(
-    log: Path,
+    path: Path,
     steps: int = 40,
     *,
     every: int = 2,
     header: TrajectoryHeader = HEADER,
+    ended: bool = True,
 ) -> None:
     """Write rows of random bytes: NaNs of every kind are among the numbers."""
     chance = random.Random(1)
-    writer = TrajectoryLogWriter(log, header)
-    for change in CHANGES:
-        writer.add_model_change(change)
+    logs = new_logs(path.parent, INFIX)
+    span = logs.begin(path.stem, header)
     for step in range(steps + 1):
-        row = chance.randbytes(row_size(header))
-        writer.add_step(step, step / 3, False, step == steps, [row])
+        for change in CHANGES:
+            if change.step == step:
+                span.add_change(change)
+        state = Array("<f8", (header.state_length,))
+        values = {"state": random_array(chance, state)}
+        for name in ("action", "observation"):
+            values[name] = random_array(chance, getattr(header, name))
         if step % every == 0 and header.snapshot.fields:
-            writer.add_frame(step, [chance.randbytes(header.snapshot.size)])
-    writer.add_facts({"complete": True, "length": steps})
-    writer.close()
+            size = header.snapshot.size
+            values["snapshot"] = random_array(chance, Array("|u1", (size,)))
+        add_row(span, step, reward=step / 3, truncated=step == steps, **values)
+    if ended:
+        span.end({"complete": True, "length": steps})
+    logs.close()
 
 
 def read(path: Path) -> TrajectoryContent:
@@ -143,23 +160,22 @@ def assert_same(one: TrajectoryContent, other: TrajectoryContent) -> None:
             np.testing.assert_array_equal(values, again.fields[name], strict=True)
 
 
-def test_the_finished_file_holds_what_the_log_held(log: Path) -> None:
+def test_the_finished_file_holds_what_the_log_held(path: Path) -> None:
     """Bit for bit, NaNs with their payloads; the log is gone."""
-    write(log)
-    content = read(log)
-    finished = finish_trajectory(log)
-    assert finished == log.with_suffix(".h5")
-    assert not log.exists()
-    assert_same(read(finished), content)
+    write(path)
+    content = read(path)
+    assert finish_trajectory(path) == path
+    assert list(path.parent.iterdir()) == [path]
+    assert_same(read(path), content)
     assert content.header.facts == {**HEADER.facts, "complete": True, "length": 40}
 
 
 @pytest.mark.parametrize("steps", [0, 1, 700])
-def test_episodes_of_any_length_are_finished(log: Path, steps: int) -> None:
+def test_episodes_of_any_length_are_finished(path: Path, steps: int) -> None:
     """The reset alone, and more than fits into one chunk of any dataset."""
-    write(log, steps, every=1)
-    content = read(log)
-    assert_same(read(finish_trajectory(log)), content)
+    write(path, steps, every=1)
+    content = read(path)
+    assert_same(read(finish_trajectory(path)), content)
 
 
 @pytest.mark.parametrize(
@@ -171,45 +187,57 @@ def test_episodes_of_any_length_are_finished(log: Path, steps: int) -> None:
         TrajectoryHeader(facts={"long": "x" * 200_000}, snapshot=HEADER.snapshot),
     ],
 )
-def test_what_is_not_recorded_is_not_there(log: Path, header: TrajectoryHeader) -> None:
+def test_what_is_not_recorded_is_not_there(
+    path: Path, header: TrajectoryHeader
+) -> None:
     """Without simulation, pictures, actions or observations; facts of any length."""
-    write(log, 3, header=header)
-    content = read(log)
-    assert_same(read(finish_trajectory(log)), content)
+    write(path, 3, header=header)
+    content = read(path)
+    assert_same(read(finish_trajectory(path)), content)
 
 
-def test_an_episode_killed_at_its_beginning_is_finished(log: Path) -> None:
+def test_an_episode_killed_at_its_beginning_is_finished(path: Path) -> None:
     """Not even the state after the reset was written."""
-    TrajectoryLogWriter(log, HEADER).close()
-    content = read(log)
+    write(path, -1, ended=False)
+    content = read(path)
     assert content.states.shape == (0, 3)
-    assert_same(read(finish_trajectory(log)), killed(content))
+    assert_same(read(finish_trajectory(path)), killed(content))
 
 
-def test_a_torn_log_is_finished_and_says_what_it_lacks(log: Path) -> None:
-    """The whole records are kept, the number of the others too."""
-    write(log)
-    os.truncate(log, log.stat().st_size - 120)
-    content = read(log)
-    assert content.dropped > 0
-    assert_same(read(finish_trajectory(log)), killed(content))
+def test_a_torn_log_is_finished(path: Path) -> None:
+    """The whole rows are kept, and of half a row nothing."""
+    write(path, ended=False)
+    size = row_log(path).stat().st_size // 41
+    os.truncate(row_log(path), 38 * size + size // 2)
+    content = read(path)
+    assert len(content.rewards) == 37
+    assert_same(read(finish_trajectory(path)), killed(content))
 
 
-def test_whoever_knows_more_of_an_end_than_the_log_is_believed(log: Path) -> None:
+def test_rows_of_an_ended_episode_that_are_lost_are_counted(path: Path) -> None:
+    """As after a crash of the machine; the list says how many there were."""
+    write(path)
+    size = row_log(path).stat().st_size // 41
+    os.truncate(row_log(path), 38 * size + 1)
+    assert read(path).dropped == 3
+    assert read(finish_trajectory(path)).dropped == 3
+
+
+def test_whoever_knows_more_of_an_end_than_the_log_is_believed(path: Path) -> None:
     """A journal may have the episode whose log lacks the end."""
-    write(log)
-    os.truncate(log, log.stat().st_size - 120)
+    write(path, ended=False)
     facts = {"complete": True, "truncated": True, "seed": 8}
-    known = read(finish_trajectory(log, facts=facts)).header.facts
+    known = read(finish_trajectory(path, facts=facts)).header.facts
     assert {key: known[key] for key in facts} == facts
+    assert "reason" not in known
 
 
-def test_ranges_of_snapshots_are_packed_rows(log: Path) -> None:
+def test_ranges_of_snapshots_are_packed_rows(path: Path) -> None:
     """A render worker gets the same bytes from the log and from the file."""
-    write(log, 200, every=1)
-    with open_trajectory(log) as reader:
+    write(path, 200, every=1)
+    with open_trajectory(path) as reader:
         rows = reader.snapshots(0, 201)
-    with open_trajectory(finish_trajectory(log)) as reader:
+    with open_trajectory(finish_trajectory(path)) as reader:
         for start, stop in [(0, 0), (0, 8), (30, 34), (70, 102), (200, 201)]:
             part = reader.snapshots(start, stop)
             assert part.dtype == np.uint8
@@ -218,12 +246,12 @@ def test_ranges_of_snapshots_are_packed_rows(log: Path) -> None:
             reader.snapshots(200, 202)
 
 
-def test_plain_h5py_finds_every_array_by_its_name(log: Path) -> None:
+def test_plain_h5py_finds_every_array_by_its_name(path: Path) -> None:
     """Without mjrec: names, shapes and the facts that one looks for first."""
-    write(log)
-    content = read(log)
+    write(path)
+    content = read(path)
     fields = HEADER.snapshot.unpack(content.snapshots)
-    with h5py.File(finish_trajectory(log)) as file:
+    with h5py.File(finish_trajectory(path)) as file:
         assert set(file) == {
             *("states", "actions", "rewards", "terminated", "truncated", "time"),
             *("observations", "frame_steps", "snapshots", "model_changes"),
@@ -245,10 +273,10 @@ def test_plain_h5py_finds_every_array_by_its_name(log: Path) -> None:
 
 
 def test_old_hdf5_libraries_can_read_it(
-    log: Path, monkeypatch: pytest.MonkeyPatch
+    path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The format of HDF5 1.10, and no filter that is not built in."""
-    write(log)
+    write(path)
     versions: list[tuple[str, str]] = []
     write_steps = trajectory_hdf5._write_steps
 
@@ -257,7 +285,7 @@ def test_old_hdf5_libraries_can_read_it(
         write_steps(file, reader)
 
     monkeypatch.setattr(trajectory_hdf5, "_write_steps", look)
-    path = finish_trajectory(log)
+    finish_trajectory(path)
     assert versions == [("v110", "v110")]
     # The superblock's version: 3 is that of 1.10.
     assert path.read_bytes()[8] == 3
@@ -270,18 +298,17 @@ def test_old_hdf5_libraries_can_read_it(
             assert filters == [h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE]
 
 
-def test_the_same_log_makes_the_same_file(log: Path, tmp_path: Path) -> None:
+def test_the_same_log_makes_the_same_file(path: Path, tmp_path: Path) -> None:
     """No time and no chance gets into it."""
-    write(log)
-    other = shutil.copy(log, tmp_path / "copy.log")
-    one, two = finish_trajectory(log), finish_trajectory(Path(other))
-    assert one.read_bytes() == two.read_bytes()
+    write(path)
+    other = shutil.copytree(tmp_path, tmp_path / "copy") / path.name
+    assert finish_trajectory(path).read_bytes() == finish_trajectory(other).read_bytes()
 
 
-def test_the_user_may_have_the_file_open_as_well(log: Path) -> None:
+def test_the_user_may_have_the_file_open_as_well(path: Path) -> None:
     """HDF5 refuses a file that is open in one process in two different ways."""
-    write(log)
-    path = finish_trajectory(log)
+    write(path)
+    finish_trajectory(path)
     with h5py.File(path), open_trajectory(path) as reader:
         assert reader.frame_count == 21
     with open_trajectory(path), h5py.File(path) as file:
@@ -289,98 +316,116 @@ def test_the_user_may_have_the_file_open_as_well(log: Path) -> None:
 
 
 def test_the_example_of_the_specification_runs(
-    log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What docs/format.md shows a stranger works on a real file."""
-    write(log)
-    finish_trajectory(log).rename(log.with_name("episode.h5"))
+    write(path)
+    finish_trajectory(path).rename(path.with_name("episode.h5"))
     text = Path(__file__).parents[1].joinpath("docs", "format.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    monkeypatch.chdir(log.parent)
+    monkeypatch.chdir(path.parent)
     exec(compile(code, "docs/format.md", "exec"), {})
     assert "E-v0" in capsys.readouterr().out
 
 
-def test_finishing_twice_changes_nothing(log: Path) -> None:
+def test_finishing_twice_changes_nothing(path: Path) -> None:
     """The second time the log is gone, and the file is as it was."""
-    write(log)
-    path = finish_trajectory(log)
-    before = path.stat()
-    assert finish_trajectory(log) == path
+    write(path)
+    before = finish_trajectory(path).stat()
+    assert finish_trajectory(path) == path
     assert path.stat() == before
 
 
-def test_a_log_left_beside_its_finished_file_is_removed(log: Path) -> None:
+def test_a_log_left_beside_its_finished_file_is_removed(
+    path: Path, tmp_path: Path
+) -> None:
     """Killed between rename and removal: nothing is made again."""
-    write(log)
-    kept = log.read_bytes()
-    path = finish_trajectory(log)
-    before = path.stat()
-    log.write_bytes(kept)
-    assert finish_trajectory(log) == path
-    assert not log.exists()
+    write(path)
+    kept = shutil.copytree(tmp_path, tmp_path / "kept")
+    before = finish_trajectory(path).stat()
+    for file in kept.iterdir():
+        shutil.copy(file, tmp_path)
+    assert finish_trajectory(path) == path
+    shutil.rmtree(kept)
+    assert list(tmp_path.iterdir()) == [path]
     assert path.stat() == before
 
 
-def test_a_damaged_finished_file_is_made_again(log: Path) -> None:
-    """While there is a log, nothing is lost."""
-    write(log)
-    content = read(log)
-    log.with_suffix(".h5").write_bytes(b"\x89HDF\r\n\x1a\nnothing of use")
-    assert_same(read(finish_trajectory(log)), content)
+def finish_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have somebody else finish what is opened next, just before it is."""
+    reader = trajectory_file.SpanReader
 
-
-def test_only_a_log_can_be_finished(log: Path) -> None:
-    """The finished file itself is not removed for being one."""
-    write(log)
-    path = finish_trajectory(log)
-    with pytest.raises(InvalidArgument, match=r"ends in \.log"):
+    def open_late(path: Path) -> Any:
+        monkeypatch.setattr(trajectory_file, "SpanReader", reader)
         finish_trajectory(path)
-    assert path.exists()
+        return reader(path)
+
+    monkeypatch.setattr(trajectory_file, "SpanReader", open_late)
 
 
 def test_two_may_finish_the_same_log(
-    log: Path, monkeypatch: pytest.MonkeyPatch
+    path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever comes second finds the file instead of the log."""
-    write(log)
-    is_whole: Callable[[Path], bool] = trajectory_file._is_whole
-    answers = [False]
-
-    def late(path: Path) -> bool:
-        if answers:
-            # The other one does it all just after this one has looked.
-            answer = answers.pop()
-            finish_trajectory(log)
-            return answer
-        return is_whole(path)
-
-    monkeypatch.setattr(trajectory_file, "_is_whole", late)
-    assert read(finish_trajectory(log)).frame_steps.size == 21
-    assert not log.exists()
+    """Whoever comes second finds the file instead of the path."""
+    write(path)
+    finish_late(monkeypatch)
+    assert read(finish_trajectory(path)).frame_steps.size == 21
+    assert list(path.parent.iterdir()) == [path]
 
 
-def test_nothing_to_finish_is_one_clear_error(log: Path) -> None:
+def test_two_may_be_at_the_same_log(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever has opened it makes the same file, though the other one is faster."""
+    write(path)
+    content = read(path)
+    real = trajectory_file.write_hdf5
+
+    def slow(reader: TrajectoryReader, name: Path) -> None:
+        monkeypatch.setattr(trajectory_file, "write_hdf5", real)
+        finish_trajectory(name)
+        real(reader, name)
+
+    monkeypatch.setattr(trajectory_file, "write_hdf5", slow)
+    assert_same(read(finish_trajectory(path)), content)
+
+
+def test_a_reader_keeps_what_somebody_finishes(path: Path) -> None:
+    """Rows and changes of the model are read from the log that is removed."""
+    write(path)
+    content = read(path)
+    with open_trajectory(path) as reader:
+        finish_trajectory(path)
+        assert_same(reader.content(), content)
+
+
+def test_nothing_to_finish_is_one_clear_error(path: Path) -> None:
     """Neither log nor file; or a log that cannot be read, which stays."""
-    with pytest.raises(UnreadableFile, match="No such file"):
-        finish_trajectory(log)
-    log.write_bytes(b"something else")
-    with pytest.raises(UnreadableFile, match="no trajectory"):
-        finish_trajectory(log)
-    assert log.read_bytes() == b"something else"
+    with pytest.raises(
+        UnreadableFile, match=r"\.h5: there is no such file, and no log"
+    ):
+        finish_trajectory(path)
+    write(path)
+    [spans] = list_paths(path.parent)
+    spans.write_bytes(b"something else\n")
+    for _ in range(3):
+        with pytest.raises(UnreadableFile, match=r"\.spans: it is not whole JSON"):
+            finish_trajectory(path)
+    assert spans.read_bytes() == b"something else\n"
+    assert row_log(path).exists()
 
 
 @pytest.mark.parametrize("room", [0, 700, 5000])
-def test_a_full_disk_leaves_the_log_and_nothing_else(log: Path, room: int) -> None:
+def test_a_full_disk_leaves_the_log_and_nothing_else(path: Path, room: int) -> None:
     """One error that names the file; with room again it succeeds."""
-    write(log)
+    write(path)
     with (
         file_size_limit(room),
         pytest.raises(FileNotWritten, match=r"\.h5: File too large"),
     ):
-        finish_trajectory(log)
-    assert list(log.parent.iterdir()) == [log]
-    finish_trajectory(log)
+        finish_trajectory(path)
+    assert not [name for name in path.parent.iterdir() if ".states." not in name.name]
+    finish_trajectory(path)
 
 
 KILLED = """
@@ -398,56 +443,54 @@ trajectory_file.finish_trajectory(path)
 
 
 @pytest.mark.parametrize("where", ["before the name", "before the removal"])
-def test_a_killed_finish_is_done_again(log: Path, where: str) -> None:
+def test_a_killed_finish_is_done_again(path: Path, where: str) -> None:
     """There is always the log or the whole file, and never half of one."""
-    write(log)
-    content = read(log)
+    write(path)
+    content = read(path)
     process = subprocess.run(
-        [sys.executable, "-c", KILLED, where, str(log)], check=False
+        [sys.executable, "-c", KILLED, where, str(path)], check=False
     )
     assert process.returncode == -signal.SIGKILL
-    assert log.exists()
-    assert log.with_suffix(".h5").exists() == (where == "before the removal")
-    assert_same(read(finish_trajectory(log)), content)
+    assert row_log(path).exists()
+    assert path.exists() == (where == "before the removal")
+    assert_same(read(finish_trajectory(path)), content)
 
 
-def test_the_file_of_an_episode_is_found(tmp_path: Path) -> None:
-    """The finished one if there is one, else the log, else nothing."""
-    infix = Infix(0, "1")
-    log = tmp_path / NAME
-    assert find_trajectory(tmp_path, infix, 27) is None
-    write(log)
-    assert find_trajectory(tmp_path, infix, 27) == log
-    kept = log.read_bytes()
-    finished = finish_trajectory(log)
-    log.write_bytes(kept)
-    assert find_trajectory(tmp_path, infix, 27) == finished
-    assert find_trajectory(tmp_path, "0.1", 27) == finished
-    assert find_trajectory(tmp_path, infix, 28) is None
+def test_the_file_of_an_episode_is_found(path: Path, tmp_path: Path) -> None:
+    """Whether it is in flight still or finished; else nothing."""
+    assert find_trajectory(tmp_path, INFIX, 27) is None
+    write(path)
+    assert find_trajectory(tmp_path, INFIX, 27) == path
+    finish_trajectory(path)
+    assert find_trajectory(tmp_path, INFIX, 27) == path
+    assert find_trajectory(tmp_path, "0.1", 27) == path
+    assert find_trajectory(tmp_path, INFIX, 28) is None
     assert find_trajectory(tmp_path, "nonsense", 27) is None
 
 
-def test_a_log_that_was_finished_meanwhile_is_opened(log: Path) -> None:
-    """Whoever was told the log's name just before gets what it has become."""
-    write(log)
-    path = finish_trajectory(log)
-    with open_trajectory(log) as reader:
-        assert reader.path == path
+def test_a_log_that_is_finished_meanwhile_is_opened(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever finds it in flight gets what it has become."""
+    write(path)
+    content = read(path)
+    finish_late(monkeypatch)
+    assert_same(read(path), content)
+    assert list(path.parent.iterdir()) == [path]
 
 
-def test_what_a_file_is_its_content_says(log: Path, tmp_path: Path) -> None:
+def test_what_a_file_is_its_content_says(path: Path, tmp_path: Path) -> None:
     """A name may be anything."""
-    write(log)
-    content = read(log)
-    copy = tmp_path / "renamed.h5"
-    shutil.copy(log, copy)
-    assert_same(read(copy), content)
+    write(path)
+    content = read(path)
+    copy = shutil.copy(finish_trajectory(path), tmp_path / "renamed")
+    assert_same(read(Path(copy)), content)
 
 
-def test_a_closed_file_says_so(log: Path) -> None:
+def test_a_closed_file_says_so(path: Path) -> None:
     """Closing is idempotent; what is in memory stays."""
-    write(log)
-    reader = open_trajectory(finish_trajectory(log))
+    write(path)
+    reader = open_trajectory(finish_trajectory(path))
     reader.close()
     reader.close()
     assert reader.step_count == 40
@@ -529,11 +572,11 @@ def external(file: h5py.File) -> None:
     ],
 )
 def test_a_file_of_another_making_is_refused(
-    log: Path, change: Callable[[h5py.File], None], reason: str
+    path: Path, change: Callable[[h5py.File], None], reason: str
 ) -> None:
     """One clear error for each thing that is not as mjrec writes it."""
-    write(log)
-    path = finish_trajectory(log)
+    write(path)
+    finish_trajectory(path)
     with h5py.File(path, "r+") as file:
         change(file)
     with pytest.raises(UnreadableFile, match=reason) as error:
@@ -541,10 +584,10 @@ def test_a_file_of_another_making_is_refused(
     assert error.value.path == path
 
 
-def test_a_truncated_file_is_refused(log: Path) -> None:
+def test_a_truncated_file_is_refused(path: Path) -> None:
     """At whatever length."""
-    write(log)
-    path = finish_trajectory(log)
+    write(path)
+    finish_trajectory(path)
     data = path.read_bytes()
     for size in [*range(0, 200, 20), len(data) // 2, len(data) - 1]:
         path.write_bytes(data[:size])
@@ -552,11 +595,11 @@ def test_a_truncated_file_is_refused(log: Path) -> None:
             read(path)
 
 
-def test_random_damage_is_noticed(log: Path) -> None:
+def test_random_damage_is_noticed(path: Path) -> None:
     """A changed byte is an error, or is one that nothing depends on."""
-    write(log)
-    content = dataclasses.replace(read(log), model_changes=())
-    path = finish_trajectory(log)
+    write(path)
+    content = dataclasses.replace(read(path), model_changes=())
+    finish_trajectory(path)
     data = path.read_bytes()
     chance = random.Random(1)
     for _ in range(60):

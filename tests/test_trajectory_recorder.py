@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from trajectories_by_hand import kinds_of
+from trajectories_by_hand import INFIX, new_logs
 
 from mjrec.errors import FileNotWritten, PicturesDiffer
+from mjrec.formats.monitor_directory import trajectory_prefix
+from mjrec.formats.span_writer import SpanWriter
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.trajectory import (
     Array,
     RowLayout,
@@ -20,10 +23,9 @@ from mjrec.formats.trajectory import (
     TrajectoryContent,
 )
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.formats.trajectory_log import RowFormat, TrajectoryLogWriter
 from mjrec.recorder.stats_recorder import StatsRecorder
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
-from mjrec.recorder.usual_steps import UsualSteps
+from mjrec.simulation.gathering import words_of
 from mjrec.simulation.state_source import EpisodeStart, MomentMemory
 
 
@@ -52,10 +54,10 @@ class Counter:
     def begin_episode(self) -> EpisodeStart:
         return self.start
 
-    def capture_state(self) -> memoryview:
+    def capture_state(self, out: Any) -> None:
         if self.step >= self.gone_from:
             raise PicturesDiffer("it is another simulation")
-        return np.array([self.time(), self.step, -self.step]).view(np.uint8).data
+        out[:] = (self.time(), self.step, -self.step)
 
     def changed_fields(self) -> Mapping[str, Any] | None:
         return self.changes.get(self.step)
@@ -82,10 +84,9 @@ class Remembered(Counter):
         super().__init__()
         self.asked: list[int] = []
         self.numbers = np.zeros(6)
-        views = [part.view(np.uint8).data for part in np.split(self.numbers, [1, 3])]
         memory = MomentMemory(
-            state=(views[0], views[1]),
-            snapshot=(views[2],),
+            words=words_of([self.numbers]),
+            owners=self.numbers,
             is_current=self.is_current,
         )
         self.start = dataclasses.replace(Counter.start, memory=memory)
@@ -94,9 +95,9 @@ class Remembered(Counter):
         self.numbers[:] = (self.time(), self.step, -self.step, *[self.step] * 3)
         return self.step not in self.changes and self.step < self.hidden_from
 
-    def capture_state(self) -> memoryview:
+    def capture_state(self, out: Any) -> None:
         self.asked.append(self.step)
-        return super().capture_state()
+        super().capture_state(out)
 
 
 def recorder(
@@ -105,11 +106,11 @@ def recorder(
     *,
     max_fps: Any = None,
     observation: Any = None,
-    rows: RowFormat | None = None,
 ) -> TrajectoryRecorder:
     """Return the recorder of an episode of `states`."""
     return TrajectoryRecorder(
-        path,
+        new_logs(path.parent),
+        path.stem,
         facts={"episode_id": 3},
         states=states,
         start=None if states is None else states.start,
@@ -119,7 +120,6 @@ def recorder(
             max_fps=max_fps,
         ),
         observation=observation,
-        rows=rows,
     )
 
 
@@ -139,15 +139,18 @@ def play(
         recorder.step(step / 2, last, False, observe(step), last, True)
 
 
+NAME = f"{trajectory_prefix(INFIX, 3)}.h5"
+
+
 def content(path: Path) -> TrajectoryContent:
-    """Return what is in a log."""
+    """Return what a log has of a trajectory."""
     with open_trajectory(path) as reader:
         return reader.content()
 
 
 def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:
     """States, actions, rewards, flags and snapshots, those of the reset included."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     trajectory = recorder(path, states)
     play(trajectory, states, 3)
     trajectory.end({"complete": True})
@@ -178,13 +181,12 @@ def stats_of_an_episode(directory: Path) -> StatsRecorder:
 def take_usual_step(
     trajectory: TrajectoryRecorder, states: Counter, step: int, stats: StatsRecorder
 ) -> None:
-    """Take a step as the recorder of an episode does, the usual way if it can."""
-    action, copier = np.full(2, step, np.float32), trajectory.copier
-    usual = None if copier is None else UsualSteps(copier, stats)
-    if usual is None or not usual.before_step(action):
+    """Take a step as the recorder of an episode does, the fast way if it can."""
+    action, fast = np.full(2, step, np.float32), trajectory.fast_path(stats)
+    if fast is None or not fast.before_step(action):
         trajectory.before_step(action)
     states.step = step
-    if usual is None or not usual.step(step / 2):
+    if fast is None or not fast.step(step / 2):
         trajectory.step(step / 2, False, False, None, False, True)
 
 
@@ -197,7 +199,8 @@ def test_memory_of_the_simulation_gives_the_same(
     for states in (Counter(), Remembered()):
         states.changes[5] = {"geom_rgba": np.zeros((1, 4), np.float32)}
         states.hidden_from = hidden_from
-        path = tmp_path / f"{type(states).__name__}.log"
+        path = tmp_path / type(states).__name__ / NAME
+        path.parent.mkdir()
         trajectory = recorder(path, states, max_fps=max_fps)
         stats = stats_of_an_episode(tmp_path)
         for step in range(1, 10):
@@ -224,76 +227,57 @@ def test_memory_of_the_simulation_gives_the_same(
     assert states.asked == [0, 1, 5, *range(hidden_from, 10)]
 
 
-def test_steps_can_be_copied_from_the_second_one_on(tmp_path: Path) -> None:
-    """As long as frames are taken: the first one tells how long a step is."""
-    states = Remembered()
-    trajectory = recorder(tmp_path / "t.log", states, max_fps=25)
-    assert trajectory.copier is None
+def test_there_is_a_fast_path_from_the_second_step_on(tmp_path: Path) -> None:
+    """As long as frames are taken: the first step tells how long one is."""
+    states, stats = Remembered(), stats_of_an_episode(tmp_path)
+    trajectory = recorder(tmp_path / NAME, states, max_fps=25)
+    assert trajectory.fast_path(stats) is None
     play(trajectory, states, 1, done=False)
-    assert trajectory.copier is not None
-    assert trajectory.copier.stride == 2
+    assert trajectory.fast_path(stats) is not None
     trajectory.stop_frames("a marker is in the way")
-    assert trajectory.copier is None
+    assert trajectory.fast_path(stats) is None
     trajectory.discard()
 
 
-def test_no_steps_are_copied_after_a_stop(tmp_path: Path) -> None:
+def test_there_is_no_fast_path_after_a_stop(tmp_path: Path) -> None:
     """Nothing more is recorded, by whichever way."""
-    states = Remembered()
-    trajectory = recorder(tmp_path / "t.log", states)
+    states, stats = Remembered(), stats_of_an_episode(tmp_path)
+    trajectory = recorder(tmp_path / NAME, states)
     play(trajectory, states, 1, done=False)
-    assert trajectory.copier is not None
+    assert trajectory.fast_path(stats) is not None
     trajectory.stop("the disk is full")
-    assert trajectory.copier is None
+    assert trajectory.fast_path(stats) is None
     trajectory.discard()
 
 
 @pytest.mark.parametrize("observation", [None, np.zeros(2)])
-def test_what_needs_a_closer_look_is_not_copied(
+def test_what_needs_a_closer_look_has_no_fast_path(
     tmp_path: Path, observation: Any
 ) -> None:
     """A simulation without memory that is known, and observations of its steps."""
     states = Counter() if observation is None else Remembered()
-    trajectory = recorder(tmp_path / "t.log", states, observation=observation)
+    trajectory = recorder(tmp_path / NAME, states, observation=observation)
     play(trajectory, states, 2, done=False, observe=lambda _: observation)
-    assert trajectory.copier is None
+    assert trajectory.fast_path(stats_of_an_episode(tmp_path)) is None
     trajectory.discard()
 
 
-def test_an_odd_action_is_not_set_for_a_copy(tmp_path: Path) -> None:
+def test_an_odd_action_is_none_of_the_fast_path(tmp_path: Path) -> None:
     """`before_step` is to be asked, which notes it."""
     states = Remembered()
-    trajectory = recorder(tmp_path / "t.log", states)
+    trajectory = recorder(tmp_path / NAME, states)
     play(trajectory, states, 1, done=False)
-    assert trajectory.copier is not None
-    assert trajectory.copier.set_action(np.zeros(2, np.float32)) is True
-    assert trajectory.copier.set_action(np.zeros(5)) is False
+    fast = trajectory.fast_path(stats_of_an_episode(tmp_path))
+    assert fast is not None
+    assert fast.before_step(np.zeros(2, np.float32)) is True
+    assert fast.before_step(np.zeros(5)) is False
     trajectory.discard()
-
-
-def test_rows_are_handed_from_one_episode_to_the_next(tmp_path: Path) -> None:
-    """There are none before the first log; those of other rows are replaced."""
-    states = Counter()
-    first = recorder(tmp_path / "a.log", states)
-    assert first.rows is None
-    play(first, states, 2)
-    first.end({})
-    states.step = 0
-    second = recorder(tmp_path / "b.log", states, rows=first.rows)
-    play(second, states, 3)
-    second.end({})
-    assert second.rows is first.rows
-    assert content(tmp_path / "b.log").states[:, 1].tolist() == [0, 1, 2, 3]
-    third = recorder(tmp_path / "c.log", None, rows=first.rows)
-    third.end({})
-    assert third.rows is not first.rows
-    assert content(tmp_path / "c.log").states.shape == (1, 0)
 
 
 def test_the_step_of_the_last_frame_is_known(tmp_path: Path) -> None:
     """None is taken twice, and -1 is none."""
     states = Counter()
-    trajectory = recorder(tmp_path / "t.log", states, max_fps=25)
+    trajectory = recorder(tmp_path / NAME, states, max_fps=25)
     seen = [trajectory.last_frame]
     for step in range(1, 4):
         trajectory.before_step(np.full(2, step, np.float32))
@@ -304,19 +288,6 @@ def test_the_step_of_the_last_frame_is_known(tmp_path: Path) -> None:
     assert [*seen, trajectory.last_frame] == [-1, 0, 2, 2, 3]
     assert trajectory.frame_count == 3
     trajectory.discard()
-
-
-def test_a_model_change_is_before_the_frame_that_shows_it(tmp_path: Path) -> None:
-    """And behind the step: a log that is torn between them has no wrong picture."""
-    states, path = Remembered(), tmp_path / "t.log"
-    states.changes[2] = {"site_rgba": np.zeros((1, 4), np.float32)}
-    trajectory, stats = recorder(path, states), stats_of_an_episode(tmp_path)
-    for step in range(1, 4):
-        take_usual_step(trajectory, states, step, stats)
-    trajectory.end({})
-    kinds = [kind for kind in kinds_of(path) if kind not in {b"head", b"fact"}]
-    moment, changed = [b"step", b"fram"], [b"step", b"chng", b"fram"]
-    assert kinds == [b"chng", *moment, *moment, *changed, *moment]
 
 
 @pytest.mark.parametrize(
@@ -332,7 +303,7 @@ def test_every_nth_step_and_the_last(
     tmp_path: Path, max_fps: int, steps: int, frames: list[int]
 ) -> None:
     """With the smallest n that keeps to max_fps."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     trajectory = recorder(path, states, max_fps=max_fps)
     play(trajectory, states, steps)
     trajectory.end({})
@@ -343,7 +314,7 @@ def test_every_nth_step_and_the_last(
 
 def test_last_frame_of_an_episode_that_is_not_over(tmp_path: Path) -> None:
     """It is taken when somebody asks, and only once."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     trajectory = recorder(path, states, max_fps=10)
     play(trajectory, states, 3, done=False)
     trajectory.take_frame()
@@ -356,7 +327,7 @@ def test_last_frame_of_an_episode_that_is_not_over(tmp_path: Path) -> None:
 
 def test_reset_alone_leaves_nothing_until_the_end(tmp_path: Path) -> None:
     """A reset that is replaced has no log; one that is the end has a frame."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     recorder(path, states).discard()
     assert list(tmp_path.iterdir()) == []
     trajectory = recorder(path, states)
@@ -374,7 +345,7 @@ def test_reset_alone_leaves_nothing_until_the_end(tmp_path: Path) -> None:
 
 def test_model_changes_go_with_their_steps(tmp_path: Path) -> None:
     """Those since the model was stored at step 0, later ones at theirs."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     states.changes[2] = {"site_rgba": np.zeros((1, 4), np.float32)}
     trajectory = recorder(path, states)
     play(trajectory, states, 3)
@@ -385,7 +356,7 @@ def test_model_changes_go_with_their_steps(tmp_path: Path) -> None:
 
 def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> None:
     """For environments whose state nobody can see."""
-    path = tmp_path / "t.log"
+    path = tmp_path / NAME
     trajectory = recorder(path, None)
     trajectory.before_step(1)
     trajectory.step(1.0, True, False, None, True, True)
@@ -400,7 +371,7 @@ def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> N
 
 def test_observations_where_they_are_asked_for(tmp_path: Path) -> None:
     """That of the reset is the first."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     trajectory = recorder(path, states, observation=np.zeros(2))
     play(trajectory, states, 2, observe=lambda step: np.full(2, step))
     trajectory.end({})
@@ -411,7 +382,7 @@ def test_observations_where_they_are_asked_for(tmp_path: Path) -> None:
 
 def test_dictionaries_say_what_they_were_made_from(tmp_path: Path) -> None:
     """The names and shapes of their arrays, in order."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     first = {"goal": np.zeros(2), "speed": 1.0}
     trajectory = recorder(path, states, observation=first)
     play(trajectory, states, 1, observe=lambda _: {"goal": np.ones(2), "speed": 2.0})
@@ -427,7 +398,7 @@ def test_odd_action_is_noted_and_nothing_stops(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An environment may take what the first action was not like."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     trajectory = recorder(path, states)
     play(trajectory, states, 1, done=False)
     for _ in range(2):
@@ -443,7 +414,7 @@ def test_odd_action_is_noted_and_nothing_stops(
 
 def test_state_after_an_environments_own_reset_is_not_a_number(tmp_path: Path) -> None:
     """It belongs to the next episode; there is no frame of it either."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     trajectory = recorder(path, states)
     trajectory.before_step(np.zeros(2))
     trajectory.step(0.0, True, False, None, True, False)
@@ -455,7 +426,7 @@ def test_state_after_an_environments_own_reset_is_not_a_number(tmp_path: Path) -
 
 def test_frames_stop_where_they_would_differ(tmp_path: Path) -> None:
     """States go on; the facts say why there are no more frames."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     states.hidden_from = 2
     trajectory = recorder(path, states)
     with pytest.raises(PicturesDiffer):
@@ -471,7 +442,7 @@ def test_frames_stop_where_they_would_differ(tmp_path: Path) -> None:
 
 def test_what_changes_is_noted_without_frames_too(tmp_path: Path) -> None:
     """After the frames have stopped the model of a step is still known."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     trajectory = recorder(path, states)
     play(trajectory, states, 1, done=False)
     trajectory.stop_frames("a marker is in the way")
@@ -486,7 +457,7 @@ def test_what_changes_is_noted_without_frames_too(tmp_path: Path) -> None:
 
 def test_step_without_a_state_is_a_step_all_the_same(tmp_path: Path) -> None:
     """Its state is not a number; rewards and actions go on, and it is told once."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     states.gone_from = 2
     trajectory = recorder(path, states)
     with pytest.raises(PicturesDiffer):
@@ -502,32 +473,34 @@ def test_step_without_a_state_is_a_step_all_the_same(tmp_path: Path) -> None:
     assert read.actions[-1].tolist() == [3, 3]
 
 
-@pytest.mark.parametrize("place", ["add_step", "add_frame"])
+@pytest.mark.parametrize("place", ["add_change", "make_room", "commit"])
 def test_an_interrupted_beginning_is_begun_anew(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A log of states alone would promise a video that nothing can be drawn of."""
-    path = tmp_path / "t.log"
+    """A recording without its first frame would promise a video of nothing."""
+    path = tmp_path / NAME
     trajectory = recorder(path, Counter())
 
-    def handler(*_: object) -> None:
+    def handler(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(TrajectoryLogWriter, place, handler)
+        patch.setattr(SpanWriter, place, handler)
+        trajectory.before_step(np.zeros(2))
         with pytest.raises(KeyboardInterrupt):
-            trajectory.before_step(np.zeros(2))
+            trajectory.step(0.0, False, False, None, False, True)
     trajectory.end({"complete": False})
     read = content(path)
     assert read.states.tolist() == [[0, 0, 0]]
     assert read.frame_steps.tolist() == [0]
+    assert len(recordings_in_flight(tmp_path)) == 1
 
 
 def test_what_is_said_first_of_the_end_counts(tmp_path: Path) -> None:
     """Also where it could not be written then, and is again with other facts."""
     directory = tmp_path / "d"
     directory.mkdir()
-    states, path = Counter(), directory / "t.log"
+    states, path = Counter(), directory / NAME
     trajectory = recorder(path, states)
     play(trajectory, states, 2)
     directory.rename(tmp_path / "elsewhere")
@@ -542,7 +515,7 @@ def test_what_is_said_first_of_the_end_counts(tmp_path: Path) -> None:
 
 def test_nothing_is_recorded_after_a_stop(tmp_path: Path) -> None:
     """What there was stays, with the reason."""
-    states, path = Counter(), tmp_path / "t.log"
+    states, path = Counter(), tmp_path / NAME
     trajectory = recorder(path, states)
     play(trajectory, states, 1, done=False)
     trajectory.stop("the disk is full")

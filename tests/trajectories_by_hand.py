@@ -7,7 +7,7 @@ its snapshots, with a white pixel in a corner.
 
 from __future__ import annotations
 
-import struct
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,10 @@ from mjrec.formats.monitor_directory import (
     trajectory_prefix,
     video_prefix,
 )
+from mjrec.formats.span_writer import SpanLogs, SpanWriter
+from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import Array, RowLayout, StateComponent, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
-from mjrec.formats.trajectory_log import TrajectoryLogWriter
 from mjrec.rendering.views import View
 
 INFIX = Infix(0, "7")
@@ -70,6 +71,27 @@ class Painter:
         return picture
 
 
+def new_logs(directory: Path, infix: Infix = INFIX) -> SpanLogs:
+    """Return what writes recordings beside those that others have written."""
+    used = [int(path.suffixes[-2][1:]) for path in list_paths(directory, infix)]
+    first = max(used, default=-1) + 1
+    return SpanLogs(directory, infix, numbers=itertools.count(first))
+
+
+def add_row(span: SpanWriter, step: int, **values: Any) -> None:
+    """Add a row whose columns are `values`; with a snapshot it is a frame's, too."""
+    slot = span.make_room()
+    commit = {
+        key: values.pop(key)
+        for key in ("reward", "terminated", "truncated", "is_step")
+        if key in values
+    }
+    for name, column in span.log.columns.items():
+        if name not in ("row", "step", "reward", "flags"):
+            column[slot] = values.get(name, 0)
+    span.commit(step, is_frame="snapshot" in values, **commit)
+
+
 def write_log(
     directory: Path,
     episode_id: int = 0,
@@ -83,8 +105,7 @@ def write_log(
     fps: str | None = None,
     **facts: Any,
 ) -> Path:
-    """Write the log of an episode at 20 steps a second."""
-    path = directory / f"{trajectory_prefix(infix, episode_id)}.log"
+    """Record an episode at 20 steps a second; return the file that it would become."""
     header = TrajectoryHeader(
         facts={
             "episode_id": episode_id,
@@ -111,30 +132,22 @@ def write_log(
         state=(StateComponent("qpos", 0, 1),),
         snapshot=RowLayout.packed([("geom_rgba", Array("|u1", (1,)))]),
     )
-    writer = TrajectoryLogWriter(path, header)
+    logs = new_logs(directory, infix)
+    name = trajectory_prefix(infix, episode_id)
+    span = logs.begin(name, header)
     taken = 0
     for step in range(steps + 1):
-        last = ended and step == steps
-        writer.add_step(step, 0.5 * bool(step), False, last, [bytes(8)])
+        values: dict[str, Any] = {}
         if frames and (step % stride == 0 or step == steps):
-            writer.add_frame(step, [bytes([grey(taken)])])
+            values["snapshot"] = [grey(taken), *[0] * 7]
             taken += 1
+        last = ended and step == steps
+        add_row(span, step, reward=0.5 * bool(step), truncated=last, **values)
     if ended:
         ending = {"complete": True, "terminated": False, "truncated": True}
-        writer.add_facts({**ending, "length": steps, "reward": 0.5 * steps})
-    writer.close()
-    return path
-
-
-def kinds_of(path: Path) -> list[bytes]:
-    """Return the kinds of the records in a log, in their order."""
-    data = path.read_bytes()
-    kinds, offset = [], 32
-    while offset < len(data):
-        kind, _, length = struct.unpack_from("<4sIQ", data, offset)
-        kinds.append(kind)
-        offset += 16 + -(-length // 8) * 8
-    return kinds
+        span.end({**ending, "length": steps, "reward": 0.5 * steps})
+    logs.close()
+    return logs.path_of(name)
 
 
 def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:

@@ -8,12 +8,13 @@ from pathlib import Path
 
 from ..formats.json_fields import field, read_object, text
 from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
+from ..formats.spans import recordings_in_flight
 from ..formats.video_metadata import metadata_path
 from .episode_results import EpisodeResult
 from .result_columns import ResultVideo
 from .result_tables import EpisodeFiles
 
-_TRAJECTORIES = (".h5", ".log")
+_TRAJECTORIES = (".h5",)
 # Also text recordings.
 _VIDEOS = (".mp4", ".json")
 
@@ -29,7 +30,9 @@ class RecordedFiles:
     def __init__(self, folder: Path, chosen: Container[tuple[int, int]]) -> None:
         self._folder = folder
         self._chosen = chosen
-        paths = folder.iterdir() if folder.is_dir() else ()
+        is_there = folder.is_dir()
+        paths = list(folder.iterdir()) if is_there else []
+        paths += [r.path for r in recordings_in_flight(folder)] if is_there else []
         self._names = frozenset(path.name for path in paths)
 
     def of(self, result: EpisodeResult) -> EpisodeFiles:

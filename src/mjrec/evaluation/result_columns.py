@@ -81,7 +81,7 @@ class ResultColumns:
         return failed
 
     def trajectory_prefix(self, index: int) -> str | None:
-        """Return the base name of a trajectory without `.h5` or `.log`, or None."""
+        """Return the base name of a trajectory without `.h5`, or None."""
         infix = self._infix(index)
         if infix is None or not self.has_trajectory[index]:
             return None

@@ -175,7 +175,7 @@ class _Columns:
         if number < 0:
             raise ValueError("an episode of a monitor has no number")
         self.has_trajectory.append(
-            _is_of(trajectory, trajectory_prefix(infix, number), (".h5", ".log"))
+            _is_of(trajectory, trajectory_prefix(infix, number), (".h5",))
         )
         if _is_of(video, video_prefix(infix, number), (".mp4", ".json", ".avi")):
             self.videos[index] = ResultVideo(video, _sha256(sha256))

@@ -34,8 +34,8 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.pending_videos import pending_video
+from ..formats.spans import FINISHED, add_facts, is_in_flight
 from ..formats.trajectory_file import amend_trajectory, find_trajectory
-from ..formats.trajectory_log_facts import append_facts
 from ..formats.video_metadata import is_done
 from ..rendering.log_finishing import finish_log
 from ..rendering.pending import EpisodeKey, claim, recorded_episodes
@@ -128,17 +128,17 @@ def settle_monitor(
 
 
 def finish_logs(folder: Path, monitor: str) -> None:
-    """Give the logs of a closed monitor's episodes their final form.
+    """Give the recordings of a closed monitor's episodes their final form.
 
     Raises:
         Error: as `settle_monitor`.
     """
     infix = Infix.parse(monitor)
     for key in () if infix is None else _episodes_of(folder, infix):
-        log = folder / f"{key.trajectory_name}.log"
-        if log.exists():
+        path = folder / f"{key.trajectory_name}{FINISHED}"
+        if is_in_flight(path):
             with _claimed(folder, key):
-                finish_log(log)
+                finish_log(path)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,20 +208,17 @@ def _numbers_of(manifest: Manifest) -> range | None:
 
 def _settle_episode(folder: Path, key: EpisodeKey, verdicts: _Verdicts) -> bool:
     """Settle an episode, and return whether it has a video, or will have."""
-    log, finished = (folder / f"{key.trajectory_name}{end}" for end in (".log", ".h5"))
-    # Where both are there, somebody was killed between making one and removing the
-    # other, and the finished one counts.
-    path = finished if finished.exists() else log
+    path = folder / f"{key.trajectory_name}{FINISHED}"
     with open_for_rendering(path) as reader:
         facts = dict(reader.header.facts)
     if facts.get("candidate") is True:
         verdict = verdicts.facts(key.episode_id, facts.get("video") or {})
         amend: Callable[[Path, Mapping[str, Any]], None]
-        amend = amend_trajectory if path is finished else append_facts
+        amend = amend_trajectory if path.exists() else add_facts
         amend(path, verdict)
         facts.update(verdict)
-    if log.exists():
-        finish_log(log)
+    if is_in_flight(path):
+        finish_log(path)
     return bool(facts.get("video"))
 
 

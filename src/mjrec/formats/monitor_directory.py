@@ -12,10 +12,12 @@
     ├── openaigym.video.<infix>.video000027.framehash   ... and its pictures' hashes
     ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
     ├── openaigym.video.<infix>.video000027.side.mp4    a further camera's
-    ├── openaigym.trajectory.<infix>.episode000027.log  a recorded episode in flight
-    ├── openaigym.trajectory.<infix>.episode000027.h5   ... and finished
-    ├── openaigym.trajectory.<infix>.episode000027.log.damaged  that nobody can read
-    ├── openaigym.clip.<infix>.step000000137.part000000.log  of a video in steps
+    ├── openaigym.states.<infix>.000000.spans           recordings in flight ...
+    ├── openaigym.states.<infix>.000000.log             ... their rows
+    ├── openaigym.states.<infix>.000000.tail            ... the last of these
+    ├── openaigym.states.<infix>.000000.looks           ... changes of the model
+    ├── openaigym.states.<infix>.000000.spans.damaged   that nobody can read
+    ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
     ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
     ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
     ├── openaigym.results.<infix>.monitor.csv           Stable-Baselines3's, if wanted
@@ -25,10 +27,11 @@
     ├── .openaigym.manifest.<infix>.lock                while somebody rewrites it
     └── .openaigym.render.<number>.lock                 while somebody uses that CPU
 
-A video that is counted in steps may go on across resets. Until it is rendered there is
-a log for each part of it that is of one episode, called by the number of steps that the
-monitor had recorded when it began. Its own name is that of the episode in which it
-began, as of any video, or `video000027.step000137.mp4` where a step began it.
+A recording in flight is a span of rows, named in a `.spans` file (`spans`): an episode
+as its trajectory will be, a clip's part, which is of one episode, as
+`openaigym.clip.<infix>.step000000137.part000000` after the number of steps that the
+monitor had recorded when the clip began. A clip's video is called as the episode's in
+which it began, or `video000027.step000137.mp4` where a step began it.
 
 `<infix>` is `<monitor id>.<uid or process id>`. It stands for one monitor: no two
 monitors ever share one in a directory. Names that start with a dot and end in
@@ -67,7 +70,8 @@ _TRAJECTORY = (
 )
 # Not the number of an episode: no part of a clip is taken for an episode's file.
 _CLIP = rf"openaigym\.clip\.{_INFIX_PART}\.step(?P<step>[0-9]{{9,18}})"
-_CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})\.log")
+_CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})")
+_STATES = rf"openaigym\.states\.{_INFIX_PART}\.[0-9]{{6,9}}"
 
 _MANIFEST = re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json")
 # By what stands behind `openaigym.`: a directory may hold a million names, and each
@@ -79,8 +83,8 @@ _VISIBLE = {
     ),
     "episodes": re.compile(rf"openaigym\.episodes\.{_INFIX_PART}\.jsonl"),
     "video": re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
-    "trajectory": re.compile(rf"{_TRAJECTORY}\.(log|h5|log\.damaged)"),
-    "clip": _CLIP_PART,
+    "trajectory": re.compile(rf"{_TRAJECTORY}\.h5"),
+    "states": re.compile(rf"{_STATES}\.(spans|log|tail|looks|spans\.damaged)"),
     "model": re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
     "results": re.compile(rf"openaigym\.results\.{_INFIX_PART}\.monitor\.csv"),
 }
@@ -177,7 +181,7 @@ def video_prefix(infix: Infix, episode_id: int) -> str:
 
 
 def trajectory_prefix(infix: Infix, episode_id: int) -> str:
-    """Return the name of an episode's trajectory without `.log` or `.h5`."""
+    """Return the name of an episode's trajectory without `.h5`."""
     return f"{FILE_PREFIX}.trajectory.{infix}.episode{episode_id:06d}"
 
 
@@ -198,7 +202,12 @@ def clip_prefix(infix: Infix, first_step: int) -> str:
 
 def clip_part_name(infix: Infix, first_step: int, number: int) -> str:
     """Return the name of one part, which is of one episode; they count from 0."""
-    return f"{clip_prefix(infix, first_step)}.part{number:06d}.log"
+    return f"{clip_prefix(infix, first_step)}.part{number:06d}"
+
+
+def states_name(infix: Infix, number: int) -> str:
+    """Return the name of a list of spans; its rows' files have other suffixes."""
+    return f"{FILE_PREFIX}.states.{infix}.{number:06d}.spans"
 
 
 def clip_lock_name(infix: Infix, first_step: int) -> str:
@@ -243,8 +252,8 @@ def is_manifest(name: str) -> bool:
 
 
 def infix_of(name: str) -> str | None:
-    """Return the infix in the name of a monitor file; None where there is none."""
-    match = _match(name)
+    """Return the infix in the name of a file or recording; None where there is none."""
+    match = _match(name) or _CLIP_PART.fullmatch(name)
     return None if match is None else match.groupdict().get("infix")
 
 

@@ -27,7 +27,7 @@ def pending_clip(episode_id: int, *, first_part: str, video: str) -> dict[str, A
 
     Args:
         episode_id: the number of the episode in which it began.
-        first_part: the base name of the first of its logs.
+        first_part: what its first part is called.
         video: the base name that the video will have.
     """
     return {"episode_id": episode_id, "clip": first_part, "video": video}
@@ -40,10 +40,10 @@ def with_reason(
 
     Args:
         entry: as `pending_video` or `pending_clip` returns it.
-        reasons: by the base names of videos, or of logs.
+        reasons: by the base names of videos, or of trajectories.
     """
-    by_log = str(entry.get("clip") or f"{entry.get('trajectory')}.log")
-    reason = reasons.get(str(entry.get("video")), reasons.get(by_log))
+    recording = str(entry.get("clip") or f"{entry.get('trajectory')}.h5")
+    reason = reasons.get(str(entry.get("video")), reasons.get(recording))
     return entry if reason is None else {**entry, "reason": _shortened(reason)}
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a trajectory holds, whichever of its two files it is in.
 
-A recorded episode is first a log (`trajectory_log`), which grows while it runs, and
-then an HDF5 file (`trajectory_file`). Both hold the same: facts, rows and model
-changes. `docs/format.md` is the specification of both.
+A recorded episode is first a span of the monitor's row log (`spans`), and then an HDF5
+file (`trajectory_hdf5`). Both hold the same: facts, rows and model changes.
+`docs/format.md` is the specification of both.
 """
 
 from __future__ import annotations
@@ -17,6 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 FORMAT_VERSION = 1
+
+
+def padded(size: int) -> int:
+    """Return a number of bytes, made a multiple of 8."""
+    return -(-size // 8) * 8
 
 
 @dataclass(frozen=True)
@@ -54,24 +59,35 @@ class Field:
 
 @dataclass(frozen=True)
 class RowLayout:
-    """Where the arrays are inside a packed row of bytes, one behind the other."""
+    """Where the arrays are inside a row of bytes, one behind the other.
+
+    Each begins at a multiple of 8 bytes, as in MuJoCo's own memory.
+    """
 
     fields: tuple[Field, ...] = ()
 
     @classmethod
     def packed(cls, arrays: Iterable[tuple[str, Array]]) -> RowLayout:
-        """Return the layout of arrays, given with their names, without any gaps."""
+        """Return the layout of arrays, given with their names."""
         fields: list[Field] = []
         offset = 0
         for name, array in arrays:
             fields.append(Field(name, array, offset))
-            offset += array.size
+            offset += padded(array.size)
         return cls(tuple(fields))
 
     @functools.cached_property
     def size(self) -> int:
         """The bytes of a row."""
-        return sum(field.array.size for field in self.fields)
+        return sum(padded(field.array.size) for field in self.fields)
+
+    @functools.cached_property
+    def padding(self) -> NDArray[np.intp]:
+        """Where in a row there is nothing."""
+        free = np.ones(self.size, bool)
+        for field in self.fields:
+            free[field.offset : field.offset + field.array.size] = False
+        return np.flatnonzero(free)
 
     def unpack(self, rows: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """Return copies of the arrays in `rows` by their names.

@@ -28,6 +28,7 @@ from ..atomic_files import replacing
 from ..errors import ClosedError, FileNotWritten, UnreadableFile
 from ..json_text import dumps
 from .json_fields import json_object, unreadable
+from .model_changes import LARGEST_CHANGE
 from .regular_files import regular_path
 from .trajectory import (
     FORMAT_VERSION,
@@ -44,7 +45,6 @@ from .trajectory_layout import (
     header_from_json,
     layout_to_json,
 )
-from .trajectory_log import LONGEST_RECORD
 from .trajectory_reader import TrajectoryReader
 
 # How every HDF5 file begins.
@@ -198,7 +198,7 @@ class TrajectoryHdf5Reader(TrajectoryReader):
         datasets = {
             field_name(name): _checked_dataset(group, name, self.path) for name in group
         }
-        if sum(map(_size, datasets.values())) > LONGEST_RECORD:
+        if sum(map(_size, datasets.values())) > LARGEST_CHANGE:
             raise ValueError("a change of the model is too large")
         stored = sum(dataset.id.get_storage_size() for dataset in datasets.values())
         self._stored_changes += stored - self._stored_by_change.get(index, 0)

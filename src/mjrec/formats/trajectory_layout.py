@@ -22,6 +22,7 @@ from .trajectory import (
     RowLayout,
     StateComponent,
     TrajectoryHeader,
+    padded,
 )
 
 # Bytes. Far beyond any simulation's; a bound, so that no file can fill the memory.
@@ -151,7 +152,7 @@ def _check_state(
 
 
 def _check_layout(fields: tuple[Field, ...]) -> RowLayout:
-    _check_parts([(f.name, f.offset, f.array.size) for f in fields])
+    _check_parts([(f.name, f.offset, padded(f.array.size)) for f in fields])
     return RowLayout(fields)
 
 

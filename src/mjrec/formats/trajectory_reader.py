@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be asked of a trajectory, whichever of its two files it is in."""
+"""What can be asked of a trajectory, in flight or finished."""
 
 from __future__ import annotations
 

@@ -98,8 +98,8 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
     def step(self, action: Any) -> dm_env.TimeStep:
         """Step the environment and record what happened."""
         recorder = self._recorder
-        usual = recorder.usual
-        if usual is None or not usual.before_step(action):
+        fast = recorder.fast
+        if fast is None or not fast.before_step(action):
             if recorder.closed:
                 return self._env.step(action)
             if recorder.done is not False:
@@ -110,14 +110,14 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
         except BaseException as error:
             recorder.note_error(error)
             raise
-        if usual is not recorder.usual:
+        if fast is not recorder.fast:
             # Within the step this monitor was closed, or its process forked.
-            usual = None
+            fast = None
         if (
-            usual is None
+            fast is None
             or timestep.first()
             or timestep.last()
-            or not usual.step(timestep.reward)
+            or not fast.step(timestep.reward)
         ):
             self._record(timestep)
         return timestep

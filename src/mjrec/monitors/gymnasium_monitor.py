@@ -113,8 +113,8 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
             ResetNeeded: before the first reset, or after the end of an episode.
         """
         recorder = self._recorder
-        usual = recorder.usual
-        if usual is None or not usual.before_step(action):
+        fast = recorder.fast
+        if fast is None or not fast.before_step(action):
             if recorder.closed:
                 return self.env.step(action)
             if self._next_step_autoreset and recorder.done:
@@ -125,11 +125,11 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         except BaseException as error:
             recorder.note_error(error)
             raise
-        if usual is not recorder.usual:
+        if fast is not recorder.fast:
             # Within the step this monitor was closed, or its process forked.
-            usual = None
+            fast = None
         _, reward, terminated, truncated, _ = result
-        if usual is None or terminated or truncated or not usual.step(reward):
+        if fast is None or terminated or truncated or not fast.step(reward):
             self._record(*result)
         return result
 

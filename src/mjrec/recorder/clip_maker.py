@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from ..formats.span_writer import SpanLogs
 from ..simulation.state_source import EpisodeStart
 from .clips import Clip
 from .deferred_clip import ClipLogs, DeferredClip
@@ -33,7 +34,8 @@ class ClipMaker:
         can_be_deferred: tells whether what begins so can be rendered later.
         tolerates: tells whether to go on after an error.
         videos: lists those that are over.
-        ended: takes over the logs of those that are over.
+        ended: takes over the recordings of those that are over.
+        logs: where clips are recorded.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class ClipMaker:
         tolerates: Callable[[Exception], bool],
         videos: EpisodeVideos,
         ended: EndedTrajectories,
+        logs: SpanLogs,
     ) -> None:
         self._promises = promises
         self._live = live
@@ -59,7 +62,7 @@ class ClipMaker:
         self._logs: ClipLogs | None = None
         if subject.clip_states is not None and subject.rendering.mode == DEFERRED:
             self._logs = ClipLogs(
-                directory=promises.directory,
+                logs=logs,
                 infix=promises.infix,
                 states=subject.clip_states,
                 pace=pace,

@@ -26,7 +26,7 @@ from typing import Any
 
 from ..errors import FileNotWritten, PicturesDiffer
 from ..formats.monitor_directory import Infix, clip_part_name
-from ..formats.trajectory_log import RowFormat
+from ..formats.span_writer import SpanLogs
 from ..simulation.state_source import EpisodeStart, StateSource
 from .trajectory_recorder import Pace, TrajectoryRecorder
 
@@ -38,7 +38,7 @@ class ClipLogs:
     """What all deferred clips of a run have in common.
 
     Attributes:
-        directory: the monitor directory.
+        logs: of the monitor.
         infix: the monitor's.
         states: of the simulation; nobody else's, who would miss what the other has
             noticed of the model.
@@ -49,10 +49,9 @@ class ClipLogs:
         before: returns what was before it in that episode, for `clip` in the header.
         tolerates: tells whether to go on after an error.
         on_end: called with each clip that is over and has left something.
-        rows: what those of the log before are like.
     """
 
-    directory: Path
+    logs: SpanLogs
     infix: Infix
     states: StateSource
     pace: Pace
@@ -60,7 +59,6 @@ class ClipLogs:
     before: Callable[[], Mapping[str, Any]]
     tolerates: Callable[[Exception], bool]
     on_end: Callable[[DeferredClip], object]
-    rows: RowFormat | None = None
 
 
 class DeferredClip:
@@ -78,7 +76,7 @@ class DeferredClip:
         episode_id: as given.
         first_step: as given.
         video: as given.
-        first_part: its first log.
+        first_part: what its first part is called.
     """
 
     def __init__(
@@ -94,8 +92,8 @@ class DeferredClip:
         self.episode_id = self._last_episode_id = episode_id
         self.first_step = first_step
         self.video = video
-        self.first_part = self._path(logs, 0)
         self._logs = logs
+        self.first_part = logs.logs.directory / self._name(0)
         self._start = start
         self._facts = facts
         self._part: TrajectoryRecorder | None = None
@@ -166,7 +164,8 @@ class DeferredClip:
         """Return what writes the part that begins now. Its log comes later."""
         logs, number = self._logs, self._parts
         return TrajectoryRecorder(
-            self._path(logs, number),
+            logs.logs,
+            self._name(number),
             facts={
                 **logs.facts(start),
                 **self._facts,
@@ -179,7 +178,6 @@ class DeferredClip:
             states=logs.states,
             start=start,
             pace=replace(logs.pace, max_fps=None),
-            rows=logs.rows if self._part is None else self._part.rows,
         )
 
     def _stop(
@@ -195,10 +193,9 @@ class DeferredClip:
 
     def _list(self, part: TrajectoryRecorder) -> None:
         self._is_over = True
-        self._logs.rows = part.rows
         # Where the disk was too full for a single row there is nothing to promise.
         if self._parts > 1 or part.is_there:
             self._logs.on_end(self)
 
-    def _path(self, logs: ClipLogs, number: int) -> Path:
-        return logs.directory / clip_part_name(logs.infix, self.first_step, number)
+    def _name(self, number: int) -> str:
+        return clip_part_name(self._logs.infix, self.first_step, number)

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 from ..errors import Error
+from ..formats.spans import is_in_flight
 
 _NO_FAILURES: Mapping[str, str] = MappingProxyType({})
 
@@ -20,7 +21,7 @@ class Rendering(Protocol):
         """Get ready: a trajectory will come that has a video. Never waits."""
 
     def submit(self, trajectory: Path) -> None:
-        """Take over an ended trajectory, or a clip by its first log. Never waits."""
+        """Take over an ended trajectory, or a clip by its first part. Never waits."""
 
     def wait(self, on_progress: Callable[[Any], None]) -> None:
         """Return when all that was taken over is done."""
@@ -38,8 +39,8 @@ class EndedTrajectories:
 
     Args:
         rendering: whoever renders; None where nothing is to be rendered now.
-        finish_log: gives the log of an ended episode its final form, where nothing
-            renders.
+        finish_log: gives the recording of an ended episode its final form, where
+            nothing renders.
     """
 
     def __init__(
@@ -59,15 +60,15 @@ class EndedTrajectories:
         if self._rendering is not None:
             self._rendering.expect()
 
-    def add(self, log: Path) -> None:
-        """Take over the log of an episode that is over. Never waits."""
+    def add(self, trajectory: Path) -> None:
+        """Take over the recording of an episode that is over. Never waits."""
         if self._rendering is not None:
-            self._rendering.submit(log)
+            self._rendering.submit(trajectory)
         else:
-            self._unfinished.append(log)
+            self._unfinished.append(trajectory)
 
     def add_clip(self, first_part: Path) -> None:
-        """Take over the logs of a video that is counted in steps. Never waits.
+        """Take over the parts of a video that is counted in steps. Never waits.
 
         They stay as they are until it is rendered, by whomever.
 
@@ -95,12 +96,12 @@ class EndedTrajectories:
         """
         failed: list[Error] = []
         for _ in range(len(self._unfinished)):
-            log = self._unfinished.pop(0)
+            trajectory = self._unfinished.pop(0)
             try:
-                if log.exists():
-                    self._finish_log(log)
+                if is_in_flight(trajectory):
+                    self._finish_log(trajectory)
             except Error as error:
                 failed.append(error)
-                self._unfinished.append(log)
+                self._unfinished.append(trajectory)
         if failed:
             raise failed[0]

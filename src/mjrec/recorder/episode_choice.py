@@ -32,8 +32,9 @@ class EpisodeChoice:
         if options.step_trigger is not None or mode == OFF:
             self._schedule = disable_videos
         self._trajectories = options.trajectory_callable
-        # The episode that was asked about last.
+        # The episodes that were asked about last.
         self._decided = (-1, False)
+        self._kept = (-1, False)
 
     @property
     def schedule_name(self) -> str:
@@ -74,6 +75,8 @@ class EpisodeChoice:
     ) -> bool:
         """Return whether an episode keeps its trajectory.
 
+        A function is asked once for a number, which resets may share.
+
         Args:
             episode_id: its number.
             episode_type: "t" for training, "e" for evaluation.
@@ -82,7 +85,11 @@ class EpisodeChoice:
         asked = self._trajectories
         if asked is None:
             return has_video or episode_type == _EVALUATION
-        return bool(asked(episode_id)) if callable(asked) else asked
+        if not callable(asked):
+            return asked
+        if self._kept[0] != episode_id:
+            self._kept = (episode_id, bool(asked(episode_id)))
+        return self._kept[1]
 
     def keeps_without_video(self, episode_type: str) -> bool:
         """Return whether a trajectory that is kept stays where its video does not."""

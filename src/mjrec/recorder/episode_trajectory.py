@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import FileNotWritten, PicturesDiffer
-from ..formats.trajectory_log import RowFormat
 from .deferred_video import DeferredVideo
 from .trajectory_recorder import TrajectoryRecorder
 
@@ -55,17 +54,12 @@ class EpisodeTrajectory:
 
     @property
     def path(self) -> Path:
-        """Its log."""
+        """Of the file that it becomes."""
         return self.recorder.path
 
     @property
-    def rows(self) -> RowFormat | None:
-        """What its rows are like, once there are any."""
-        return self.recorder.rows
-
-    @property
     def is_there(self) -> bool:
-        """Whether there is a file, with as much as could be written."""
+        """Whether the log has as much of it as could be written."""
         return self.recorder.is_there
 
     def lacks(self, steps: int) -> bool:
@@ -110,14 +104,20 @@ class EpisodeTrajectory:
             self._stop(error)
 
     def take_frame(self) -> None:
-        """Take the frame of this moment, unless there is one of it already."""
+        """Take the frame of this moment, unless there is one of it already.
+
+        Raises:
+            FileNotWritten: the disk is full, and that is not tolerated.
+        """
         try:
             self.recorder.take_frame()
         except PicturesDiffer as error:
             self._stop_frames(error)
+        except FileNotWritten as error:
+            self._stop(error)
 
     def end(self, facts: Mapping[str, Any]) -> None:
-        """Write what is known of the episode's end, and close the log. Idempotent.
+        """Write what is known of the episode's end. Idempotent.
 
         Raises:
             FileNotWritten: the disk is full, and that is not tolerated; the next call

@@ -20,7 +20,7 @@ from ..errors import DirectoryNotWritable, Error, InvalidArgument
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.json_fields import read_object, unreadable
 from ..formats.second_names import give_second_names
-from ..formats.trajectory_log_facts import append_facts
+from ..formats.spans import add_facts, drop_recording
 from .deferred_video import DeferredVideo
 from .ended_trajectories import EndedTrajectories
 from .episode_videos import EpisodeVideos
@@ -37,7 +37,7 @@ class _Held:
 
     Attributes:
         size: of its files, in bytes.
-        trajectory: its log.
+        trajectory: the file that its recording becomes.
         promise: what the log says of the video.
         stays: the trajectory is kept in any case.
         deferred: its video, where that is to be rendered.
@@ -134,6 +134,7 @@ class KeptVideos:
         episode_id: int,
         trajectory: Path,
         *,
+        size: int,
         promise: Mapping[str, Any],
         stays: bool,
         deferred: DeferredVideo | None,
@@ -142,7 +143,8 @@ class KeptVideos:
 
         Args:
             episode_id: its number.
-            trajectory: the log, which is closed.
+            trajectory: the file that its recording becomes.
+            size: of its rows, in bytes.
             promise: what the log says of the video.
             stays: the trajectory is kept in any case.
             deferred: the video, where it is to be rendered.
@@ -150,13 +152,14 @@ class KeptVideos:
         held = self._held.setdefault(episode_id, _Held())
         held.trajectory, held.promise = trajectory, promise
         held.stays, held.deferred = stays, deferred
-        self._count(held, [trajectory])
+        self._count(held, size)
 
     def hold_live(self, episode_id: int, recorder: VideoRecorder) -> None:
         """Hold a video that was drawn live, and is closed."""
         held = self._held.setdefault(episode_id, _Held())
         held.live.append(recorder)
-        self._count(held, _files_of(recorder))
+        files = [path for path in _files_of(recorder) if path.exists()]
+        self._count(held, sum(path.stat().st_size for path in files))
 
     def settle(self) -> None:
         """Delete what has fallen out.
@@ -215,14 +218,13 @@ class KeptVideos:
     def _is_chosen(self, episode_id: int) -> bool:
         return self._selection.standing(episode_id) is Standing.CHOSEN
 
-    def _count(self, held: _Held, paths: Iterable[Path]) -> None:
+    def _count(self, held: _Held, size: int) -> None:
         if self._selection.holds_all and not self._most_bytes_held:
             logger.info(
                 "Which episodes get a video is decided at the end (keep=%s): until "
                 "then the recordings of all of them stay on the disk.",
                 self._selection.name,
             )
-        size = sum(path.stat().st_size for path in paths if path.exists())
         held.size += size
         self._bytes_held += size
         self._most_bytes_held = max(self._most_bytes_held, self._bytes_held)
@@ -253,7 +255,7 @@ class KeptVideos:
                 _say_in_metadata(recorder, self.chosen_facts())
             if held.trajectory is not None:
                 verdict = self.verdict(Standing.CHOSEN, held.promise)
-                append_facts(held.trajectory, verdict)
+                add_facts(held.trajectory, verdict)
                 self._ended.add(held.trajectory)
         finally:
             self._list(episode_id, held)
@@ -275,10 +277,10 @@ class KeptVideos:
             return
         if held.stays:
             verdict = self.verdict(Standing.DROPPED, held.promise)
-            append_facts(held.trajectory, verdict)
+            add_facts(held.trajectory, verdict)
             self._ended.add(held.trajectory)
         else:
-            _remove([held.trajectory])
+            drop_recording(held.trajectory)
 
     def _leave_all(self) -> None:
         for episode_id in list(self._held):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import logging
 import os
 import sys
@@ -23,7 +24,7 @@ from ..formats.monitor_directory import (
     stats_prefix,
     trajectory_prefix,
 )
-from ..formats.trajectory_log import RowFormat
+from ..formats.span_writer import SpanLogs
 from ..results.recorded_environment import GYM_VERSION
 from ..simulation.state_source import EpisodeStart, StateSource
 from .begun_episode import BegunEpisode
@@ -37,6 +38,7 @@ from .episode_choice import EpisodeChoice
 from .episode_journal import EpisodeJournal
 from .episode_trajectory import EpisodeTrajectory
 from .episode_videos import EpisodeVideos
+from .fast_path import FastPath, counting
 from .faults import Faults, What
 from .kept_videos import KeptVideos
 from .live_videos import LiveVideoMaker, LiveVideos
@@ -50,7 +52,6 @@ from .subject import Subject, check_pictures
 from .told_trackers import ToldTrackers
 from .tracking import FinishedEpisode, Run
 from .trajectory_recorder import Pace, TrajectoryRecorder
-from .usual_steps import CountedSteps, UsualSteps
 from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder
 
@@ -62,8 +63,8 @@ class Recorder:
 
     It is told what happens to an environment and never calls it, except for pictures
     and states: `before_reset`, the environment's reset inside `resetting`, `reset`;
-    `before_step`, the environment's step, `step`, or, while there is `usual`, what that
-    has instead; `close`. It belongs to the process that made it.
+    `before_step`, the environment's step, `step`, or, while there is a `fast` path,
+    what that has instead; `close`. It belongs to the process that made it.
 
     Args:
         directory: the monitor directory.
@@ -153,7 +154,11 @@ class Recorder:
             clock=subject.clock, declared=subject.declared, max_fps=options.max_fps
         )
         self._trajectory: EpisodeTrajectory | None = None
-        self._rows: RowFormat | None = None
+        numbers = itertools.count()
+        self._logs, self._clip_logs = (
+            SpanLogs(self.directory, self._place.infix, numbers=numbers)
+            for _ in range(2)
+        )
         self._deferral = Deferral(subject)
         self.video_recorder: VideoRecorder | DeferredVideo | None = None
         # The same, where it is drawn live, and those of further cameras.
@@ -187,8 +192,8 @@ class Recorder:
             faults=self._faults,
         )
         self.closed = False
-        # What the next step may be recorded with; None where it is not a usual one.
-        self.usual: UsualSteps | CountedSteps | None = None
+        # What the next step may be recorded with; None where it needs a closer look.
+        self.fast: FastPath | None = None
 
     @property
     def directory(self) -> Path:
@@ -251,7 +256,7 @@ class Recorder:
         """
         if self._is_forked:
             self._refuse_process()
-        self.usual = None
+        self.fast = None
         self.stats_recorder.before_reset(after_error=self._ending is not None)
         if not self._is_unbegun():
             self._take_last_picture()
@@ -317,7 +322,7 @@ class Recorder:
         succeeds. A reset is then allowed in any case. Nothing more is taken of the
         environment's state, which may be half of a step.
         """
-        self.usual = None
+        self.fast = None
         if self.stats_recorder.done is False and self._ending is None:
             self._ending = ending(error)
 
@@ -362,7 +367,7 @@ class Recorder:
         reward = reward_to_float(reward)
         done = bool(terminated or truncated)
         self._ending = None
-        self.usual = None
+        self.fast = None
         if done:
             # Before it is counted: an end that is interrupted is taken up again.
             self._flags = {
@@ -396,7 +401,7 @@ class Recorder:
                     self._end_episode()
                     self._tell_of_episode()
                 else:
-                    self.usual = self._usual_steps()
+                    self.fast = self._fast_path()
 
     def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
         """End the running episode, and wait until all videos are rendered.
@@ -444,8 +449,10 @@ class Recorder:
         logger.info("Finished writing results. They are in %s.", self.directory)
 
     def _end_by_close(self) -> None:
-        self.usual = None
+        self.fast = None
         with contextlib.ExitStack() as ends:
+            for logs in (self._logs, self._clip_logs):
+                ends.callback(self._settle, logs.close)
             for states in self._all_states():
                 # A trajectory without its model is worth nothing, and what stores it
                 # may end with the process.
@@ -472,6 +479,7 @@ class Recorder:
             tolerates=functools.partial(self._tolerates, "video"),
             videos=self._videos,
             ended=self._ended,
+            logs=self._clip_logs,
         )
         return Clips(
             length=self._options.video_length,
@@ -528,14 +536,13 @@ class Recorder:
                 self.directory,
             )
 
-    def _usual_steps(self) -> UsualSteps | CountedSteps | None:
+    def _fast_path(self) -> FastPath | None:
         """Return what the coming steps may be recorded with, if they are usual."""
         if self._live_videos is not None or self._clips is not None:
             return None
         if self._trajectory is None:
-            return CountedSteps(self.stats_recorder)
-        copier = self._trajectory.recorder.copier
-        return None if copier is None else UsualSteps(copier, self.stats_recorder)
+            return counting(self.stats_recorder)
+        return self._trajectory.recorder.fast_path(self.stats_recorder)
 
     def _refuse_step(self) -> None:
         if self._is_forked:
@@ -631,7 +638,8 @@ class Recorder:
     ) -> EpisodeTrajectory:
         name = trajectory_prefix(self._place.infix, episode.episode_id)
         recorder = TrajectoryRecorder(
-            self.directory / f"{name}.log",
+            self._logs,
+            name,
             facts=self._facts.of_trajectory(
                 episode, start, video=promise, is_kept=is_kept
             ),
@@ -639,7 +647,8 @@ class Recorder:
             start=start,
             pace=self._pace,
             observation=observation if self._options.observations else None,
-            rows=self._rows,
+            # It may be dropped without the others.
+            is_alone=self._kept is not None and promise is not None,
         )
         return EpisodeTrajectory(
             recorder,
@@ -707,7 +716,6 @@ class Recorder:
         trajectory, self._trajectory = self._trajectory, None
         if trajectory is not None:
             trajectory.discard()
-            self._rows = trajectory.rows
 
     def _how_it_ended(self, otherwise: str) -> dict[str, Any]:
         """Return whether the running episode is complete, and what ended it."""
@@ -776,7 +784,7 @@ class Recorder:
                 "end_time": time.time(),
             }
         )
-        self._trajectory, self._rows = None, trajectory.rows
+        self._trajectory = None
         if trajectory.is_there:
             self._hand_on(trajectory, standing)
         # Else the disk was too full for a single row: there is nothing to promise.
@@ -790,6 +798,7 @@ class Recorder:
             self._kept.hold_trajectory(
                 episode_id,
                 trajectory.path,
+                size=trajectory.recorder.size,
                 promise=trajectory.promise or {},
                 stays=trajectory.stays,
                 deferred=deferred,
@@ -844,7 +853,7 @@ _recorders: weakref.WeakSet[Recorder] = weakref.WeakSet()
 def _refuse_what_the_parent_made() -> None:
     for recorder in _recorders:
         recorder._is_forked = True
-        recorder.usual = None
+        recorder.fast = None
 
 
 os.register_at_fork(after_in_child=_refuse_what_the_parent_made)

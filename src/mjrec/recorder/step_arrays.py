@@ -23,7 +23,7 @@ class StepArray:
 
     Attributes:
         kind: dtype and shape.
-        bytes: of the array that was set last, `(size,) uint8`; always the same memory.
+        values: the array that was set last; always the same memory.
         parts: the names and shapes of a dictionary's arrays, which lie one behind the
             other; None for a plain array.
     """
@@ -36,20 +36,19 @@ class StepArray:
     ) -> None:
         self.kind = Array(dtype.str, shape)
         self.parts = parts
-        self._values: NDArray[Any] = np.zeros(shape, dtype)
-        self._shape = self._values.shape
+        self.values: NDArray[Any] = np.zeros(shape, dtype)
+        self._shape = self.values.shape
         # Of the array before, which the next one is usually like.
         self._usual: np.dtype[Any] | None = None
         # What goes in without a loss: integers into floats, and not the other way.
         self._kinds = "fiub" if dtype.kind == "f" else "iub"
         if dtype.kind == "u":
             self._kinds = "u"
-        self.bytes: NDArray[np.uint8] = self._values.reshape(-1).view(np.uint8)
 
     @property
     def size(self) -> int:
         """The bytes of one."""
-        return len(self.bytes)
+        return self.values.nbytes
 
     def set(self, value: Any) -> bool:
         """Take over `value`; return False, and hold zeros, where it is of another kind.
@@ -62,7 +61,7 @@ class StepArray:
             and value.dtype is self._usual
             and value.shape == self._shape
         ):
-            self._values[...] = value
+            self.values[...] = value
             return True
         return self._set_other(value)
 
@@ -72,7 +71,7 @@ class StepArray:
             fits = array.shape == self.kind.shape and array.dtype.kind in self._kinds
         except (AttributeError, KeyError, TypeError, ValueError):
             fits = False
-        self._values[...] = array if fits else 0
+        self.values[...] = array if fits else 0
         if fits and self.parts is None:
             self._usual = array.dtype
         return fits

@@ -16,7 +16,6 @@ from ..rendering.recorded_clips import ClipKey, clip_parts
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.videos import video_path
 from .remains import Remains
-from .report import RecoveredFile
 
 _END = ".meta.json"
 _METADATA = re.compile(r"openaigym\.video\..+\.video[0-9]+\.step[0-9]+\.meta\.json")
@@ -27,7 +26,7 @@ def pending_clips(remains: Remains) -> list[dict[str, Any]]:
 
     One that cannot be read is named by nobody; whoever renders the directory says so.
     """
-    keys = {ClipKey.of(path.name) for path in remains.clip_logs}
+    keys = {ClipKey.of(path.name) for path in remains.clip_parts}
     clips = (_pending(remains.directory, key) for key in keys if key is not None)
     return sorted(
         (clip for clip in clips if clip is not None), key=lambda clip: clip["clip"]
@@ -42,17 +41,7 @@ def videos_begun_by_steps(remains: Remains) -> list[Path]:
 
 def last_clip_episode(remains: Remains) -> int:
     """Return the highest number of an episode that a part is of; -1 where none."""
-    return max((_episode_of(path) for path in remains.clip_logs), default=-1)
-
-
-def remove_empty_parts(remains: Remains) -> list[RecoveredFile]:
-    """Remove the logs in which there is nothing, and return what was removed."""
-    removed = []
-    for path in remains.clip_logs:
-        if path.exists() and path.stat().st_size == 0:
-            path.unlink(missing_ok=True)
-            removed.append(RecoveredFile(path.name, "empty, removed"))
-    return removed
+    return max((_episode_of(path) for path in remains.clip_parts), default=-1)
 
 
 def _pending(directory: Path, key: ClipKey) -> dict[str, Any] | None:

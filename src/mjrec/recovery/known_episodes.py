@@ -39,7 +39,7 @@ class KnownEpisodes:
         # there may be millions, nothing is asked.
         self._recorded = {
             number
-            for path in remains.paths
+            for path in remains.known_paths
             if (number := episode_of(path.name)) is not None
         }
         self._facts: dict[int, Mapping[str, Any]] = {}

@@ -88,7 +88,7 @@ def _has_anything(remains: Remains) -> bool:
         (
             *(files.journal, files.manifest, files.stats),
             *(files.trajectories, files.videos, files.metadata),
-            remains.clip_logs,
+            remains.clip_parts,
         )
     )
 
@@ -228,6 +228,7 @@ def _manifest(
             "broken": broken,
             "faults": old_details.get("faults", []),
             "versions": old_details.get("versions") or _versions(remains, known),
+            **{k: old_details[k] for k in ("surroundings",) if k in old_details},
             "recovered": True,
         },
     )

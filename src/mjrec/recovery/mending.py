@@ -18,9 +18,9 @@ from pathlib import Path
 from ..errors import Error, UnreadableFile
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import Infix
+from ..formats.spans import remove_list
 from ..rendering.pending import EpisodeKey, claim
 from ..rendering.rendered_manifests import update_manifest
-from .clips import remove_empty_parts
 from .known_episodes import KnownEpisodes
 from .live_videos import finish_video
 from .manifests import write_results
@@ -33,7 +33,7 @@ from .remains import (
 )
 from .report import RecoveredFile
 from .text_recordings import finish_text
-from .unfinished_logs import finish_log_of_dead
+from .unfinished_logs import finish_log_of_dead, set_aside
 
 logger = logging.getLogger(__name__)
 
@@ -86,12 +86,17 @@ class Mending:
 
     def _mend(self, remains: Remains) -> None:
         known = KnownEpisodes(remains)
+        for spans in remains.damaged_lists:
+            with self._noting_failure(spans.name):
+                self._note(set_aside(spans))
         for log in unfinished_logs(remains):
             with self._noting_failure(log.name), self._claimed(log) as is_ours:
                 if is_ours:
                     self._note(finish_log_of_dead(log, known))
-        for file in remove_empty_parts(remains):
-            self._note(file)
+        for spans in look_through(self._directory, remains.infix).idle_lists:
+            with self._noting_failure(spans.name):
+                remove_list(spans)
+                self._note(RecoveredFile(spans.name, "nothing in flight, removed"))
         # Of logs a manifest says nothing that is not so of trajectories.
         before = len(self.files)
         for note in sorted(remains.notes, key=remains.is_first_video):

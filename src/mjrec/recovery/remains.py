@@ -26,6 +26,7 @@ from ..formats.monitor_directory import (
     names_in,
     video_prefix,
 )
+from ..formats.spans import SPANS, read_list
 from ..formats.unfinished_video import note_path
 from ..formats.video_metadata import is_broken, metadata_path
 from ..results.monitor_files import MonitorFiles
@@ -60,7 +61,7 @@ class Remains:
     @functools.cached_property
     def files(self) -> MonitorFiles:
         """The files as results are read from them."""
-        return MonitorFiles(str(self.infix), self.paths)
+        return MonitorFiles(str(self.infix), self.known_paths)
 
     @property
     def lock(self) -> Path:
@@ -69,17 +70,35 @@ class Remains:
 
     @property
     def logs(self) -> list[Path]:
-        """The logs of its episodes."""
-        return [
-            path
-            for path in self.paths
-            if path.suffix == ".log" and ClipPart.parse(path.name) is None
-        ]
+        """The files that its episodes in flight will become."""
+        return [path for path in self._in_flight if path.suffix == ".h5"]
 
     @property
-    def clip_logs(self) -> list[Path]:
-        """The logs of videos that are counted in steps."""
-        return [path for path in self.paths if ClipPart.parse(path.name) is not None]
+    def clip_parts(self) -> list[Path]:
+        """What the parts of videos are called that are counted in steps."""
+        return [path for path in self._in_flight if path.suffix != ".h5"]
+
+    @property
+    def damaged_lists(self) -> list[Path]:
+        """Lists of spans that nobody can read."""
+        return [path for path in self.paths if path.suffix == SPANS and _is_bad(path)]
+
+    @property
+    def idle_lists(self) -> list[Path]:
+        """Lists of spans that nobody needs any more."""
+        lists = (path for path in self.paths if path.suffix == SPANS)
+        return [p for p in lists if not _is_bad(p) and not read_list(p).in_flight()]
+
+    @property
+    def _in_flight(self) -> list[Path]:
+        lists = (path for path in self.paths if path.suffix == SPANS)
+        found = (read_list(path).in_flight() for path in lists if not _is_bad(path))
+        return [each.path for recordings in found for each in recordings]
+
+    @property
+    def known_paths(self) -> tuple[Path, ...]:
+        """The files, and those that recordings in flight will become."""
+        return (*self.paths, *self.logs)
 
     @property
     def notes(self) -> list[Path]:
@@ -144,7 +163,7 @@ class Remains:
 
     def _renders_clip(self) -> bool:
         """Tell whether somebody is at a clip, whose video may be called as others."""
-        parts = (ClipPart.parse(path.name) for path in self.clip_logs)
+        parts = (ClipPart.parse(path.name) for path in self.clip_parts)
         locks = {clip_lock_name(self.infix, part.first_step) for part in parts if part}
         return any(is_locked(self.directory / name) for name in locks)
 
@@ -198,11 +217,12 @@ def is_open(remains: Remains) -> bool:
 def has_work(remains: Remains) -> bool:
     """Tell whether anything is to be put in order, of a monitor that is not open."""
     unfinished = remains.notes or remains.leftovers or unfinished_logs(remains)
-    return bool(unfinished or lacks_results(remains))
+    lists = remains.damaged_lists or remains.idle_lists
+    return bool(unfinished or lists or lacks_results(remains))
 
 
 def unfinished_logs(remains: Remains) -> list[Path]:
-    """Return the logs of episodes that are to get their final form.
+    """Return the files of episodes in flight that are to get their final form.
 
     Those of a monitor that closed and left the choice among them to somebody else
     wait for that.
@@ -241,6 +261,13 @@ def lacks_results(remains: Remains) -> bool:
 def _infix_of(name: str) -> Infix | None:
     part = _PART.fullmatch(name)
     return Infix.parse(infix_of(part["final"] if part else name) or "")
+
+
+def _is_bad(path: Path) -> bool:
+    try:
+        return read_list(path).is_headless
+    except UnreadableFile:
+        return True
 
 
 def _begins_with_frame(part: Path) -> bool:

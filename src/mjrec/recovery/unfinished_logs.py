@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The logs of a dead monitor's episodes, made into trajectories."""
+"""The episodes that a dead monitor left in its logs, made into trajectories."""
 
 from __future__ import annotations
 
@@ -9,62 +9,80 @@ from typing import Any
 from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry
 from ..formats.monitor_directory import episode_of
+from ..formats.spans import FORMAT, drop_recording
 from ..formats.trajectory import FORMAT_VERSION
-from ..formats.trajectory_file import finish_trajectory
-from ..formats.trajectory_log import FIRST_LINE, FIRST_LINE_SIZE
-from ..formats.trajectory_log_reader import TrajectoryLogReader
+from ..formats.trajectory_file import finish_trajectory, open_trajectory
 from ..formats.video_metadata import is_done
+from ..json_text import loads
 from ..rendering.log_finishing import finish_log
 from ..rendering.videos import video_path
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
 
+_LONGEST_LINE = 1 << 26
 
-def finish_log_of_dead(log: Path, known: KnownEpisodes) -> RecoveredFile | None:
-    """Give a log its final form, as far as it goes.
 
-    One that is empty is removed. One that cannot be read is set aside: its name gets
-    `.damaged` for an ending, so that nobody takes it for a log any more. One that was
-    only to be kept until its video is there, and the video is, is removed.
+def finish_log_of_dead(path: Path, known: KnownEpisodes) -> RecoveredFile | None:
+    """Give a recording in flight its final form, as far as it goes.
+
+    One that was only to be kept until its video is there, and the video is, is dropped.
+
+    Args:
+        path: of the file that it becomes.
+        known: what is known of the episodes.
 
     Returns:
-        What became of it; None where it was gone.
+        What became of it; None where it is finished already.
 
     Raises:
-        UnreadableFile: it is of a newer format, or may not be read; it stays.
+        UnreadableFile: it may not be read; it stays.
         Error: as `finish_log`.
     """
-    try:
-        if log.stat().st_size == 0:
-            log.unlink()
-            return RecoveredFile(log.name, "empty, removed")
-    except FileNotFoundError:
+    if path.exists():
         return None
-    try:
-        facts, steps = _look_at(log)
-    except UnreadableFile as error:
-        return _set_aside(log, error)
-    if not facts.get("kept", True) and is_done(video_path(log, facts)):
+    with open_trajectory(path) as reader:
+        facts, steps = dict(reader.header.facts), reader.step_count
+    if not facts.get("kept", True) and is_done(video_path(path, facts)):
         # Its renderer died between the two.
-        log.with_suffix(".h5").unlink(missing_ok=True)
-        log.unlink(missing_ok=True)
-        return RecoveredFile(log.name, "its video is there, removed")
-    number = episode_of(log.name)
+        drop_recording(path)
+        return RecoveredFile(path.name, "its video is there, removed")
+    number = episode_of(path.name)
     entry = None if number is None else known.entry(number)
     if "complete" in facts:
-        path = finish_log(log)
+        path = finish_log(path)
     elif entry is not None and entry.length == steps:
         # All of it is there but the last words.
-        path = finish_trajectory(log, facts=_ending(entry))
+        path = finish_trajectory(path, facts=_ending(entry))
     else:
-        path = finish_log(log)
+        path = finish_log(path)
         return RecoveredFile(path.name, f"{_count(steps)}, incomplete: killed")
     return RecoveredFile(path.name, _count(steps))
 
 
-def _look_at(log: Path) -> tuple[dict[str, Any], int]:
-    with TrajectoryLogReader(log) as reader:
-        return dict(reader.header.facts), reader.step_count
+def set_aside(spans: Path) -> RecoveredFile:
+    """Give a list of spans that cannot be read a name that nobody looks for.
+
+    Raises:
+        UnreadableFile: it is of a newer format; it stays.
+    """
+    with spans.open("rb") as file:
+        line = file.readline(_LONGEST_LINE)
+    if _is_newer(line):
+        raise UnreadableFile(spans, "it was written by a newer mjrec: update mjrec")
+    damaged = spans.with_name(f"{spans.name}.damaged")
+    spans.replace(damaged)
+    return RecoveredFile(damaged.name, "cannot be read, set aside")
+
+
+def _is_newer(line: bytes) -> bool:
+    try:
+        values = loads(line)
+    except ValueError:
+        return False
+    if not isinstance(values, dict) or values.get("format") != FORMAT:
+        return False
+    version = values.get("version")
+    return isinstance(version, int) and version > FORMAT_VERSION
 
 
 def _ending(entry: JournalEntry) -> dict[str, Any]:
@@ -76,22 +94,6 @@ def _ending(entry: JournalEntry) -> dict[str, Any]:
         "reward": entry.reward,
         "end_time": entry.end_time,
     }
-
-
-def _set_aside(log: Path, error: UnreadableFile) -> RecoveredFile:
-    if isinstance(error.__cause__, OSError) or _is_newer(log):
-        raise error
-    damaged = log.with_name(f"{log.name}.damaged")
-    log.replace(damaged)
-    return RecoveredFile(damaged.name, f"cannot be read ({error.reason}), set aside")
-
-
-def _is_newer(log: Path) -> bool:
-    with log.open("rb") as file:
-        line = file.read(FIRST_LINE_SIZE)
-    number = line.removeprefix(FIRST_LINE).strip()
-    is_log = line.startswith(FIRST_LINE) and number.isdigit()
-    return is_log and int(number) > FORMAT_VERSION
 
 
 def _count(steps: int) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,8 @@ def render_clip(
         write_that_it_broke(video_path(parts[0], first), metadata)
         return None
     chosen = clip.chosen()
+    # All frames are recorded: `max_fps` has no part in the rate that was asked for.
+    asked = (first.get("video") or {}).get("fps")
     runs = _runs(clip, chosen.indices)
     footage = Footage(
         runs=runs,
@@ -71,7 +74,7 @@ def render_clip(
         steps=chosen.indices,
         stride=chosen.every,
         timestep=clip.timing.get("timestep"),
-        fps=usual_fps(clip.timing, chosen),
+        fps=usual_fps(clip.timing, chosen) if asked is None else Fraction(asked),
         captions=_captions(runs) if is_annotated(first) else None,
     )
     return render_footage(

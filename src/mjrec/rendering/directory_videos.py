@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,8 +13,9 @@ from typing import Any, Self
 
 from ..annotation import check_annotation
 from ..engines.work import Engine
-from ..errors import InvalidArgument
+from ..errors import InvalidArgument, UnreadableFile
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
+from ..formats.spans import is_in_flight, list_paths, read_list
 from ..formats.trajectory_file import find_trajectory
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_all_models
@@ -227,6 +229,8 @@ def iter_rendered_videos(
                 elsewhere, directory, keys, strict=strict, on_progress=tell
             )
         )
+        if target.is_dir() and episode is None:
+            outcomes = itertools.chain(outcomes, _unreadable_lists(directory))
     else:
         paths = _trajectories(target, keys)
         outcomes = (
@@ -246,6 +250,17 @@ def iter_rendered_videos(
     return _trusting(outcomes) if trust_models else outcomes
 
 
+def _unreadable_lists(directory: Path) -> Iterator[Outcome]:
+    """Yield what nobody knows the recordings of."""
+    for path in list_paths(directory):
+        try:
+            read_list(path)
+        except UnreadableFile as error:
+            if path.exists():
+                reason = str(error)
+                yield Outcome(name=path.name, directory=directory, failure=reason)
+
+
 def _trusting(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
     with trusting_all_models():
         yield from outcomes
@@ -263,7 +278,7 @@ def _recordings_of(
     Raises:
         InvalidArgument: there are none.
     """
-    if not target.exists():
+    if not target.exists() and not is_in_flight(target):
         raise InvalidArgument(f"There is no directory or file {target}.")
     if not target.is_dir():
         key = key_of(target.name)
@@ -304,7 +319,7 @@ def _trajectories(target: Path, keys: Iterable[RecordingKey]) -> list[Path]:
     Raises:
         InvalidArgument: there are none.
     """
-    if not target.is_dir() and target.suffix in (".log", ".h5"):
+    if not target.is_dir() and target.suffix == ".h5":
         # Whatever its name is otherwise.
         return [target]
     found = (

@@ -17,8 +17,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from ..errors import BlankVideo, Error, GLError
+from ..errors import BlankVideo, DirectoryNotWritable, Error, GLError
 from ..formats.second_names import give_all_second_names
+from ..formats.spans import drop_recording, list_paths, remove_if_done
 from ..formats.trajectory_file import finish_trajectory
 from ..formats.unfinished_video import VideoFile
 from .clip_videos import render_clip
@@ -89,7 +90,7 @@ def finish_pending(
 
 
 def bring_up_to_date(directory: Path) -> None:
-    """Give videos their second names, and keep manifests true.
+    """Give videos their second names, keep manifests true, and remove idle logs.
 
     To be called when videos of a directory have been finished. It also does what an
     earlier run could not.
@@ -98,6 +99,10 @@ def bring_up_to_date(directory: Path) -> None:
         UnreadableFile: a manifest is damaged.
     """
     give_all_second_names(directory)
+    for spans in list(list_paths(directory)):
+        # Those of whoever died between finishing the last recording and removing them.
+        with contextlib.suppress(DirectoryNotWritable):
+            remove_if_done(spans)
     reconcile(directory)
 
 
@@ -254,7 +259,7 @@ class EpisodeFinisher:
             )
         # The first one last: it says which video they are of.
         for part in reversed(clip.parts):
-            part.unlink(missing_ok=True)
+            drop_recording(part)
         update_manifest(self._directory, clip.key.infix)
         return outcome
 
@@ -270,8 +275,8 @@ class EpisodeFinisher:
                 functools.partial(render_video, path),
             )
         if not episode.is_kept:
-            for suffix in (".log", ".h5"):
-                path.with_suffix(suffix).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
+            drop_recording(path)
         update_manifest(self._directory, episode.key.infix)
         return outcome
 

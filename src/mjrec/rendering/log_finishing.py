@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Giving an ended log its final form, without the memory of the caller's process.
+"""Giving an ended recording its final form, without memory of the caller's process.
 
-A long log is turned into HDF5 by a process of its own:
-`python -m mjrec.rendering.log_finishing LOG`. It says one JSON object,
+A long one is turned into HDF5 by a process of its own:
+`python -m mjrec.rendering.log_finishing PATH`. It says one JSON object,
 `{"finished": "<path>"}` or `{"error": {...}}`.
 """
 
@@ -31,6 +31,8 @@ from ..child_python import (
     take_standard_output,
 )
 from ..errors import Error
+from ..formats.span_reader import rows_size
+from ..formats.spans import find_recording
 from ..formats.trajectory_file import finish_trajectory
 from ..patience import Patience
 
@@ -46,9 +48,9 @@ _READ_SIZE = 1 << 16
 
 
 def finish_log(log: Path) -> Path:
-    """Make the HDF5 file of an ended log, and remove the log.
+    """Make the HDF5 file of an ended recording.
 
-    What `finish_trajectory` does, for a long log in a process of its own. It may be
+    What `finish_trajectory` does, for a long one in a process of its own. It may be
     interrupted (Ctrl-C): then no process and no half file is left, and the log stays.
     In the very moment in which the process is started it may be left alone instead; it
     then finishes the log and ends. A process that hangs, using no CPU for
@@ -61,12 +63,8 @@ def finish_log(log: Path) -> Path:
         Error: as `finish_trajectory`; or the process was killed or hung, and the log
             stays.
     """
-    try:
-        size = log.stat().st_size
-    except OSError:
-        # Whatever that means, it is told in one way.
-        size = 0
-    if size <= _LARGEST_HERE:
+    recording = find_recording(log)
+    if recording is None or rows_size(recording) <= _LARGEST_HERE:
         return finish_trajectory(log)
     try:
         # Not a pipe, which could fill up while the other one is read.
@@ -80,7 +78,7 @@ def finish_log(log: Path) -> Path:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Finish the log that is named; return the exit status."""
+    """Finish the recording that is named; return the exit status."""
     [path] = sys.argv[1:] if argv is None else argv
     answers = take_standard_output()
     say_stacks_when_asked()

@@ -31,6 +31,7 @@ from ..formats.monitor_directory import (
     video_lock_name,
     video_prefix,
 )
+from ..formats.spans import recordings_in_flight
 from ..formats.trajectory_file import find_trajectory
 from ..formats.video_metadata import is_done, metadata_path
 from .recorded_clips import ClipKey, PendingClip, look_at_clip, recorded_clips
@@ -115,7 +116,7 @@ class PendingEpisode:
     @property
     def is_log(self) -> bool:
         """Whether the trajectory has not got its final form yet."""
-        return self.trajectory.suffix == ".log"
+        return not self.trajectory.is_file()
 
 
 RecordingKey: TypeAlias = EpisodeKey | ClipKey
@@ -128,17 +129,18 @@ def key_of(name: str) -> RecordingKey | None:
 
 
 def recordings(directory: Path) -> list[RecordingKey]:
-    """Return the episodes that have a trajectory, and the clips that have logs."""
+    """Return the episodes that have a trajectory, and the clips in flight."""
     return [*recorded_episodes(directory), *recorded_clips(directory)]
 
 
 def recorded_episodes(directory: Path) -> list[EpisodeKey]:
     """Return the episodes that have a trajectory, monitor by monitor, in order."""
+    finished = (path for path in iter_monitor_files(directory) if path.suffix == ".h5")
+    in_flight = (each.path for each in recordings_in_flight(directory))
     keys = {
         key
-        for path in iter_monitor_files(directory)
-        if path.suffix in (".log", ".h5")
-        and (key := EpisodeKey.of(path.name)) is not None
+        for path in (*finished, *in_flight)
+        if path.suffix == ".h5" and (key := EpisodeKey.of(path.name)) is not None
     }
     return sorted(
         keys, key=lambda key: (key.infix.monitor_id, key.infix.uid, key.episode_id)
@@ -173,7 +175,7 @@ def may_be_left(directory: Path, key: RecordingKey) -> bool:
 def _not_done(directory: Path, key: EpisodeKey) -> Path | None:
     """Return the trajectory of an episode; None where there is nothing left to do."""
     trajectory = find_trajectory(directory, key.infix, key.episode_id)
-    if trajectory is None or trajectory.with_suffix(".log").exists():
+    if trajectory is None or not trajectory.is_file():
         return trajectory
     return None if is_done(directory / key.video_name) else trajectory
 
@@ -183,7 +185,7 @@ def _look_at_episode(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
     trajectory = _not_done(directory, key)
     if trajectory is None:
         return None
-    is_log = trajectory.with_suffix(".log").exists()
+    is_log = not trajectory.is_file()
     with open_for_rendering(trajectory) as reader:
         facts = reader.header.facts
         if is_log and _is_monitors(facts) and _is_open(directory, key.infix):
@@ -194,9 +196,7 @@ def _look_at_episode(directory: Path, key: EpisodeKey) -> PendingEpisode | None:
         further = () if video is None else further_video_paths(trajectory, facts)
         return PendingEpisode(
             key=key,
-            # Where both are there, somebody died between making one and removing the
-            # other, and finishing the log does what is left of that.
-            trajectory=trajectory.with_suffix(".log") if is_log else trajectory,
+            trajectory=trajectory,
             video=video,
             further_videos=tuple(further),
             frame_count=0 if video is None else reader.frame_count * (1 + len(further)),

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos that are counted in steps, as the logs of a directory hold them.
 
-Such a video may go on across resets, and then has a log for each of its parts, one
-behind the other. They stay logs, and are removed when the video is there.
+Such a video may go on across resets, and then is a span for each of its parts, one
+behind the other. They stay in the log, and are dropped when the video is there.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from ..formats.monitor_directory import (
     clip_lock_name,
     clip_part_name,
     infix_of,
-    iter_monitor_files,
     lock_name,
 )
+from ..formats.spans import recordings_in_flight
 from ..formats.trajectory_reader import added_up
 from ..formats.video_metadata import is_done
 from .recorded_facts import model_file, open_for_rendering
@@ -69,7 +69,7 @@ class ClipKey:
 
     @property
     def recording_name(self) -> str:
-        """The name of the first of its logs."""
+        """What its first part is called."""
         return clip_part_name(self.infix, self.first_step, 0)
 
     @property
@@ -80,10 +80,10 @@ class ClipKey:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedClip:
-    """What the logs of a clip say, all together.
+    """What the parts of a clip say, all together.
 
     Attributes:
-        parts: the logs, in their order.
+        parts: what they are called, in their order.
         facts: of each.
         frame_counts: likewise.
         step_count: of all.
@@ -125,7 +125,7 @@ class PendingClip:
 
     Attributes:
         key: which one.
-        parts: its logs, in their order.
+        parts: what its parts are called, in their order.
         video: what is to be rendered; None where nothing is.
         further_videos: what is to be rendered besides, of further cameras.
         frame_count: how many frames are to be rendered, of all of these.
@@ -146,8 +146,8 @@ class PendingClip:
 
 
 def recorded_clips(directory: Path) -> list[ClipKey]:
-    """Return the clips that have logs, monitor by monitor, in order."""
-    parts = (ClipPart.parse(path.name) for path in iter_monitor_files(directory))
+    """Return the clips in flight, monitor by monitor, in order."""
+    parts = (ClipPart.parse(each.name) for each in recordings_in_flight(directory))
     keys = {ClipKey(part.infix, part.first_step) for part in parts if part is not None}
     return sorted(
         keys,
@@ -156,22 +156,18 @@ def recorded_clips(directory: Path) -> list[ClipKey]:
 
 
 def clip_parts(directory: Path, key: ClipKey) -> list[Path]:
-    """Return the logs of a clip, in their order.
-
-    Without what a process has left that was killed before it wrote anything.
-    """
-    numbered = sorted(
-        (part.number, path)
-        for path in directory.iterdir()
-        if (part := ClipPart.parse(path.name)) is not None
-        and (part.infix, part.first_step) == (key.infix, key.first_step)
-        and path.is_file()
-    )
-    return [path for _, path in numbered if path.stat().st_size]
+    """Return what the parts of a clip are called, in their order."""
+    # In which they are in the logs, too.
+    return [
+        recording.path
+        for recording in recordings_in_flight(directory, key.infix)
+        if (part := ClipPart.parse(recording.name)) is not None
+        and part.first_step == key.first_step
+    ]
 
 
 def read_clip(parts: Sequence[Path]) -> RecordedClip:
-    """Read what the logs of a clip say.
+    """Read what the parts of a clip say.
 
     Raises:
         UnreadableFile: one is missing or damaged.

@@ -35,7 +35,7 @@ from ..rendering.recorded_pictures import check_has_pictures, warn_of_other_pict
 from ..rendering.views import View, plain_camera
 from .video_stream import VideoStream, read_stream, stream_frames, video_kind
 
-_TRAJECTORIES: Final = (".h5", ".log")
+_TRAJECTORY: Final = ".h5"
 _MOST_IN_A_ROW: Final = 8
 _DOTS_PER_INCH: Final = 300
 # Pixels of a whole strip; Pillow calls twice as many an attack.
@@ -66,7 +66,7 @@ def film_strip(
     are simulated seconds since the reset where these are known, else the video's own.
 
     Args:
-        file: a trajectory (`.h5`, `.log`), which is drawn again; or a video, which is
+        file: a trajectory (`.h5`), which is drawn again; or a video, which is
             decoded.
         frames: how many pictures.
         columns: how many side by side; None is all of up to eight, else as many as make
@@ -93,7 +93,7 @@ def film_strip(
         _check_count("columns", columns)
     check_annotation()
     source: contextlib.AbstractContextManager[_Shots]
-    if path.suffix in _TRAJECTORIES:
+    if path.suffix == _TRAJECTORY:
         view = View(
             camera=None if camera is None else plain_camera(camera),
             height=height,
@@ -168,7 +168,7 @@ def _of_video(path: Path, count: int) -> Iterator[_Shots]:
     if video_kind(path) is None:
         raise UnreadableFile(
             path,
-            "it is neither a video (mp4, avi, mkv) nor a trajectory (.h5, .log)",
+            "it is neither a video (mp4, avi, mkv) nor a trajectory (.h5)",
         )
     stream = read_stream(path)
     indices = _spread(len(stream), count, path)

@@ -11,8 +11,8 @@ from typing import Any
 
 from ..errors import UnreadableFile
 from ..formats.journal import MOST_EPISODES, JournalEntry, read_journal
+from ..formats.spans import find_recording
 from ..formats.stats_file import StatsFile
-from ..formats.trajectory_log_reader import TrajectoryLogReader
 from .monitor_files import MonitorFiles, monitors_of
 from .numbering import NumberedEpisode, number_episodes
 from .sources import MonitorResults
@@ -40,8 +40,8 @@ class Episode:
         monitor: the infix of its monitor's files.
         video: its video, where there is one.
         metadata: its video's metadata, where there is one.
-        trajectory: its recorded states, where there are some; the finished file rather
-            than the log.
+        trajectory: its recorded states, where there are some. The file may not be
+            there yet: `load_trajectory` reads what a log has of it so far.
         pending: its video is promised and not there; `mjrec render` makes it. Where a
             monitor was killed, a finished trajectory without a video counts as a
             promise, though its monitor may have recorded no videos: that stands inside
@@ -217,18 +217,17 @@ def _is_pending(results: MonitorResults, episode_id: int) -> bool:
     if episode_id < known - (results.is_behind and results.saved is not None):
         return episode_id in results.pending_ids
     # Its monitor is open, or was killed.
-    return trajectory.suffix == ".h5" or _says_deferred(trajectory)
+    return trajectory.exists() or _says_deferred(trajectory)
 
 
 def _episode_number(value: object) -> int | None:
     return value if type(value) is int and 0 <= value <= MOST_EPISODES else None
 
 
-def _says_deferred(log: Path) -> bool:
+def _says_deferred(trajectory: Path) -> bool:
     try:
-        with TrajectoryLogReader(log) as reader:
-            video = reader.header.facts.get("video")
+        recording = find_recording(trajectory)
     except UnreadableFile:
-        # Damaged, or finished just now.
         return False
+    video = None if recording is None else recording.facts.get("video")
     return isinstance(video, dict) and video.get("recording") == "deferred"

@@ -15,6 +15,7 @@ from ..formats.monitor_directory import (
     is_manifest,
     iter_monitor_files,
 )
+from ..formats.spans import recordings_in_flight
 
 # Videos of further cameras have the camera's name before the ending.
 _VIDEO = re.compile(r".*\.video(?P<episode>\d{6,})\.(?P<kind>meta\.json|mp4|avi|json)")
@@ -35,7 +36,7 @@ class MonitorFiles:
         lock: what it claimed its infix with; it is left where the monitor was killed.
         videos: its videos, by the numbers of their episodes.
         metadata: their metadata, likewise.
-        trajectories: the recorded states, likewise; finished files rather than logs.
+        trajectories: the recorded states, likewise; also what is not finished yet.
         last_episode_id: the highest number of an episode in a name, also of a file
             that was never finished; -1 where there is none.
     """
@@ -70,27 +71,25 @@ class MonitorFiles:
         elif video is not None:
             kind = self.metadata if video["kind"] == "meta.json" else self.videos
             kind[int(video["episode"])] = path
-        elif path.suffix in (".h5", ".log"):
-            self._sort_in_trajectory(path)
-
-    def _sort_in_trajectory(self, path: Path) -> None:
-        number = episode_of(path.name)
-        if number is not None and (
-            path.suffix == ".h5" or number not in self.trajectories
-        ):
+        elif path.suffix == ".h5" and number is not None:
             self.trajectories[number] = path
 
 
 def monitors_of(directory: Path) -> list[MonitorFiles]:
     """Return the files of each monitor, in the order of the infixes.
 
-    Monitors of which there is a lock or an unfinished file only are among them.
+    Files that recordings in flight will become are among them, and monitors of which
+    there is a lock or an unfinished file only.
     """
     grouped: dict[str, list[Path]] = {}
     for path in iter_monitor_files(directory, hidden=True):
         infix = infix_of(path.name)
         if infix is not None:
             grouped.setdefault(infix, []).append(path)
+    for recording in recordings_in_flight(directory):
+        infix = infix_of(recording.path.name)
+        if infix is not None:
+            grouped.setdefault(infix, []).append(recording.path)
     return [
         MonitorFiles(infix, grouped[infix]) for infix in sorted(grouped, key=_order)
     ]

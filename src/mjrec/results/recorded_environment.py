@@ -12,7 +12,7 @@ from ..errors import UnreadableFile
 from ..formats.journal import JournalReader
 from ..formats.json_fields import json_object, read_object
 from ..formats.manifest import Manifest
-from ..formats.trajectory_log_reader import TrajectoryLogReader
+from ..formats.spans import find_recording
 from .monitor_files import MonitorFiles
 
 # What stands for gym's version in what this package writes.
@@ -58,8 +58,8 @@ def _witnesses(
         yield files.journal, _in_journal
     if files.lock is not None:
         yield files.lock, _in_lock
-    logs = [path for path in files.trajectories.values() if path.suffix == ".log"]
-    yield from ((path, _in_log) for path in logs[:_TRIES])
+    paths = list(files.trajectories.values())
+    yield from ((path, _in_log) for path in paths[:_TRIES] if not path.exists())
     yield from ((path, _in_metadata) for path in [*files.metadata.values()][:_TRIES])
 
 
@@ -80,8 +80,8 @@ def _in_lock(path: Path) -> object:
 
 
 def _in_log(path: Path) -> object:
-    with TrajectoryLogReader(path) as reader:
-        return _of(reader.header.facts.get("env_id"))
+    recording = find_recording(path)
+    return None if recording is None else _of(recording.facts.get("env_id"))
 
 
 def _in_metadata(path: Path) -> object:

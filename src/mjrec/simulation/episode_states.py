@@ -17,6 +17,7 @@ from ..errors import ClosedError, PicturesDiffer
 from ..formats.trajectory import RowLayout
 from .authored_model import AuthoredModel
 from .cameras import raw_data, raw_model
+from .gathering import can_be_gathered, words_of
 from .integration_state import STATE_SPEC, state_components
 from .model_fields import is_settable
 from .model_memory import ModelMemory
@@ -122,8 +123,8 @@ class EpisodeStates:
             memory=None if self._quick is None else self._quick.memory(),
         )
 
-    def capture_state(self) -> bytes | memoryview:
-        """Return the state of this moment; the next call overwrites it.
+    def capture_state(self, out: NDArray[np.float64]) -> None:
+        """Write the state of this moment into `out`, `(state_length,)`.
 
         Raises:
             PicturesDiffer: the environment has gone over to another model.
@@ -133,7 +134,7 @@ class EpisodeStates:
             self._go_over_to(model, data)
         if self._stored is None:
             raise _not_begun()
-        return self._stored.read_state()
+        self._stored.read_state(out)
 
     def capture_snapshot(
         self, out: NDArray[np.uint8]
@@ -301,9 +302,8 @@ class _StoredModel:
         self._checked = CheckedPictures()
         self._kept: KeptCameras | None = None
         self._has_state_memory = has_state_memory(model)
-        self._state = np.empty(mujoco.mj_stateSize(model, STATE_SPEC))
-        self._state_bytes = self._state.view(np.uint8).data
-        self.state_memory: tuple[memoryview, ...] | None = None
+        # Of `gathering.WORDS`; None where a state has to be asked for.
+        self.state_words: NDArray[np.intp] | None = None
         self._followed: int | None = None
 
     def follow(self, data: mujoco.MjData) -> None:
@@ -312,14 +312,13 @@ class _StoredModel:
         if self._has_state_memory and data._address != self._followed:
             # It is kept alive, so that no other can have its address.
             self._followed = data._address
-            self.state_memory = state_memory(self._model, data)
+            arrays = state_memory(self._model, data)
+            is_gathered = can_be_gathered(arrays)
+            self.state_words = words_of(arrays) if is_gathered else None
 
-    def read_state(self) -> bytes | memoryview:
-        """Return the state; the next call may overwrite it."""
-        if self.state_memory is not None:
-            return b"".join(self.state_memory)
-        mujoco.mj_getState(self._model, self.data, self._state, STATE_SPEC)
-        return self._state_bytes
+    def read_state(self, out: NDArray[np.float64]) -> None:
+        """Write the state into `out`."""
+        mujoco.mj_getState(self._model, self.data, out, STATE_SPEC)
 
     def pictures(
         self,
@@ -371,7 +370,7 @@ class _QuickCapture:
         self._is_unmoved = is_unmoved
         self._seen = [*stored.memory.seen, *pictures.watched.seen]
         self._present = [*stored.memory.present, *pictures.watched.present]
-        self._state_memory = stored.state_memory
+        self._state_words = stored.state_words
         self._source = pictures.source
         self.take = pictures.source.take
 
@@ -386,14 +385,12 @@ class _QuickCapture:
         self._seen.clear()
 
     def memory(self) -> MomentMemory | None:
-        """Return what somebody else can copy."""
-        if self._state_memory is None or not self._source.is_plain:
+        """Return what somebody else can gather rows from."""
+        state, source = self._state_words, self._source
+        if state is None or source.words is None or not source.is_plain:
             return None
-        return MomentMemory(
-            state=self._state_memory,
-            snapshot=self._source.memory,
-            is_current=self.is_current,
-        )
+        words = np.concatenate([state, source.words])
+        return MomentMemory(words=words, owners=source, is_current=self.is_current)
 
 
 def _called_in(around: Callable[[Callable[[], None]], None], do: Callable[[], T]) -> T:

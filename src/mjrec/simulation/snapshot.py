@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument
 from ..formats.trajectory import Array, RowLayout
+from .gathering import WORDS, can_be_gathered, words_of
 from .tendon_colours import TendonColours, has_limited_tendons, has_plastic_tendons
 
 # Not an array of `MjData`: the colours that tendons have in the picture. They are
@@ -246,7 +247,8 @@ class SnapshotSource:
         layout: what `snapshot_layout` gave for the model.
 
     Attributes:
-        memory: what a snapshot consists of, in its order.
+        arrays: what a snapshot consists of, in its order.
+        words: the same in `gathering.WORDS`; None where it cannot be gathered.
         is_plain: all of it is the data's own; else `take` brings it up to date.
     """
 
@@ -263,14 +265,23 @@ class SnapshotSource:
             else:
                 arrays.append(getattr(data, field.name))
         self.is_plain = self._colours is None
-        self.memory = tuple(array.reshape(-1).view(np.uint8).data for array in arrays)
+        self.arrays = tuple(arrays)
+        self.words = words_of(arrays) if can_be_gathered(arrays) else None
+        self._fields = layout.fields
 
     def take(self, out: NDArray[np.uint8]) -> None:
-        """Write a snapshot of this moment into `out`, `(layout.size,) uint8`."""
+        """Write a snapshot of this moment into `out`, `(layout.size,) uint8`.
+
+        It begins at a multiple of 8 bytes.
+        """
         if self._colours is not None:
             self._colours.update()
-        # Three times as fast as `np.concatenate` into `out`, for a few short arrays.
-        out.data[:] = b"".join(self.memory)
+        if self.words is not None:
+            WORDS.take(self.words, None, out.view(np.uint64), "clip")
+            return
+        for field, array in zip(self._fields, self.arrays, strict=True):
+            part = out[field.offset : field.offset + field.array.size]
+            part[...] = array.reshape(-1).view(np.uint8)
 
 
 def _array(model: mujoco.MjModel, name: str) -> Array:

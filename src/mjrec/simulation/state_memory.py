@@ -2,10 +2,9 @@
 """The physics state as the memory in which a simulation has it.
 
 `mj_getState` copies a state's components one behind the other. Their memory stays where
-it is for as long as the data lives, so whoever copies it himself, with what else he
-copies, spares the call, which is a quarter of what recording a step costs. That the
-memory holds what `mj_getState` gives is tried on data of our own, not taken from a
-release's headers.
+it is for as long as the data lives, so that a row can be gathered from it in one call,
+together with the snapshot (`gathering`). That the memory holds what `mj_getState` gives
+is tried on data of our own, not taken from a release's headers.
 """
 
 from __future__ import annotations
@@ -44,10 +43,13 @@ def has_state_memory(model: mujoco.MjModel) -> bool:
         return False
     given = np.empty(size)
     mujoco.mj_getState(model, data, given, STATE_SPEC)
-    return b"".join(memory) == given.tobytes() == state.tobytes()
+    held = b"".join(array.tobytes() for array in memory)
+    return held == given.tobytes() == state.tobytes()
 
 
-def state_memory(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[memoryview, ...]:
+def state_memory(
+    model: mujoco.MjModel, data: mujoco.MjData
+) -> tuple[NDArray[np.float64], ...]:
     """Return the memory of the state's components, in their order.
 
     Args:
@@ -55,8 +57,10 @@ def state_memory(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[memoryview
         data: its data, to be kept alive for as long as the memory is used.
     """
     names = [part.name for part in state_components(model)]
-    arrays = [_time(data) if name == _TIME else _array(data, name) for name in names]
-    return tuple(array.reshape(-1).view(np.uint8).data for array in arrays)
+    return tuple(
+        _time(data) if name == _TIME else _array(data, name).reshape(-1)
+        for name in names
+    )
 
 
 def _array(data: mujoco.MjData, component: str) -> NDArray[Any]:

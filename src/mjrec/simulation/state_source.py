@@ -17,21 +17,20 @@ from ..formats.trajectory import RowLayout, StateComponent
 
 @dataclass(frozen=True, kw_only=True)
 class MomentMemory:
-    """The memory of a simulation itself, for a recorder that copies it on its own.
-
-    Asking for a state and a snapshot costs more than copying both.
+    """The memory of a simulation itself, for a recorder that gathers rows from it.
 
     Attributes:
-        state: what the state consists of, in its order.
-        snapshot: what a snapshot consists of, likewise.
+        words: what state and snapshot consist of, in `gathering.WORDS`; this object
+            keeps them alive.
+        owners: of the words.
         is_current: tells that nothing but the state is other than at the capture
             before, which is usual: the memory then holds this moment, until the
             environment is called again. Where it does not, `capture_state` and
             `capture_snapshot` are to be asked.
     """
 
-    state: tuple[memoryview, ...]
-    snapshot: tuple[memoryview, ...]
+    words: NDArray[np.intp]
+    owners: Any
     is_current: Callable[[], bool]
 
 
@@ -72,11 +71,8 @@ class StateSource(Protocol):
     def begin_episode(self) -> EpisodeStart:
         """Return what is there now, just after a reset."""
 
-    def capture_state(self) -> bytes | memoryview:
-        """Return the state of this moment, as bytes.
-
-        They stay until the next call, which overwrites them.
-        """
+    def capture_state(self, out: NDArray[np.float64]) -> None:
+        """Write the state of this moment into `out`, `(state_length,)`."""
 
     def capture_snapshot(
         self, out: NDArray[np.uint8]
@@ -84,7 +80,7 @@ class StateSource(Protocol):
         """Write what a picture of this moment is made from into `out`.
 
         Args:
-            out: `(snapshot.size,)`, contiguous.
+            out: `(snapshot.size,)`, contiguous, at a multiple of 8 bytes.
 
         Returns:
             Model and view fields that are other than at the capture before (or at the

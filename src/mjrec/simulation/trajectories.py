@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnknownName, UnreadableFile
 from ..formats.monitor_directory import infix_of, iter_monitor_files
+from ..formats.spans import recordings_in_flight
 from ..formats.trajectory_file import open_trajectory
 from ..formats.trajectory_reader import TrajectoryReader
 
@@ -38,8 +39,9 @@ def load_trajectory(
     """Return a recorded episode.
 
     Args:
-        path: of its `openaigym.trajectory.*.h5`, or of the `.log` of an episode that
-            is not over, or whose process was killed.
+        path: of its `openaigym.trajectory.*.h5`. Of an episode that is not over, or
+            whose process was killed, that file is not there yet, and what its
+            monitor's log has of it is returned.
         trust_models: whether `model()`, and `mjrec.render` of what is returned, load
             a compiled model that another user, or another machine, has written. A
             crafted one can do anything to whoever loads it; so without this, such a
@@ -263,6 +265,9 @@ def _check_size(reader: TrajectoryReader) -> None:
     arrays = [array for array in (header.action, header.observation) if array]
     row = 8 * header.state_length + sum(array.size for array in arrays)
     needed = row * reader.row_count + header.snapshot.size * reader.frame_count
+    if not reader.path.exists():
+        # Nothing is packed in a log.
+        return
     if needed > max(_ALWAYS_FINE, _MOST_EXPANSION * reader.path.stat().st_size):
         raise UnreadableFile(
             reader.path,
@@ -273,7 +278,9 @@ def _check_size(reader: TrajectoryReader) -> None:
 
 def _what_is_in(directory: Path) -> str:
     files = iter_monitor_files(directory)
-    names = [path.name for path in files if path.suffix in (".h5", ".log")]
+    finished = [path.name for path in files if path.suffix == ".h5"]
+    in_flight = [each.path.name for each in recordings_in_flight(directory)]
+    names = sorted({*finished, *in_flight})
     if not names:
         return f"{directory} is a directory, and holds no trajectories."
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""

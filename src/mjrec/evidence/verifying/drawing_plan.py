@@ -22,6 +22,7 @@ from ...formats.monitor_directory import (
     infix_of,
     trajectory_prefix,
 )
+from ...formats.spans import FINISHED, is_in_flight
 from ...formats.trajectory_reader import TrajectoryReader
 from ...formats.video_metadata import StepRuns
 from ...formats.video_names import view_of
@@ -149,10 +150,9 @@ def _trajectory_of(video: ShippedVideo) -> Path:
     if number is None or infix is None:
         raise NotDrawable("its name is not that of an episode's video")
     stem = trajectory_prefix(infix, number)
-    for ending in (".h5", ".log"):
-        path = video.path.with_name(f"{stem}{ending}")
-        if path.exists():
-            return path
+    path = video.path.with_name(f"{stem}{FINISHED}")
+    if path.exists() or is_in_flight(path):
+        return path
     if video.is_live:
         raise NotDrawable(told_live(video.live_reason))
     raise NotDrawable(

@@ -182,7 +182,7 @@ class _Run:
         self._desynchronise(0, row[0], found[0])
         if self._observation is not None:
             self._observation.set(observation)
-            self._add_observations(0, [self._observation.bytes.copy()])
+            self._add_observations(0, [self._observation.values.copy()])
 
     def _begin_as_recorded(self) -> None:
         """Let the episode begin in the first recorded state."""
@@ -200,7 +200,7 @@ class _Run:
         gaps: NDArray[np.bool_] = np.asarray(np.isnan(rows).any(axis=1))
         found = np.full_like(rows[1:], np.nan)
         rewards = np.zeros(stop - start)
-        observations: list[NDArray[np.uint8]] = []
+        observations: list[NDArray[Any]] = []
         ended = reader.terminated[start:stop] | reader.truncated[start:stop]
         read = self._live.read
         made = 0
@@ -226,7 +226,7 @@ class _Run:
                 self._changes.compare(number + 1, self._model, result.changed)
             if self._observation is not None:
                 self._observation.set(step.observation)
-                observations.append(self._observation.bytes.copy())
+                observations.append(self._observation.values.copy())
             if step.terminated or step.truncated or ended[index]:
                 result.ending = self._different_end(number, step)
                 if result.ending:
@@ -288,13 +288,13 @@ class _Run:
             numbers, rows[known][:, self._compared], found[known][:, self._compared]
         )
 
-    def _add_observations(self, first: int, found: list[NDArray[np.uint8]]) -> None:
+    def _add_observations(self, first: int, found: list[NDArray[Any]]) -> None:
         differences, array = self._result.observations, self._observation
         if differences is None or array is None or not found:
             return
         recorded = self._reader.observations(first, first + len(found))
         assert recorded is not None
-        ours = np.stack(found).view(array.kind.dtype).reshape(len(found), -1)
+        ours = np.stack(found).reshape(len(found), -1)
         theirs = np.asarray(recorded).reshape(len(found), -1)
         numbers = np.arange(first, first + len(found))
         differences.add(numbers, theirs.astype(np.float64), ours.astype(np.float64))

@@ -32,6 +32,7 @@ from ...environments.made_again import (
 from ...environments.mjcf_again import MjcfAgain
 from ...errors import Error, UnreadableFile
 from ...formats.monitor_directory import episode_of, infix_of, iter_monitor_files
+from ...formats.spans import is_in_flight, recordings_in_flight
 from ...formats.trajectory_file import open_trajectory
 from ...simulation.mujoco_warnings import log_mujoco_warnings
 from ..verification import Check, Level, Verdict
@@ -51,9 +52,9 @@ def check_physics(
         count: told how many episodes are done, and of how many.
         made_again: gets the sha256 of each compiled model that was made again here.
     """
-    paths = [
-        path for path in iter_monitor_files(task.recordings) if _is_trajectory(path)
-    ]
+    files = iter_monitor_files(task.recordings)
+    in_flight = [each.path for each in recordings_in_flight(task.recordings)]
+    paths = sorted(path for path in (*files, *in_flight) if _is_trajectory(path))
     # Else MuJoCo writes a file into the reader's working directory.
     log_mujoco_warnings()
     workshop, names = _Workshop(task), EnvironmentNames()
@@ -71,14 +72,14 @@ def check_physics(
 
 def _is_trajectory(path: Path) -> bool:
     is_one = path.name.startswith("openaigym.trajectory.")
-    return is_one and path.suffix in (".h5", ".log")
+    return is_one and path.suffix == ".h5"
 
 
 def _checks_of(
     path: Path, workshop: _Workshop, names: EnvironmentNames
 ) -> Iterator[Check]:
     subject = f"episode {episode_of(path.name)} of {infix_of(path.name)}"
-    if path.suffix == ".log":
+    if is_in_flight(path):
         yield Check(
             level=Level.PHYSICS,
             claim="the episode's states are recorded",

@@ -232,7 +232,7 @@ def _check_models(paths: list[Path], *, is_packed: bool) -> Iterator[Check]:
     )
     named: dict[str, str] = {}
     for path in paths:
-        if path.suffix in (".h5", ".log") and ".trajectory." in path.name:
+        if path.suffix == ".h5" and ".trajectory." in path.name:
             named.update(_models_of(path, found))
     known = {path.name for path in paths}
     for path in paths:

@@ -17,7 +17,7 @@ import mujoco  # noqa: E402  after importorskip
 from recorded_states import (  # noqa: E402  after importorskip
     assert_same,
     changes_in,
-    is_usual,
+    is_fast,
     trajectories,
 )
 from recordings import stats_of  # noqa: E402  after importorskip
@@ -51,7 +51,7 @@ def go(
     spec, timesteps = monitor.action_spec(), []
     for number in range(1, count + 1):
         if not usual:
-            monitor._recorder.usual = None
+            monitor._recorder.fast = None
         if before is not None:
             before(number, monitor)
         action = np.full(spec.shape, np.cos(number)).clip(spec.minimum, spec.maximum)
@@ -102,10 +102,10 @@ def test_steps_are_usual_from_the_second_one_on(
         for _ in range(2):
             assert monitor.step(np.zeros(6)).first()
             for _ in range(8):
-                seen.append(is_usual(monitor))
+                seen.append(is_fast(monitor))
                 last = go(monitor, 1)[0]
             assert last.last()
-            assert not is_usual(monitor)
+            assert not is_fast(monitor)
     assert seen == 2 * [False, *7 * [True]]
     assert stats_of(tmp_path)["episode_lengths"] == [8, 8]
 
@@ -125,7 +125,7 @@ def test_a_changed_model_is_noticed_at_the_very_step(tmp_path: Path) -> None:
 
     def paint(number: int, monitor: Any) -> None:
         if number == 4:
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             monitor.physics.model.geom_rgba[1, 3] = 0.5
 
     trajectory = recorded(load(), tmp_path, before=paint)
@@ -147,7 +147,7 @@ def test_the_free_camera_follows_the_model(tmp_path: Path) -> None:
 
     def turn(number: int, monitor: Any) -> None:
         if number in (4, 6):
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             monitor.physics.model.vis.global_.azimuth += 30
 
     recorded(load(), tmp_path, before=turn)
@@ -162,7 +162,7 @@ def test_a_camera_of_ones_own_may_be_moved(tmp_path: Path) -> None:
 
     def turn(number: int, monitor: Any) -> None:
         if number in (3, 4, 7):
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             camera.azimuth += 10
 
     recorded(load(), tmp_path, camera=camera, before=turn)
@@ -183,7 +183,7 @@ def test_other_data_is_recorded_from_its_first_step_on(tmp_path: Path) -> None:
     def swap(number: int, monitor: Any) -> None:
         note(monitor)
         if number == 4:
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             physics = monitor.physics
             physics._data = physics.copy(share_model=True).data
             physics._data.qpos[2] += 0.1
@@ -247,7 +247,7 @@ def test_a_monitor_may_be_closed_within_a_step(tmp_path: Path) -> None:
 
     monitor.reset()
     go(monitor, 3)
-    assert is_usual(monitor)
+    assert is_fast(monitor)
     env.task.after_step = close.__get__(env.task)
     [timestep] = go(monitor, 1)
     assert timestep.mid()

@@ -17,12 +17,13 @@ import mujoco
 import numpy as np
 import pytest
 from full_disk import file_size_limit
-from recorded_states import assert_same, changes_in, is_usual, trajectories
+from recorded_states import assert_same, changes_in, is_fast, trajectories
 from recordings import manifest_of, stats_of
 from waiting import wait_until
 
 import mjrec
 from mjrec import FileNotWritten, Monitor, ResetNeeded
+from mjrec.formats.spans import recordings_in_flight
 
 CHEETAH, HOPPER, PENDULUM = "HalfCheetah-v5", "Hopper-v5", "InvertedPendulum-v5"
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -68,7 +69,7 @@ def go(
     results = []
     for number in range(1, count + 1):
         if not usual:
-            monitor._recorder.usual = None
+            monitor._recorder.fast = None
         if before is not None:
             before(number, monitor)
         results.append(monitor.step(monitor.action_space.sample()))
@@ -129,7 +130,7 @@ def test_usual_steps_are_shown_by_any_camera(camera: Any, tmp_path: Path) -> Non
     """One that was asked for is no reason to look more closely."""
 
     def check(number: int, monitor: Any) -> None:
-        assert is_usual(monitor) == (number > 1)
+        assert is_fast(monitor) == (number > 1)
         assert number < 3 or monitor._recorder._states._quick.is_current()
 
     directories = tmp_path / "usual", tmp_path / "other"
@@ -164,9 +165,9 @@ def test_steps_are_usual_from_the_second_one_on(
         for _ in range(2):
             begin(monitor)
             for _ in range(8):
-                seen.append(is_usual(monitor))
+                seen.append(is_fast(monitor))
                 go(monitor, 1)
-            assert not is_usual(monitor)
+            assert not is_fast(monitor)
     assert seen == 2 * [False, *7 * [True]]
 
 
@@ -280,11 +281,11 @@ def test_episodes_that_are_only_counted(tmp_path: Path) -> None:
             begin(monitor)
             seen = []
             for steps in range(1, 101):
-                seen.append(is_usual(monitor))
+                seen.append(is_fast(monitor))
                 [(_, _, terminated, truncated, _)] = go(monitor, 1)
                 assert monitor.get_total_steps() == steps
                 if terminated or truncated:
-                    assert not is_usual(monitor)
+                    assert not is_fast(monitor)
                     monitor.reset()
         stats = stats_of(tmp_path / name)
         found.append((seen, stats["episode_lengths"], stats["episode_rewards"]))
@@ -340,7 +341,7 @@ def test_a_model_that_changes_between_frames(cheetah: Any, tmp_path: Path) -> No
 
     def paint(number: int, monitor: Any) -> None:
         if number == 4:
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             model.geom_rgba[1, 3] = 0.5
 
     with monitored(cheetah, tmp_path, max_fps=8) as monitor:
@@ -359,7 +360,7 @@ def test_a_changed_model_is_noticed_at_the_very_step(
 
     def paint(number: int, monitor: Any) -> None:
         if number in (4, 7):
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             model.geom_rgba[1] = (0, 0, 1, number / 10)
 
     trajectory = recorded(cheetah, tmp_path, before=paint)
@@ -463,7 +464,7 @@ def test_another_camera_is_noticed_at_the_very_step(
 
     def turn(number: int, monitor: Any) -> None:
         if number == 4:
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             renderer = cheetah.unwrapped.mujoco_renderer
             # Gymnasium 1.0 begins with the tracking one.
             renderer.camera_id = 0 if renderer.camera_id == -1 else -1
@@ -480,7 +481,7 @@ def test_a_camera_of_ones_own_may_be_moved(tmp_path: Path) -> None:
 
     def turn(number: int, monitor: Any) -> None:
         if number in (3, 4, 7):
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             camera.azimuth += 10
 
     recorded(make(), tmp_path, camera=camera, before=turn)
@@ -494,7 +495,7 @@ def test_the_free_camera_follows_the_model(tmp_path: Path) -> None:
 
     def turn(number: int, monitor: Any) -> None:
         if number == 4:
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             model.vis.global_.azimuth += 30
 
     recorded(env, tmp_path, camera=-1, before=turn)
@@ -593,9 +594,9 @@ def test_an_environment_that_raises_may_go_on(tmp_path: Path) -> None:
         go(monitor, 3)
         with pytest.raises(ZeroDivisionError):
             go(monitor, 1)
-        assert not is_usual(monitor)
+        assert not is_fast(monitor)
         rewards = [float(result[1]) for result in go(monitor, 2)]
-        assert is_usual(monitor)
+        assert is_fast(monitor)
         state = state_of(env)
         assert monitor.get_total_steps() == 5
     [trajectory] = trajectories(tmp_path)
@@ -631,7 +632,7 @@ def test_a_disk_that_is_full_in_mid_episode(on_error: str, tmp_path: Path) -> No
     wait_until(lambda: list(tmp_path.glob("*.mjb.gz")))
     monitor.reset(seed=1)
     go(monitor, 2)
-    assert is_usual(monitor)
+    assert is_fast(monitor)
     states, errors = [], 0
     with file_size_limit(200):
         for _ in range(300):
@@ -640,7 +641,7 @@ def test_a_disk_that_is_full_in_mid_episode(on_error: str, tmp_path: Path) -> No
             except FileNotWritten:
                 errors += 1
             states.append(state_of(env))
-    assert not is_usual(monitor)
+    assert not is_fast(monitor)
     go(monitor, 98)
     begin(monitor)
     go(monitor, 400)
@@ -661,7 +662,7 @@ def test_statistics_may_be_set_in_mid_episode(schedule: Any, tmp_path: Path) -> 
     with Monitor(make(max_episode_steps=8), tmp_path, schedule, workers=0) as monitor:
         begin(monitor)
         go(monitor, 3)
-        assert is_usual(monitor)
+        assert is_fast(monitor)
         monitor.stats_recorder.rewards = 0
         monitor.stats_recorder.steps = 100
         rewards = [float(result[1]) for result in go(monitor, 5)]
@@ -713,7 +714,7 @@ def test_an_interrupted_step_is_recorded_or_is_not(
         with Monitor(env, directory, schedule, **options) as monitor:
             begin(monitor)
             go(monitor, 4)
-            assert is_usual(monitor)
+            assert is_fast(monitor)
             was_interrupted = interrupt_in(monitor, number)
             while not monitor.stats_recorder.done:
                 go(monitor, 1)
@@ -742,7 +743,7 @@ def test_episodes_that_are_only_counted_end_like_others(
     monitor = Monitor(env, tmp_path, False, allow_early_reset=True)
     begin(monitor)
     go(monitor, 3)
-    assert is_usual(monitor)
+    assert is_fast(monitor)
     if way == "done":
         monitor.stats_recorder.done = True
         with pytest.raises(ResetNeeded):
@@ -757,7 +758,7 @@ def test_episodes_that_are_only_counted_end_like_others(
         env.after[4] = lambda: 1 // 0
         with pytest.raises(ZeroDivisionError):
             go(monitor, 1)
-        assert not is_usual(monitor)
+        assert not is_fast(monitor)
     assert monitor.get_total_steps() == (4 if way == "reset" else 3)
     monitor.close()
     assert stats_of(tmp_path)["episode_lengths"] == []
@@ -770,7 +771,7 @@ def test_a_child_forked_in_mid_episode_is_told(cheetah: Any, tmp_path: Path) -> 
     with monitored(cheetah, tmp_path / "run") as monitor:
         begin(monitor)
         go(monitor, 4)
-        assert is_usual(monitor)
+        assert is_fast(monitor)
         before = state_of(cheetah).tolist()
         child = os.fork()
         if child == 0:
@@ -827,7 +828,7 @@ def test_a_reset_in_mid_episode_ends_it(cheetah: Any, tmp_path: Path) -> None:
         begin(monitor)
         go(monitor, 4)
         begin(monitor)
-        assert not is_usual(monitor)
+        assert not is_fast(monitor)
         go(monitor, 8)
     early, whole = trajectories(tmp_path)
     assert (len(early), len(whole)) == (4, 8)
@@ -867,13 +868,15 @@ def test_clips_are_recorded_beside_trajectories(tmp_path: Path) -> None:
         begin(monitor)
         for _ in range(8):
             go(monitor, 1)
-            assert not is_usual(monitor)
+            assert not is_fast(monitor)
     same = recorded(make(max_episode_steps=8), tmp_path / "same")
     [whole] = trajectories(tmp_path / "both")
     np.testing.assert_array_equal(whole.states, same.states)
     np.testing.assert_array_equal(whole.rewards, same.rewards)
-    [path] = (tmp_path / "both").glob("*.clip.*.log")
-    clip = mjrec.load_trajectory(path)
+    [recording] = [
+        r for r in recordings_in_flight(tmp_path / "both") if "clip" in r.name
+    ]
+    clip = mjrec.load_trajectory(recording.path)
     np.testing.assert_array_equal(clip.states, same.states[2:6])
     assert clip.frame_steps.tolist() == [0, 1, 2, 3]
 
@@ -888,7 +891,7 @@ def test_a_monitor_may_be_closed_within_a_step(tmp_path: Path) -> None:
     begin(monitor)
     env.after[4] = monitor.close
     go(monitor, 3)
-    assert is_usual(monitor)
+    assert is_fast(monitor)
     [(observation, *_)] = go(monitor, 1)
     assert observation.shape == (17,)
     [trajectory] = trajectories(tmp_path)

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An append-only log of fixed-size rows that survives SIGKILL without being flushed.
+
+Row i stands at byte `i * row_size` of the log, and before that in slot `i % capacity`
+of the tail, a small file beside it that is mapped into the writer's memory. Rows are
+filled in place there, in pages that stay hot; one aligned 64-bit counter, raised when a
+row is whole, is all that a reader needs. A full tail is written to the log before a
+slot is used again, so that every row is in one of the two at any instant.
+
+The tail file begins with a page of 64-bit words: the counter, the words in a row, and
+how many rows it has room for. When the log is closed its last rows are written and the
+tail is removed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import mmap
+import os
+import struct
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileNotWritten
+from .regular_files import open_regular
+
+TAIL_BYTES = 256 << 10
+_LEAST_ROWS = 4
+TAIL_HEAD = 4096
+_TAIL = ".tail"
+
+# statfs(2) of ext4, XFS, tmpfs and overlayfs: what a mapped page holds outlives the
+# process there. Of others (networks, FUSE, copy-on-write) some lose pages, or answer a
+# full disk with SIGBUS, so each row is written as it comes.
+_MAPPABLE = frozenset((0xEF53, 0x58465342, 0x01021994, 0x794C7630))
+
+
+class RowLog:
+    """Writes a row log.
+
+    Args:
+        path: of the log; neither it nor its tail is there.
+        row_words: 64-bit words in a row.
+        tail_bytes: how much of the log the tail holds, at least four rows.
+
+    Attributes:
+        path: as given.
+        count: rows so far.
+        slots: the tail, `(capacity, row_words) uint64`. Row `count` is filled in
+            `slots[count % capacity]` once `make_room` was called, and counted by
+            `counter[0] = log.count = count + 1`.
+        memory: the tail as its file has it: `TAIL_HEAD` bytes, then the slots.
+        counter: of the rows so far, for readers.
+        limit: `make_room` is to be called before row `limit` is filled.
+
+    Raises:
+        FileNotWritten: the disk has no room for the tail, or the directory is gone.
+    """
+
+    def __init__(
+        self, path: Path, row_words: int, *, tail_bytes: int = TAIL_BYTES
+    ) -> None:
+        self.path = path
+        self.row_size = 8 * row_words
+        self.capacity = max(_LEAST_ROWS, tail_bytes // self.row_size)
+        self.count = self._written = 0
+        length = TAIL_HEAD + self.capacity * self.row_size
+        with self._naming_errors():
+            self._log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+            try:
+                self._is_mapped = _may_be_mapped(self._log)
+                self.memory = self._new_memory(length)
+            except BaseException:
+                os.close(self._log)
+                path.unlink(missing_ok=True)
+                raise
+        self.limit = self.capacity if self._is_mapped else 0
+        self.counter = memoryview(self.memory).cast("Q")
+        self.counter[1], self.counter[2] = row_words, self.capacity
+        rows = np.frombuffer(self.memory, np.uint64, offset=TAIL_HEAD)
+        self.slots: NDArray[np.uint64] = rows.reshape(self.capacity, row_words)
+
+    @property
+    def size(self) -> int:
+        """The bytes of all rows so far."""
+        return self.count * self.row_size
+
+    def make_room(self) -> None:
+        """Write what the log lacks, so that the next slot can be filled.
+
+        Raises:
+            FileNotWritten: the disk is full; all rows so far are kept.
+        """
+        self._write()
+        self.limit = self.count + (self.capacity if self._is_mapped else 0)
+
+    def commit(self) -> None:
+        """Count the row that was filled, and have it survive this process."""
+        self.counter[0] = self.count = self.count + 1
+        self.settle()
+
+    def settle(self) -> None:
+        """Write the counted rows where no tail keeps them.
+
+        Raises:
+            FileNotWritten: the disk is full; they stay in memory.
+        """
+        if not self._is_mapped:
+            self._write()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether rows can be added."""
+        return self._log >= 0
+
+    def close(self) -> None:
+        """Write the last rows and remove the tail. Idempotent.
+
+        Raises:
+            FileNotWritten: the disk is full; the next call tries again.
+        """
+        if not self.is_open:
+            return
+        self._write()
+        self.release()
+        with contextlib.suppress(OSError):
+            # Where it stays it does no harm: it says nothing that the log does not.
+            tail_path(self.path).unlink()
+
+    def release(self) -> None:
+        """Let go of the files as they are. Idempotent."""
+        if self.is_open:
+            os.close(self._log)
+            self._log = -1
+
+    def _write(self) -> None:
+        with self._naming_errors():
+            while self._written < self.count:
+                first = self._written % self.capacity
+                stop = min(self.capacity, first + self.count - self._written)
+                _write_all(
+                    self._log,
+                    self.slots[first:stop].reshape(-1).view(np.uint8).data,
+                    self._written * self.row_size,
+                )
+                self._written += stop - first
+
+    def _new_memory(self, length: int) -> mmap.mmap:
+        if not self._is_mapped:
+            return mmap.mmap(-1, length)
+        path = tail_path(self.path)
+        tail = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        try:
+            # A full disk is an error here, and not a SIGBUS when a page is touched.
+            os.posix_fallocate(tail, 0, length)
+            return mmap.mmap(tail, length)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        finally:
+            os.close(tail)
+
+    @contextlib.contextmanager
+    def _naming_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise FileNotWritten(self.path, error.strerror or error) from error
+
+
+def tail_path(log: Path) -> Path:
+    """Return where the tail of a log is."""
+    return log.with_suffix(_TAIL)
+
+
+class RowLogReader:
+    """Reads a row log, also while it is written and after its writer was killed.
+
+    Args:
+        path: of the log.
+        row_size: bytes in a row.
+
+    Raises:
+        OSError: there is no such log, or it cannot be read.
+    """
+
+    def __init__(self, path: Path, row_size: int) -> None:
+        self._row_size = row_size
+        with contextlib.ExitStack() as opened:
+            # The tail first: a writer that closes now has all rows in the log.
+            self._tail = self._capacity = 0
+            with contextlib.suppress(FileNotFoundError):
+                tail = opened.enter_context(open_regular(tail_path(path)))
+                self._tail, self._capacity = tail.fileno(), self._room_in(tail.fileno())
+            self._log = opened.enter_context(open_regular(path)).fileno()
+            self._opened = opened.pop_all()
+
+    @property
+    def count(self) -> int:
+        """Rows so far."""
+        counted, in_log = self._counted(), self._in_log()
+        # More than the tail has room for were never counted before they were written.
+        return max(in_log, min(counted, in_log + self._capacity))
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint8]:
+        """Return `(stop - start, row_size) uint8`, rows of `count`.
+
+        Raises:
+            ValueError: they are not all there: the log was cut short.
+        """
+        rows = np.empty((stop - start, self._row_size), np.uint8)
+        done = self._read_log(start, rows)
+        while done < len(rows):
+            first = start + done
+            found = self._read_tail(first, rows[done:])
+            # Slots that were used again meanwhile: their rows are in the log now.
+            lost = max(0, self._counted() + 1 - self._capacity - first)
+            if lost and self._in_log() > first:
+                done += self._read_log(first, rows[done:])
+            elif found:
+                done += found
+            else:
+                raise ValueError("its last rows are not there")
+        return rows
+
+    def close(self) -> None:
+        """Close the files; idempotent."""
+        self._opened.close()
+
+    def _room_in(self, tail: int) -> int:
+        """Return how many rows a tail holds; 0 where it is none of this log."""
+        page = os.pread(tail, 24, 0)
+        words, capacity = (
+            struct.unpack_from("=QQ", page, 8) if len(page) == 24 else (0, 0)
+        )
+        length = os.fstat(tail).st_size
+        is_sound = (
+            8 * words == self._row_size
+            and TAIL_HEAD + capacity * self._row_size <= length
+        )
+        return capacity if is_sound else 0
+
+    def _counted(self) -> int:
+        if not self._capacity:
+            return 0
+        return int.from_bytes(os.pread(self._tail, 8, 0), byteorder=sys.byteorder)
+
+    def _in_log(self) -> int:
+        return os.fstat(self._log).st_size // self._row_size
+
+    def _read_log(self, start: int, out: NDArray[np.uint8]) -> int:
+        """Fill rows from the log, and return how many are there whole."""
+        left = out.reshape(-1).data
+        offset = start * self._row_size
+        while left and (count := os.preadv(self._log, [left], offset)):
+            left, offset = left[count:], offset + count
+        return (offset - start * self._row_size) // self._row_size
+
+    def _read_tail(self, start: int, out: NDArray[np.uint8]) -> int:
+        """Fill rows from the tail up to its end, and return how many they are."""
+        if not self._capacity:
+            return 0
+        slot = start % self._capacity
+        part = out[: self._capacity - slot]
+        os.preadv(
+            self._tail, [part.reshape(-1).data], TAIL_HEAD + slot * self._row_size
+        )
+        return len(part)
+
+
+def _may_be_mapped(descriptor: int) -> bool:
+    # `os.statvfs` has no type; the first member of the C struct is it.
+    found = (ctypes.c_long * 64)()
+    failed = ctypes.CDLL(None).fstatfs(descriptor, found)
+    return not failed and found[0] in _MAPPABLE
+
+
+def _write_all(descriptor: int, data: memoryview, offset: int) -> None:
+    while data:
+        count = os.pwrite(descriptor, data, offset)
+        if count == 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        data, offset = data[count:], offset + count

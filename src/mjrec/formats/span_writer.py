@@ -1,0 +1,372 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writing recordings into a monitor's row logs, one behind the other.
+
+A log goes on from recording to recording for as long as their rows look alike and it is
+not long. Each line of the list and each row is with the operating system when the call
+that wrote it returns, so that a killed process loses nothing and nothing needs to be
+flushed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from ..errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
+from .model_changes import pack_change
+from .monitor_directory import Infix, states_name
+from .row_log import TAIL_BYTES, RowLog
+from .spans import (
+    FINISHED,
+    FRAME,
+    HEAD_WORDS,
+    LOG,
+    LOOKS,
+    STEP,
+    TERMINATED,
+    TRUNCATED,
+    append_line,
+    first_line,
+    remove_if_done,
+    remove_list,
+    row_dtype,
+)
+from .trajectory import ModelChange, TrajectoryHeader
+
+# A new log begins with the next recording then.
+_LONG = 64 << 20
+
+# How a change of the model begins: the row that it holds from, and its length.
+LOOK_PREFIX = struct.Struct("<QQ")
+ROW_HEAD = struct.Struct("=qqdQ")
+
+
+class SpanLogs:
+    """The logs of one monitor, of which one at a time is written.
+
+    Args:
+        directory: the monitor directory.
+        infix: the monitor's.
+        numbers: gives each log its number; of one monitor all share it.
+        tail_bytes: of each log.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        infix: Infix,
+        *,
+        numbers: Iterator[int],
+        tail_bytes: int = TAIL_BYTES,
+    ) -> None:
+        self.directory = directory
+        self._infix = infix
+        self._numbers = numbers
+        self._tail_bytes = tail_bytes
+        self._log: OpenLog | None = None
+
+    def path_of(self, name: str) -> Path:
+        """Return the file that an episode's recording of this name becomes."""
+        return self.directory / f"{name}{FINISHED}"
+
+    def begin(
+        self, name: str, header: TrajectoryHeader, *, alone: bool = False
+    ) -> SpanWriter:
+        """Begin a recording.
+
+        Args:
+            name: of its file, without suffix.
+            header: what is known of it, and what its rows look like.
+            alone: it gets a log of its own, to be removed with it.
+
+        Raises:
+            InvalidArgument: no file could hold such rows.
+            FileNotWritten: the disk is full, or the directory is gone.
+        """
+        if self._log is not None and (alone or not self._log.suits(header)):
+            self.close()
+        if self._log is None:
+            path = self.directory / states_name(self._infix, next(self._numbers))
+            self._log = OpenLog(path, header, tail_bytes=self._tail_bytes)
+        span = SpanWriter(self._log, name, header.facts)
+        if alone:
+            self._log.is_alone = True
+        return span
+
+    def close(self) -> None:
+        """Write what the log lacks, and close it. Idempotent.
+
+        Raises:
+            FileNotWritten: the disk is full; the next call tries again.
+        """
+        log = self._log
+        if log is None:
+            return
+        try:
+            log.close()
+        finally:
+            if log.is_released:
+                self._log = None
+
+    def release(self) -> None:
+        """Let go of the log as it is: in a forked process it is its parent's."""
+        if self._log is not None:
+            self._log.release()
+            self._log = None
+
+
+class OpenLog:
+    """A row log that is written, with its list of spans.
+
+    Attributes:
+        path: of the list.
+        rows: the log itself.
+        columns: what the slots of its tail hold, by the names of `row_dtype`.
+        bodies: for each slot all words behind its head.
+        is_alone: it is one recording's only.
+        is_released: nothing is written any more.
+    """
+
+    def __init__(
+        self, path: Path, header: TrajectoryHeader, *, tail_bytes: int
+    ) -> None:
+        try:
+            line = first_line(header)
+        except ValueError as error:
+            raise InvalidArgument(f"A trajectory cannot be written: {error}.") from None
+        self.path = path
+        self.is_alone = self.is_released = False
+        self.facts = header.facts
+        self._described = _described(header)
+        dtype = row_dtype(header)
+        # First of all, so that whatever a killed process leaves is found.
+        append_line(path, line, is_first=True)
+        try:
+            self.rows = RowLog(
+                path.with_suffix(LOG), dtype.itemsize // 8, tail_bytes=tail_bytes
+            )
+        except BaseException:
+            remove_list(path)
+            raise
+        slots = self.rows.slots
+        rows = slots.view(dtype)[:, 0]
+        self.columns: dict[str, NDArray[Any]] = {n: rows[n] for n in dtype.names or ()}
+        self.bodies = [slots[k, HEAD_WORDS:] for k in range(self.rows.capacity)]
+        self._looks: int | None = None
+        self._look_size = 0
+
+    @property
+    def look_size(self) -> int:
+        """The bytes of all changes of the model so far."""
+        return self._look_size
+
+    def suits(self, header: TrajectoryHeader) -> bool:
+        """Tell whether a recording with such rows can go on in this log."""
+        is_short = self.rows.size + self._look_size < _LONG
+        is_free = self.rows.is_open and not self.is_alone
+        return is_short and is_free and self._described == _described(header)
+
+    def say(self, **values: Any) -> None:
+        """Add a line to the list.
+
+        Raises:
+            FileNotWritten: the disk is full; nothing was added.
+        """
+        append_line(self.path, values)
+
+    def add_change(self, change: ModelChange) -> None:
+        """Add a change of the model that holds from the next row on.
+
+        Raises:
+            InvalidArgument: it cannot be written down.
+            FileNotWritten: the disk is full; nothing was added.
+        """
+        packed = pack_change(change)
+        record = LOOK_PREFIX.pack(self.rows.count, len(packed)) + packed
+        path = self.path.with_suffix(LOOKS)
+        try:
+            if self._looks is None:
+                self._looks = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+            if os.pwrite(self._looks, record, self._look_size) != len(record):
+                os.ftruncate(self._looks, self._look_size)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            raise FileNotWritten(path, error.strerror or error) from error
+        self._look_size += len(record)
+
+    def close(self) -> None:
+        """Write the last rows, and remove all if nobody needs it any more.
+
+        Raises:
+            FileNotWritten: the disk is full; the next call tries again.
+        """
+        try:
+            self.rows.close()
+            self.say(closed=True)
+        except FileNotWritten:
+            if not self.path.exists():
+                # Somebody has removed the directory; there is nothing to try again.
+                self.release()
+            raise
+        self.release()
+        with contextlib.suppress(DirectoryNotWritable):
+            # The next one that finishes a recording tries again.
+            remove_if_done(self.path)
+
+    def release(self) -> None:
+        """Let go of the files as they are. Idempotent."""
+        self.is_released = True
+        self.rows.release()
+        if self._looks is not None:
+            os.close(self._looks)
+            self._looks = None
+
+
+class SpanWriter:
+    """Writes one recording.
+
+    Args:
+        log: where its rows go.
+        name: of its file, without suffix.
+        facts: what is known of it.
+
+    Attributes:
+        log: as given.
+        steps: the number of the last step; 0 before.
+        frame_count: how many frames there are.
+        last_frame: the step of the last one; -1 before.
+
+    Raises:
+        FileNotWritten: the disk is full.
+    """
+
+    def __init__(self, log: OpenLog, name: str, facts: Mapping[str, Any]) -> None:
+        self.log = log
+        self.steps = self.frame_count = 0
+        self.last_frame = -1
+        self._name = name
+        self._first_row = log.rows.count
+        self._unsaid: dict[str, Any] = {}
+        self._ending: Mapping[str, Any] | None = None
+        self._has_ended = self._is_dropped = False
+        own = {
+            k: v for k, v in facts.items() if k not in log.facts or log.facts[k] != v
+        }
+        without = [key for key in log.facts if key not in facts]
+        log.say(
+            begin=name,
+            row=self._first_row,
+            look=log.look_size,
+            facts=own,
+            **({"without": without} if without else {}),
+        )
+
+    @property
+    def size(self) -> int:
+        """The bytes of its rows."""
+        return (self.log.rows.count - self._first_row) * self.log.rows.row_size
+
+    def make_room(self) -> int:
+        """Return the slot that the next row is to be filled in.
+
+        Raises:
+            FileNotWritten: the disk is full; all rows so far are kept.
+        """
+        rows = self.log.rows
+        if rows.count >= rows.limit:
+            rows.make_room()
+        return rows.count % rows.capacity
+
+    def commit(
+        self,
+        step: int,
+        reward: float = 0.0,
+        *,
+        is_step: bool = True,
+        is_frame: bool = False,
+        terminated: bool = False,
+        truncated: bool = False,
+    ) -> None:
+        """Count the row that was filled.
+
+        Args:
+            step: 0 for the reset, which has no reward and no action, then 1, 2, 3 ...
+            reward: of the step.
+            is_step: the row has the step's state, action and observation.
+            is_frame: the row has the snapshot of this moment.
+            terminated: the task ended the episode.
+            truncated: a limit from outside the task ended it.
+
+        Raises:
+            FileNotWritten: the disk is full, where rows are written one by one; the
+                row stays, and all that follows tries again.
+        """
+        rows = self.log.rows
+        flags = (STEP if is_step else 0) | (FRAME if is_frame else 0)
+        flags |= (TERMINATED if terminated else 0) | (TRUNCATED if truncated else 0)
+        head = rows.slots[rows.count % rows.capacity, :HEAD_WORDS]
+        ROW_HEAD.pack_into(head.data.cast("B"), 0, rows.count, step, reward, flags)
+        # No call in here: a signal's handler that raises does so after one, and what is
+        # counted has to be what is there.
+        rows.counter[0] = rows.count = rows.count + 1
+        if is_step:
+            self.steps = step
+        if is_frame:
+            self.last_frame = step
+            self.frame_count += 1
+        rows.settle()
+
+    def add_change(self, change: ModelChange) -> None:
+        """Add a change of the model, before the row that shows it.
+
+        Raises:
+            InvalidArgument: it cannot be written down.
+            FileNotWritten: the disk is full; nothing was added.
+        """
+        self.log.add_change(change)
+
+    def note(self, facts: Mapping[str, Any]) -> None:
+        """Add to the facts; on a full disk they wait for the next note or the end."""
+        self._unsaid.update(facts)
+        with contextlib.suppress(FileNotWritten):
+            self.log.say(note=self._name, facts=self._unsaid)
+            self._unsaid = {}
+
+    def end(self, facts: Mapping[str, Any]) -> None:
+        """Say how it ended. Idempotent; what the first call says counts.
+
+        Raises:
+            FileNotWritten: the disk is full; the next call tries again.
+        """
+        if self._ending is None:
+            # Others may follow before it can be said.
+            self._stop = self.log.rows.count
+            self._ending = dict(facts)
+        if not self._has_ended:
+            said = {**self._unsaid, **self._ending}
+            self.log.say(end=self._name, row=self._stop, facts=said)
+            self._has_ended = True
+
+    def drop(self) -> None:
+        """Leave nothing of it that anybody would read. Idempotent.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        if not self._is_dropped:
+            self.log.say(drop=self._name)
+            self._is_dropped = True
+
+
+_Described = tuple[Any, ...]
+
+
+def _described(header: TrajectoryHeader) -> _Described:
+    return header.state, header.snapshot, header.action, header.observation

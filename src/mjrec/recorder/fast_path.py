@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recording the steps of which nothing but the state is new.
+
+A fast simulation's step takes as long as some hundred lines of Python. Nearly all steps
+are alike: no error, no end, the same model, the same view. A `FastPath` stands in place
+of `Recorder.before_step` and `Recorder.step` for as long as the recorder has one. Where
+one of its functions returns False nothing was recorded, and the recorder's method of
+that name is to be called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..formats.row_log import TAIL_HEAD
+from ..formats.span_writer import ROW_HEAD, SpanWriter
+from ..formats.spans import FRAME, STEP
+from ..simulation.gathering import WORDS
+from .stats_recorder import StatsRecorder
+
+# Rewards are NumPy's float64 as a rule: `+` would make one of the sum, too.
+_sum = float.__add__
+# A float has each integer up to here, and one far beyond it is no float.
+_LARGEST = 1 << 53
+
+
+class FastPath(NamedTuple):
+    """What usual steps are recorded with.
+
+    Attributes:
+        before_step: notes the action, and tells whether a step may be taken.
+        step: records a step that did not end the episode, by its reward.
+    """
+
+    before_step: Callable[[Any], bool]
+    step: Callable[[Any], bool]
+
+
+def counting(stats: StatsRecorder) -> FastPath:
+    """Return what counts steps and records nothing else."""
+
+    def before_step(action: Any) -> bool:
+        # Others may have ended the episode, or its recording.
+        return stats.done is False and not stats.closed
+
+    def step(reward: Any) -> bool:
+        if not isinstance(reward, float):
+            return False
+        total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
+        # No call from here on, behind which a signal's handler could raise.
+        stats.rewards = total
+        stats.steps += 1  # type: ignore[operator]
+        stats.total_steps += 1
+        return True
+
+    return FastPath(before_step, step)
+
+
+def gathering(
+    stats: StatsRecorder,
+    span: SpanWriter,
+    words: NDArray[np.intp],
+    *,
+    set_action: Callable[[Any], bool],
+    is_current: Callable[[], bool],
+    stride: int,
+) -> FastPath:
+    """Return what records steps with one copy of memory each.
+
+    Args:
+        stats: counts the steps.
+        span: the recording, which has its first rows.
+        words: those of a row but its head, in `WORDS`.
+        set_action: puts the action into the memory that is gathered; False where it is
+            not like those before.
+        is_current: tells, after the step, whether nothing but the state is new.
+        stride: only steps of which this is a factor have a frame.
+    """
+    log, bodies = span.log.rows, span.log.bodies
+    take, pack_into = WORDS.take, ROW_HEAD.pack_into
+    memory, counter = log.memory, log.counter
+    capacity, size, both = log.capacity, log.row_size, STEP | FRAME
+
+    def before_step(action: Any) -> bool:
+        return stats.done is False and not stats.closed and set_action(action)
+
+    def step(reward: Any) -> bool:
+        row = log.count
+        if row >= log.limit or not is_current():
+            return False
+        if not isinstance(reward, float):
+            if type(reward) is not int or abs(reward) > _LARGEST:
+                return False
+            reward = float(reward)
+        slot = row % capacity
+        take(words, None, bodies[slot], "clip")
+        number = span.steps + 1
+        is_frame = number % stride == 0
+        flags = both if is_frame else STEP
+        pack_into(memory, TAIL_HEAD + slot * size, row, number, reward, flags)
+        total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
+        # No call from here on, behind which a signal's handler could raise: what is
+        # counted is what is there.
+        counter[0] = log.count = row + 1
+        span.steps = number
+        if is_frame:
+            span.last_frame = number
+            span.frame_count += 1
+        stats.rewards = total
+        stats.steps += 1  # type: ignore[operator]
+        stats.total_steps += 1
+        return True
+
+    return FastPath(before_step, step)

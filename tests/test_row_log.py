@@ -1,0 +1,489 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A row log keeps every counted row, whatever becomes of the process or the disk."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import os
+import signal
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from full_disk import file_size_limit
+from processes import forked, kill_self
+
+import mjrec.formats.row_log as row_log
+from mjrec.errors import FileNotWritten
+from mjrec.formats.row_log import TAIL_HEAD, RowLog, RowLogReader, tail_path
+
+WORDS = 4
+SIZE = 8 * WORDS
+CAPACITY = 8
+SMALL = CAPACITY * SIZE
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "openaigym.states.0.1.000000.log"
+
+
+@pytest.fixture(params=["a mapped tail", "no tail"])
+def mapped(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether the file system has mappings that outlive a process."""
+    is_mapped = bool(request.param == "a mapped tail")
+    monkeypatch.setattr(row_log, "_may_be_mapped", lambda _: is_mapped)
+    return is_mapped
+
+
+def rows(start: int, stop: int, words: int = WORDS) -> np.ndarray:
+    """Return what is written as rows: their numbers, and what follows from these."""
+    numbers = np.arange(start, stop, dtype=np.uint64)[:, None]
+    return numbers * np.arange(1, words + 1, dtype=np.uint64) ** 5
+
+
+def add(log: RowLog, count: int = 1) -> None:
+    """Add rows as recorders do."""
+    for _ in range(count):
+        if log.count >= log.limit:
+            log.make_room()
+        words = log.slots.shape[1]
+        log.slots[log.count % log.capacity] = rows(log.count, log.count + 1, words)[0]
+        log.commit()
+
+
+def check(path: Path, count: int, words: int = WORDS) -> None:
+    """Check that a log has exactly the first `count` rows."""
+    reader = RowLogReader(path, 8 * words)
+    try:
+        assert reader.count == count
+        found = reader.read(0, count).view(np.uint64)
+        np.testing.assert_array_equal(found, rows(0, count, words))
+    finally:
+        reader.close()
+
+
+@pytest.mark.usefixtures("mapped")
+@pytest.mark.parametrize("count", [0, 1, CAPACITY, CAPACITY + 1, 5 * CAPACITY + 3])
+def test_rows_are_there_when_they_are_counted_and_when_all_is_closed(
+    path: Path, names: Callable[[Path], list[str]], count: int
+) -> None:
+    """Wherever the tail wraps; in the end there is the log alone."""
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    for number in range(count):
+        add(log)
+        check(path, number + 1)
+    log.close()
+    log.close()
+    assert not log.is_open
+    check(path, count)
+    assert path.read_bytes() == rows(0, count).tobytes()
+    assert names(path.parent) == [path.name]
+
+
+def test_any_range_can_be_read(path: Path) -> None:
+    """From the log, from the tail, and from both."""
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    add(log, 3 * CAPACITY + 5)
+    reader = RowLogReader(path, SIZE)
+    for start, stop in itertools.combinations_with_replacement(range(log.count + 1), 2):
+        found = reader.read(start, stop).view(np.uint64)
+        np.testing.assert_array_equal(found, rows(start, stop))
+    reader.close()
+
+
+@pytest.mark.usefixtures("mapped")
+def test_an_open_reader_sees_what_is_added(path: Path) -> None:
+    """Also where the tail wraps several times meanwhile, and when the log is closed."""
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    reader = RowLogReader(path, SIZE)
+    for count in (0, 3, 2 * CAPACITY, 1, 5 * CAPACITY):
+        add(log, count)
+        assert reader.count == log.count
+        found = reader.read(0, log.count).view(np.uint64)
+        np.testing.assert_array_equal(found, rows(0, log.count))
+    log.close()
+    found = reader.read(0, log.count).view(np.uint64)
+    np.testing.assert_array_equal(found, rows(0, log.count))
+    reader.close()
+
+
+def test_a_row_that_is_not_counted_is_not_there(path: Path) -> None:
+    """Though it was filled in a slot that held another one."""
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    add(log, CAPACITY)
+    log.make_room()
+    log.slots[0] = 77
+    check(path, CAPACITY)
+
+
+def killed_when_full(log: RowLog) -> None:
+    """Before a full tail is written."""
+    if log.count == 3 * CAPACITY:
+        kill_self()
+
+
+def killed_in_a_row(log: RowLog) -> None:
+    """With half of it filled."""
+    if log.count == 3 * CAPACITY + 2:
+        log.make_room()
+        log.slots[log.count % CAPACITY, : WORDS // 2] = 5
+        kill_self()
+
+
+def killed_before_it_counts(log: RowLog) -> None:
+    """With a row filled."""
+    if log.count == 3 * CAPACITY + 2:
+        log.commit = kill_self  # type: ignore[method-assign]
+
+
+def killed_in_the_middle_of_a_write(log: RowLog) -> None:
+    """With some rows of a full tail in the log, and half of one."""
+    if log.count == 3 * CAPACITY:
+        kill_after_writing(lambda data: data[: len(data) // 2 - 3])
+
+
+def killed_after_a_write(log: RowLog) -> None:
+    """With a full tail in the log, which nobody has taken note of."""
+    if log.count == 3 * CAPACITY:
+        kill_after_writing(lambda data: data)
+
+
+def kill_after_writing(part: Callable[[memoryview], memoryview]) -> None:
+    real = os.pwrite
+
+    def pwrite(descriptor: int, data: memoryview, offset: int) -> int:
+        real(descriptor, part(data), offset)
+        kill_self()
+        return 0
+
+    os.pwrite = pwrite
+
+
+def killed_in_the_next_slot(log: RowLog) -> None:
+    """When the first slot of a tail that was written is filled again."""
+    if log.count == 3 * CAPACITY:
+        log.make_room()
+        log.slots[0] = 5
+        kill_self()
+
+
+def killed_in_a_close(log: RowLog) -> None:
+    """With all rows in the log, before the tail is removed."""
+    if log.count == 3 * CAPACITY + 2:
+        Path.unlink = kill_self  # type: ignore[method-assign]
+        log.close()
+
+
+MOMENTS = [
+    *(killed_when_full, killed_in_a_row, killed_before_it_counts),
+    *(killed_in_the_middle_of_a_write, killed_after_a_write),
+    *(killed_in_the_next_slot, killed_in_a_close),
+]
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_killed_process_loses_no_counted_row(
+    path: Path, mapped: bool, moment: Callable[[RowLog], None]
+) -> None:
+    """At any moment; nothing was flushed, and no signal's handler was called."""
+
+    def record(tell: Callable[[], object]) -> None:
+        log = RowLog(path, WORDS, tail_bytes=SMALL)
+        while True:
+            moment(log)
+            add(log)
+            tell()
+
+    counted, status = forked(record)
+    assert os.WTERMSIG(status) == signal.SIGKILL
+    assert counted >= 3 * CAPACITY
+    # Without a tail a row counts as soon as it is in the log.
+    is_written = not mapped and moment is killed_after_a_write
+    check(path, counted + is_written)
+
+
+def test_a_reader_beside_a_writer_never_sees_a_wrong_row(path: Path) -> None:
+    """Whatever the tail does between any two of its looks."""
+    count = 60_000
+
+    def record(_: Callable[[], object]) -> None:
+        while not path.with_suffix(".go").exists():
+            pass
+        add(log, count)
+        log.close()
+        os._exit(0)
+
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    process = os.fork()
+    if process == 0:
+        try:
+            record(lambda: None)
+        finally:
+            os._exit(1)
+    reader = RowLogReader(path, SIZE)
+    path.with_suffix(".go").touch()
+    seen = looks = 0
+    while seen < count:
+        before, seen = seen, reader.count
+        assert before <= seen <= count
+        # Some of them are about to be written over.
+        for first in (before, max(0, seen - CAPACITY - 2), max(0, seen - 3)):
+            found = reader.read(first, seen).view(np.uint64)
+            np.testing.assert_array_equal(found, rows(first, seen))
+        looks += seen > before
+    assert os.waitpid(process, 0)[1] == 0
+    assert looks > 10
+    reader.close()
+    log.release()
+    check(path, count)
+
+
+def test_rows_may_be_larger_than_the_tail(path: Path) -> None:
+    """There is room for four of them then: pictures as observations, say."""
+    words = 300 << 7
+    log = RowLog(path, words)
+    assert log.capacity == 4
+    for count in range(1, 11):
+        add(log)
+        check(path, count, words)
+    log.close()
+    check(path, 10, words)
+
+
+def test_where_nothing_is_mapped_each_row_is_written_at_once(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On network file systems, for example; there is no tail."""
+    monkeypatch.setattr(row_log, "_may_be_mapped", lambda _: False)
+    log = RowLog(path, WORDS)
+    for count in range(1, 4):
+        add(log)
+        assert path.read_bytes() == rows(0, count).tobytes()
+    assert not tail_path(path).exists()
+
+
+def test_only_file_systems_that_are_known_are_mapped(path: Path) -> None:
+    """That of processes is none of these; that in memory is."""
+    found = {}
+    for name in ("/proc/self/status", "/dev/shm"):
+        descriptor = os.open(name, os.O_RDONLY)
+        found[name] = row_log._may_be_mapped(descriptor)
+        os.close(descriptor)
+    assert found == {"/proc/self/status": False, "/dev/shm": True}
+
+
+def test_a_full_disk_is_an_error_when_the_tail_is_made(path: Path) -> None:
+    """And no SIGBUS later; nothing is left, and it can be tried again."""
+    with (
+        file_size_limit(TAIL_HEAD),
+        pytest.raises(FileNotWritten, match=rf"{path.name}: File too large"),
+    ):
+        RowLog(path, WORDS)
+    assert list(path.parent.iterdir()) == []
+    RowLog(path, WORDS).close()
+
+
+def test_a_full_disk_costs_no_row(path: Path) -> None:
+    """The row that finds no room is refused; with room again all goes on."""
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    # The tail fits; what can be written of the log ends in a row.
+    with file_size_limit(TAIL_HEAD + SMALL + 5):
+        with pytest.raises(FileNotWritten, match=rf"{path.name}: File too large"):
+            add(log, 1000)
+        refused = log.count
+        assert TAIL_HEAD // SIZE < refused < 1000
+        check(path, refused)
+        for attempt in (log.make_room, log.close, log.close):
+            with pytest.raises(FileNotWritten, match="File too large"):
+                attempt()
+        assert log.is_open
+        check(path, refused)
+    add(log, 20)
+    log.close()
+    check(path, refused + 20)
+
+
+def test_a_full_disk_costs_no_row_where_nothing_is_mapped(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The row that finds no room is in memory, and no other one is taken."""
+    monkeypatch.setattr(row_log, "_may_be_mapped", lambda _: False)
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    add(log, 5)
+    with file_size_limit(5 * SIZE + 3):
+        for _ in range(3):
+            with pytest.raises(FileNotWritten, match=rf"{path.name}: File too large"):
+                add(log)
+        assert log.count == 6
+        check(path, 5)
+    add(log, 20)
+    log.close()
+    check(path, 26)
+
+
+class Interrupt(BaseException):
+    """As Ctrl-C raises it."""
+
+
+@pytest.mark.parametrize("written", [0, 5, 3 * SIZE, SMALL])
+def test_an_interrupted_write_is_taken_up_again(
+    path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    """After Ctrl-C at any byte of it; each row is there once."""
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    add(log, 2 * CAPACITY)
+    real = os.pwrite
+
+    def pwrite(descriptor: int, data: memoryview, offset: int) -> int:
+        monkeypatch.undo()
+        real(descriptor, data[:written], offset)
+        raise Interrupt
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    with pytest.raises(Interrupt):
+        add(log)
+    check(path, 2 * CAPACITY)
+    add(log, CAPACITY)
+    log.close()
+    check(path, 3 * CAPACITY)
+
+
+def test_a_directory_that_is_gone_is_one_clear_error(tmp_path: Path) -> None:
+    """The error names the file, not an operating system call."""
+    with pytest.raises(FileNotWritten, match=r"a\.log: No such file or directory"):
+        RowLog(tmp_path / "gone" / "a.log", WORDS)
+
+
+@pytest.mark.parametrize("name", ["a.log", "a.tail"])
+def test_nothing_is_written_over(tmp_path: Path, name: str) -> None:
+    """Neither another log nor its tail; what is in the way stays as it is."""
+    (tmp_path / name).write_bytes(b"other")
+    with pytest.raises(FileNotWritten, match=r"a\.log: File exists"):
+        RowLog(tmp_path / "a.log", WORDS)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_bytes() == b"other"
+
+
+def set_counter(path: Path, count: int) -> None:
+    with tail_path(path).open("r+b") as tail:
+        tail.write(struct.pack("=Q", count))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2 * CAPACITY - 1])
+def test_rows_of_the_log_count_beyond_a_stale_counter(path: Path, count: int) -> None:
+    """After a crash of the machine the tail may be older than the log."""
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    add(log, 2 * CAPACITY)
+    log.make_room()
+    set_counter(path, count)
+    check(path, 2 * CAPACITY)
+
+
+@pytest.mark.parametrize("count", [3 * CAPACITY, 1 << 40, (1 << 64) - 1])
+def test_a_counter_beyond_what_can_be_is_not_believed(path: Path, count: int) -> None:
+    """No memory is taken for what is not there, and what is there is read."""
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    add(log, CAPACITY + 5)
+    set_counter(path, count)
+    reader = RowLogReader(path, SIZE)
+    assert reader.count == 2 * CAPACITY
+    found = reader.read(0, CAPACITY + 5).view(np.uint64)
+    np.testing.assert_array_equal(found, rows(0, CAPACITY + 5))
+    reader.close()
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"",
+        struct.pack("=QQ", 9, WORDS),
+        struct.pack("=QQQ", 9, WORDS + 1, CAPACITY),
+        struct.pack("=QQQ", 9, WORDS, CAPACITY + 1),
+        struct.pack("=QQQ", 9, WORDS, 1 << 63),
+        struct.pack("=QQQ", 9, WORDS, 0),
+        bytes(24),
+    ],
+)
+def test_a_tail_of_something_else_is_passed_over(path: Path, head: bytes) -> None:
+    """What it says would lead beyond it, or to rows of another size."""
+    log = RowLog(path, WORDS)
+    add(log, 5)
+    log.close()
+    tail_path(path).write_bytes(head.ljust(len(head) and TAIL_HEAD + SMALL, b"\0"))
+    check(path, 5)
+
+
+def test_a_log_that_was_cut_is_an_error(path: Path) -> None:
+    """Of the rows that are not there any more."""
+    log = RowLog(path, WORDS)
+    add(log, 9)
+    log.close()
+    reader = RowLogReader(path, SIZE)
+    os.truncate(path, 5 * SIZE + 1)
+    assert reader.count == 5
+    np.testing.assert_array_equal(reader.read(0, 5).view(np.uint64), rows(0, 5))
+    with pytest.raises(ValueError, match="last rows are not there"):
+        reader.read(4, 6)
+    reader.close()
+
+
+def test_in_place_of_a_file_there_may_be_something_else(path: Path) -> None:
+    """A missing log is an error, and so is a pipe, which is not waited for."""
+    with pytest.raises(FileNotFoundError):
+        RowLogReader(path, SIZE)
+    for name in (path, tail_path(path)):
+        path.write_bytes(rows(0, 5).tobytes())
+        name.unlink(missing_ok=True)
+        for put in (os.mkfifo, Path.mkdir, lambda n: n.symlink_to("/etc/passwd")):
+            put(name)
+            with pytest.raises(ValueError, match=r"regular file|out of its directory"):
+                RowLogReader(path, SIZE)
+            name.rmdir() if name.is_dir() else name.unlink()
+
+
+def descriptors() -> int:
+    gc.collect()
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_no_descriptor_stays(path: Path) -> None:
+    """Of logs and readers that are closed, released, or could not be opened."""
+    before = descriptors()
+    log = RowLog(path, WORDS)
+    add(log)
+    reader = RowLogReader(path, SIZE)
+    with pytest.raises(FileNotWritten):
+        RowLog(path, WORDS)
+    path.with_name("b.tail").mkdir()
+    path.with_name("b.log").touch()
+    with pytest.raises(ValueError, match="not a regular file"):
+        RowLogReader(path.with_name("b.log"), SIZE)
+    reader.close()
+    reader.close()
+    log.close()
+    other = RowLog(path.with_name("c.log"), WORDS)
+    other.release()
+    other.release()
+    del log, other
+    assert descriptors() == before
+
+
+def test_what_is_released_stays_as_it_is(path: Path) -> None:
+    """A forked process lets go of its parent's log, and changes nothing of it."""
+    log = RowLog(path, WORDS, tail_bytes=SMALL)
+    add(log, CAPACITY + 3)
+
+    def release(_: Callable[[], object]) -> None:
+        log.release()
+        log.close()
+        os._exit(0)
+
+    assert forked(release) == (0, 0)
+    check(path, CAPACITY + 3)
+    add(log, CAPACITY)
+    log.close()
+    check(path, 2 * CAPACITY + 3)
