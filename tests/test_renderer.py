@@ -27,7 +27,7 @@ from mjrec.errors import (
     UnknownName,
 )
 from mjrec.gl import probe
-from mjrec.simulation import gl_thread
+from mjrec.simulation import gl_strings, gl_thread
 from mjrec.simulation.gl_strings import current_gl_strings
 from mjrec.simulation.gl_thread import GLThread
 from mjrec.simulation.renderer import SceneRenderer
@@ -643,8 +643,14 @@ def test_a_picture_beyond_the_driver_is_refused(
     table: tuple[mujoco.MjModel, mujoco.MjData], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The limit that OpenGL tells is named; a smaller one than any real driver's."""
-    gl = pytest.importorskip("OpenGL.GL")
-    monkeypatch.setattr(gl, "glGetIntegerv", lambda name: 64)
+    told = gl_strings.raw_opengl()
+    name_of_limit = 0x84E8
+
+    def tell(name: int, limit: Any) -> None:
+        assert name == name_of_limit
+        limit.value = 64
+
+    monkeypatch.setattr(told, "glGetIntegerv", tell)
 
     with pytest.raises(InvalidArgument, match=r"70x50 pixels is larger.*64x64"):
         SceneRenderer(table[0], **SIZE)
