@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import mjrec
+from mjrec.formats.in_flight import recordings_in_flight
 from mjrec.formats.span_reader import rows_size
-from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.trajectory_file import finish_trajectory
 
 from .children import call

@@ -21,7 +21,7 @@ from recordings import in_flight, manifest_of
 
 import mjrec
 from mjrec.commands import main
-from mjrec.formats.spans import add_facts, drop_recording
+from mjrec.formats.in_flight import add_facts, drop_recording
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.pending import key_of, look_at, recordings

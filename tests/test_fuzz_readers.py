@@ -27,6 +27,7 @@ from sound_files import compiled, finished, source
 from trajectories_by_hand import INFIX, write_log
 
 from mjrec import Error, UnreadableFile
+from mjrec.formats.in_flight import recordings_in_flight
 from mjrec.formats.journal import JournalEntry, JournalWriter, read_journal
 from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
 from mjrec.formats.model_changes import pack_change
@@ -34,7 +35,6 @@ from mjrec.formats.monitor_directory import states_name, trajectory_prefix
 from mjrec.formats.row_log import TAIL_HEAD
 from mjrec.formats.span_reader import rows_size
 from mjrec.formats.span_writer import LOOK_PREFIX
-from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.stats_file import StatsFile, read_stats_file, write_stats_file
 from mjrec.formats.trajectory import ModelChange
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory

@@ -38,10 +38,10 @@ from sound_files import (
 from trajectories_by_hand import INFIX, add_row, new_logs, write_log
 
 from mjrec import UnreadableFile, load_trajectory
+from mjrec.formats.in_flight import list_paths
 from mjrec.formats.manifest import read_manifest
 from mjrec.formats.monitor_directory import Infix, episode_of, infix_of
 from mjrec.formats.span_writer import LOOK_PREFIX, SpanLogs
-from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import Array, ModelChange, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.json_text import dumps, loads

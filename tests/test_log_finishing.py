@@ -14,7 +14,7 @@ from processes import children
 from trajectories_by_hand import write_log
 
 from mjrec import Error, FileNotWritten, UnreadableFile
-from mjrec.formats.spans import is_in_flight
+from mjrec.formats.in_flight import is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import log_finishing
 from mjrec.rendering.log_finishing import finish_log

@@ -25,7 +25,7 @@ from trajectories_by_hand import Painter, write_log, write_pending_manifest
 
 from mjrec import BlankVideo, FileNotWritten, Monitor, RenderError, VideoRecorder
 from mjrec.formats.ffmpeg import ffmpeg_executable
-from mjrec.formats.spans import recordings_in_flight
+from mjrec.formats.in_flight import recordings_in_flight
 from mjrec.formats.trajectory_file import (
     find_trajectory,
     finish_trajectory,

@@ -26,9 +26,9 @@ from trajectories_by_hand import (
 
 from mjrec import GLError, LocalEngine, Monitor
 from mjrec.engines.work import Job, JobOutcome, Work
+from mjrec.formats.in_flight import recordings_in_flight
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import Infix
-from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering import shared_pool, video_jobs
 from mjrec.rendering.again import Variant, render_again
 from mjrec.rendering.finishing import finish_pending

@@ -19,9 +19,9 @@ from trajectories_by_hand import (
 )
 
 from mjrec import GLError, load_results
+from mjrec.formats.in_flight import add_facts, is_in_flight
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import Infix, lock_name, video_lock_name
-from mjrec.formats.spans import add_facts, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_metadata import is_done
 from mjrec.rendering import shared_pool

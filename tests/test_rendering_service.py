@@ -25,14 +25,14 @@ from trajectories_by_hand import write_log
 from waiting import wait_until
 
 from mjrec import Error, InvalidArgument, Monitor
-from mjrec.formats.spans import find_recording, is_in_flight, recordings_in_flight
+from mjrec.formats.in_flight import find_recording, is_in_flight, recordings_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.render_service import Progress, RenderService
 
 # A program around a service, with the directory at argv[1].
 PROGRAM = """
 import pathlib, sys
-from mjrec.formats.spans import recordings_in_flight
+from mjrec.formats.in_flight import (recordings_in_flight)
 from mjrec.rendering.render_service import RenderService
 directory = pathlib.Path(sys.argv[1])
 service = RenderService(directory, workers=1)

@@ -30,6 +30,17 @@ import mjrec.formats.span_reader as span_reader
 import mjrec.formats.span_writer as span_writer
 import mjrec.formats.spans as spans_module
 from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
+from mjrec.formats import in_flight
+from mjrec.formats.in_flight import (
+    add_facts,
+    drop_recording,
+    find_recording,
+    is_in_flight,
+    list_paths,
+    read_list,
+    recordings_in_flight,
+    remove_if_done,
+)
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import (
     Infix,
@@ -40,18 +51,7 @@ from mjrec.formats.monitor_directory import (
 from mjrec.formats.row_log import RowLogReader, tail_path
 from mjrec.formats.span_reader import SpanReader, rows_size
 from mjrec.formats.span_writer import LOOK_PREFIX, SpanLogs, SpanWriter
-from mjrec.formats.spans import (
-    add_facts,
-    append_line,
-    drop_recording,
-    find_recording,
-    is_in_flight,
-    list_paths,
-    read_list,
-    recordings_in_flight,
-    remove_if_done,
-    row_dtype,
-)
+from mjrec.formats.spans import append_line, row_dtype
 from mjrec.formats.trajectory import (
     Array,
     Field,
@@ -1113,8 +1113,8 @@ def test_a_list_whose_monitor_ends_while_it_is_looked_at_is_not_removed(
         return found
 
     for name in ("read_list", "_is_open"):
-        real = getattr(spans_module, name)
-        monkeypatch.setattr(spans_module, name, functools.partial(end_late, real))
+        real = getattr(in_flight, name)
+        monkeypatch.setattr(in_flight, name, functools.partial(end_late, real))
     remove_if_done(spans)
     check(read(logs.path_of(trajectory_prefix(INFIX, 28))), 5)
 
@@ -1139,7 +1139,7 @@ def test_whoever_finds_a_log_half_removed_has_an_error(path: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Path, "unlink", unlink)
             with pytest.raises(KeyboardInterrupt):
-                spans_module.remove_list(files_of(directory)[0])
+                in_flight.remove_list(files_of(directory)[0])
         if count == 0:
             check(read(directory / path.name), 6)
             continue
@@ -1157,7 +1157,7 @@ def test_a_log_that_is_removed_while_it_is_opened_is_an_error(
 
     def open_late(reader: SpanReader, spans: Any) -> Any:
         monkeypatch.undo()
-        spans_module.remove_list(spans.path)
+        in_flight.remove_list(spans.path)
         return reader._open_looks(spans)
 
     monkeypatch.setattr(SpanReader, "_open_looks", open_late)
@@ -1174,9 +1174,9 @@ def test_a_list_that_is_removed_meanwhile_is_passed_over(
     logs.close()
     write(logs, 5)
     first, _ = list_paths(path.parent)
-    monkeypatch.setattr(spans_module, "list_paths", lambda *_: iter([first, files[1]]))
+    monkeypatch.setattr(in_flight, "list_paths", lambda *_: iter([first, files[1]]))
     files = list(list_paths(path.parent))
-    spans_module.remove_list(first)
+    in_flight.remove_list(first)
     check(read(path), 5)
 
 

@@ -25,8 +25,8 @@ from trajectories_by_hand import add_row, new_logs
 import mjrec.formats.trajectory_file as trajectory_file
 import mjrec.formats.trajectory_hdf5 as trajectory_hdf5
 from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
+from mjrec.formats.in_flight import list_paths
 from mjrec.formats.monitor_directory import Infix, trajectory_prefix
-from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import (
     Array,
     ModelChange,

@@ -13,9 +13,9 @@ import pytest
 from trajectories_by_hand import INFIX, new_logs
 
 from mjrec.errors import FileNotWritten, PicturesDiffer
+from mjrec.formats.in_flight import recordings_in_flight
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.span_writer import SpanWriter
-from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.trajectory import (
     Array,
     RowLayout,

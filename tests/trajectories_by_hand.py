@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from mjrec.formats.in_flight import list_paths
 from mjrec.formats.manifest import Manifest, write_manifest
 from mjrec.formats.monitor_directory import (
     Infix,
@@ -22,7 +23,6 @@ from mjrec.formats.monitor_directory import (
     video_prefix,
 )
 from mjrec.formats.span_writer import SpanLogs, SpanWriter
-from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import Array, RowLayout, StateComponent, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.views import View

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DirectoryNotWritable, Error
+from ..formats.in_flight import add_facts, is_in_flight
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.manifest import Manifest, read_manifest, write_manifest
 from ..formats.monitor_directory import (
@@ -34,7 +35,7 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.pending_videos import pending_video
-from ..formats.spans import FINISHED, add_facts, is_in_flight
+from ..formats.spans import FINISHED
 from ..formats.trajectory_file import amend_trajectory, find_trajectory
 from ..formats.video_metadata import is_done
 from ..rendering.log_finishing import finish_log

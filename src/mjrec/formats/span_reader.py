@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ClosedError, UnreadableFile
+from .in_flight import find_recording, read_list
 from .json_fields import unreadable
 from .model_changes import LARGEST_CHANGE, unpack_change
 from .regular_files import open_regular
@@ -31,8 +32,6 @@ from .spans import (
     TRUNCATED,
     Recording,
     SpanList,
-    find_recording,
-    read_list,
     row_dtype,
 )
 from .trajectory import ModelChange

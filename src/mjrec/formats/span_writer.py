@@ -20,6 +20,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ..errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
+from .in_flight import remove_if_done, remove_list
 from .model_changes import pack_change
 from .monitor_directory import Infix, states_name
 from .row_log import TAIL_BYTES, RowLog
@@ -34,8 +35,6 @@ from .spans import (
     TRUNCATED,
     append_line,
     first_line,
-    remove_if_done,
-    remove_list,
     row_dtype,
 )
 from .trajectory import ModelChange, TrajectoryHeader

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
+from .in_flight import find_recording, remove_if_done
 from .json_fields import unreadable
 from .monitor_directory import Infix, trajectory_prefix
 from .regular_files import open_regular
 from .span_reader import SpanReader
-from .spans import FINISHED, find_recording, remove_if_done
+from .spans import FINISHED
 from .trajectory_hdf5 import SIGNATURE, TrajectoryHdf5Reader, write_hdf5
 from .trajectory_reader import TrajectoryReader, added_up
 

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 from ..errors import Error
-from ..formats.spans import is_in_flight
+from ..formats.in_flight import is_in_flight
 
 _NO_FAILURES: Mapping[str, str] = MappingProxyType({})
 

@@ -16,9 +16,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ..errors import Error, UnreadableFile
+from ..formats.in_flight import remove_list
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import Infix
-from ..formats.spans import remove_list
 from ..rendering.pending import EpisodeKey, claim
 from ..rendering.rendered_manifests import update_manifest
 from .known_episodes import KnownEpisodes

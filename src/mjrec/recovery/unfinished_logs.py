@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
+from ..formats.in_flight import drop_recording
 from ..formats.journal import JournalEntry
 from ..formats.monitor_directory import episode_of
-from ..formats.spans import FORMAT, drop_recording
+from ..formats.spans import FORMAT
 from ..formats.trajectory import FORMAT_VERSION
 from ..formats.trajectory_file import finish_trajectory, open_trajectory
 from ..formats.video_metadata import is_done

@@ -18,8 +18,8 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from ..errors import BlankVideo, DirectoryNotWritable, Error, GLError
+from ..formats.in_flight import drop_recording, list_paths, remove_if_done
 from ..formats.second_names import give_all_second_names
-from ..formats.spans import drop_recording, list_paths, remove_if_done
 from ..formats.trajectory_file import finish_trajectory
 from ..formats.unfinished_video import VideoFile
 from .clip_videos import render_clip

@@ -31,8 +31,8 @@ from ..child_python import (
     take_standard_output,
 )
 from ..errors import Error
+from ..formats.in_flight import find_recording
 from ..formats.span_reader import rows_size
-from ..formats.spans import find_recording
 from ..formats.trajectory_file import finish_trajectory
 from ..patience import Patience
 

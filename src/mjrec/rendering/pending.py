@@ -19,6 +19,7 @@ from typing import Any, TypeAlias
 
 from ..errors import DirectoryNotWritable
 from ..formats.frame_hashes import frame_hash_path
+from ..formats.in_flight import recordings_in_flight
 from ..formats.locks import Lock, is_locked, try_lock
 from ..formats.monitor_directory import (
     Infix,
@@ -31,7 +32,6 @@ from ..formats.monitor_directory import (
     video_lock_name,
     video_prefix,
 )
-from ..formats.spans import recordings_in_flight
 from ..formats.trajectory_file import find_trajectory
 from ..formats.video_metadata import is_done, metadata_path
 from .recorded_clips import ClipKey, PendingClip, look_at_clip, recorded_clips

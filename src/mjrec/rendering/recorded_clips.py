@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
+from ..formats.in_flight import recordings_in_flight
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
     ClipPart,
@@ -24,7 +25,6 @@ from ..formats.monitor_directory import (
     infix_of,
     lock_name,
 )
-from ..formats.spans import recordings_in_flight
 from ..formats.trajectory_reader import added_up
 from ..formats.video_metadata import is_done
 from .recorded_facts import model_file, open_for_rendering

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
+from ..formats.in_flight import find_recording
 from ..formats.journal import MOST_EPISODES, JournalEntry, read_journal
-from ..formats.spans import find_recording
 from ..formats.stats_file import StatsFile
 from .monitor_files import MonitorFiles, monitors_of
 from .numbering import NumberedEpisode, number_episodes

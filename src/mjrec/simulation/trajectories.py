@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnknownName, UnreadableFile
+from ..formats.in_flight import recordings_in_flight
 from ..formats.monitor_directory import infix_of, iter_monitor_files
-from ..formats.spans import recordings_in_flight
 from ..formats.trajectory_file import open_trajectory
 from ..formats.trajectory_reader import TrajectoryReader
 

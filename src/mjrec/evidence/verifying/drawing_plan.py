@@ -16,13 +16,14 @@ from typing import Any
 
 from ...annotation import Caption, check_annotation
 from ...errors import Error, MissingDependency, NoPictures
+from ...formats.in_flight import is_in_flight
 from ...formats.monitor_directory import (
     Infix,
     episode_of,
     infix_of,
     trajectory_prefix,
 )
-from ...formats.spans import FINISHED, is_in_flight
+from ...formats.spans import FINISHED
 from ...formats.trajectory_reader import TrajectoryReader
 from ...formats.video_metadata import StepRuns
 from ...formats.video_names import view_of
