@@ -20,7 +20,7 @@ import gymnasium
 import pytest
 from parts import parametrize
 from processes import children
-from recordings import frames_of
+from recordings import frames_of, in_flight
 from trajectories_by_hand import write_log
 from waiting import wait_until
 
@@ -32,7 +32,7 @@ from mjrec.rendering.render_service import Progress, RenderService
 # A program around a service, with the directory at argv[1].
 PROGRAM = """
 import pathlib, sys
-from mjrec.formats.in_flight import (recordings_in_flight)
+from mjrec.formats.in_flight import recordings_in_flight
 from mjrec.rendering.render_service import RenderService
 directory = pathlib.Path(sys.argv[1])
 service = RenderService(directory, workers=1)
@@ -152,7 +152,7 @@ def test_a_video_that_is_expected_finds_its_workers(
     [server] = children() - others
     wait_until(lambda: len(children(server)) == 2)
     workers = children(server)
-    for log in sorted(recorded.glob("*.log")):
+    for log in in_flight(recorded):
         service.expect()
         service.submit(log)
         service.wait()
@@ -258,7 +258,7 @@ def test_one_worker_beside_a_simulation_uses_one_cpu(
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     others = children()
     service = start(recorded, workers=1)
-    for log in recorded.glob("*.log"):
+    for log in in_flight(recorded):
         service.submit(log)
     wait_until(stuck_encoder.exists)
     [server] = children() - others
