@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -364,14 +365,18 @@ class TrajectoryRecorder:
     def _measured_pace(self) -> dict[str, Any]:
         """Measure the time of a step over the first one, and choose the stride."""
         elapsed = _difference(self._first_time, self._pace.clock())
-        rate = rate_from_timestep(elapsed) if elapsed else self._pace.declared()
-        self._stride = stride_for(rate, self._pace.max_fps)
+        rate = _rate_of(elapsed) if elapsed else self._pace.declared()
+        self._stride = _stride_for(rate, self._pace.max_fps)
         return {
             "rate": str(rate),
             "timestep": str(1 / rate) if elapsed else None,
             "stride": self._stride,
         }
 
+
+# Of the same few steps in each episode; fractions take Python long.
+_rate_of = functools.lru_cache(maxsize=64)(rate_from_timestep)
+_stride_for = functools.lru_cache(maxsize=64)(stride_for)
 
 _NOTHING = EpisodeStart(state=(), snapshot=RowLayout(), model={}, scene=None)
 

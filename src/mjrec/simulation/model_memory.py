@@ -85,6 +85,10 @@ class ModelMemory:
         # For the comparison at every captured step, which is one of two lists.
         self.seen = [piece.seen for piece in self._light]
         self.present = [piece.raw for piece in self._light]
+        # For that at every reset, likewise.
+        self._stored = [piece.stored for piece in pieces]
+        self._whole = [piece.raw for piece in pieces]
+        self._is_as_stored = True
 
     def is_of(self, model: mujoco.MjModel) -> bool:
         """Tell whether `model` is the model remembered, in whatever wrapper."""
@@ -96,8 +100,11 @@ class ModelMemory:
 
         What is there now counts as seen.
         """
+        if self._is_as_stored and self._stored == self._whole:
+            return {}
         pieces = [*self._light, *self._heavy]
         names = [name for piece in pieces for name in piece.look_from_stored()]
+        self._is_as_stored = not names
         return read_fields(self.model, names)
 
     def is_unchanged(self) -> bool:
@@ -117,6 +124,7 @@ class ModelMemory:
         return self._looked_at([*self._light, *self._heavy])
 
     def _looked_at(self, pieces: Iterable[_Piece]) -> dict[str, NDArray[Any]] | None:
+        self._is_as_stored = False
         names = [name for piece in pieces for name in piece.look()]
         return read_fields(self.model, names) or None
 
@@ -134,17 +142,17 @@ class _Piece:
         self.is_watched = is_watched
         self.raw = memory.raw
         self._memory = memory
-        self._stored = memory.copy()
-        self.seen = memory.copy() if is_watched else self._stored
+        self.stored = memory.copy()
+        self.seen = memory.copy() if is_watched else self.stored
 
     def look_from_stored(self) -> list[str]:
         """Return the names of what is other than when this was made."""
-        if self._stored == self.raw:
-            if self.seen != self._stored:
-                self._see(self._stored)
+        if self.stored == self.raw:
+            if self.seen != self.stored:
+                self._see(self.stored)
             return []
         self._see(self._memory.copy())
-        return self._memory.differing(self._stored)
+        return self._memory.differing(self.stored)
 
     def look(self) -> list[str]:
         """Return the names of what has changed since the last look."""
