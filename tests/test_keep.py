@@ -190,6 +190,17 @@ def test_bytes_that_were_held_are_those_of_the_logs(tmp_path: Path) -> None:
     assert 2 * min(sizes) <= most <= 2 * max(sizes)
 
 
+def test_disk_holds_no_more_candidates_than_may_be_chosen(tmp_path: Path) -> None:
+    """Three and the running one, however long the run is; each goes when it is out."""
+    returns = [1 + (7 * number) % 5 for number in range(150)]
+    with mjrec.Monitor(pendulum(returns), tmp_path, keep="worst:3", workers=0) as env:
+        for _ in returns:
+            run(env, 1)
+            assert len(list(tmp_path.glob("*.spans"))) <= 4
+            assert len(list(tmp_path.glob("openaigym.states.*"))) <= 4 * 3
+    assert len(h5_of(tmp_path)) == 3
+
+
 def test_failures_are_what_the_environment_calls_so(tmp_path: Path) -> None:
     """Decided at the end of each; after so many no states are recorded any more."""
     success = [True, False, True, False, False, True, False, False]
