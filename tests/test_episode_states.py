@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import dataclasses
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -409,7 +410,9 @@ def _recorded_and_live(simulation: Simulation, pictures: int) -> None:
     """Compare scenes that stay, picture by picture: a live and a recorded one."""
     start = simulation.begin()
     assert start.scene is not None
-    live_view = simulation.view().detached()
+    own = simulation.view()
+    camera, option = copy.copy(own.camera), copy.copy(own.option)
+    live_view = dataclasses.replace(own, camera=camera, option=option)
     live = mujoco.MjvScene(simulation.model, maxgeom=100)
     view = scene_view_from_facts(start.scene)
     model = copy.copy(simulation.model)

@@ -215,11 +215,6 @@ class Recorder:
         """Whether the episode is over; None before the first reset."""
         return self.stats_recorder.done
 
-    @property
-    def wants_observations(self) -> bool:
-        """Whether observations are recorded."""
-        return self._options.observations
-
     def set_mode(self, mode: str | None) -> None:
         """Set the type of the episodes from the next reset on.
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -66,18 +65,6 @@ class SceneView:
             "label": self.label,
             "previous_cameras": None,
         }
-
-    def detached(self) -> SceneView:
-        """Return the same view with a camera and an option of its own."""
-        return SceneView(
-            camera=copy.copy(self.camera),
-            option=copy.copy(self.option),
-            max_geom=self.max_geom,
-            fresh=self.fresh,
-            height=self.height,
-            width=self.width,
-            label=self.label,
-        )
 
 
 def scene_view_from_facts(facts: Mapping[str, Any]) -> SceneView:
