@@ -121,7 +121,7 @@ def find_recording(path: Path) -> Recording | None:
         try:
             recording = read_list(each).recordings.get(name)
         except UnreadableFile as error:
-            # Where it was removed just now, nobody needs what it was about.
+            # A list that was removed just now had nothing in flight.
             damage = error if os.path.lexists(each) else damage
             continue
         if recording is not None and not recording.is_dropped:
@@ -129,6 +129,18 @@ def find_recording(path: Path) -> Recording | None:
     if found is None and damage is not None:
         raise damage
     return found
+
+
+def get_recording(path: Path) -> Recording:
+    """Return a recording that is not dropped, by the path of its file.
+
+    Raises:
+        UnreadableFile: there is none, or a list cannot be read.
+    """
+    recording = find_recording(path)
+    if recording is None:
+        raise UnreadableFile(path, "there is no such file, and no log of it")
+    return recording
 
 
 def is_in_flight(path: Path) -> bool:
@@ -156,12 +168,12 @@ def add_facts(path: Path, facts: Mapping[str, Any]) -> None:
         UnreadableFile: there is no such recording.
         FileNotWritten: the disk is full; nothing was added.
     """
-    recording = _found(path)
+    recording = get_recording(path)
     append_line(recording.spans.path, {"note": recording.name, "facts": dict(facts)})
 
 
 def drop_recording(path: Path) -> None:
-    """Let nobody need the rows of a recording any more; one that is not there is fine.
+    """Give up the rows of a recording; it is no error where there are none.
 
     Raises:
         FileNotWritten: the disk is full.
@@ -174,7 +186,7 @@ def drop_recording(path: Path) -> None:
 
 
 def remove_if_done(path: Path) -> None:
-    """Remove a list and its logs, if nobody needs them and no row is added any more.
+    """Remove a list and its logs once the log is closed and nothing is in flight.
 
     Raises:
         DirectoryNotWritable: they cannot be removed.
@@ -198,19 +210,12 @@ def remove_list(path: Path) -> None:
     """
     log = path.with_suffix(LOG)
     try:
-        # The log first: whoever has not opened it does not find half of the rest. The
-        # list last: without it nobody would find the others.
+        # The log first, so that no reader opens it without the rest; the list last,
+        # because the others are found through it.
         for each in (log, tail_path(log), path.with_suffix(LOOKS), path):
             each.unlink(missing_ok=True)
     except OSError as error:
         raise DirectoryNotWritable(path.parent, error) from error
-
-
-def _found(path: Path) -> Recording:
-    recording = find_recording(path)
-    if recording is None:
-        raise UnreadableFile(path, "there is no such file, and no log of it")
-    return recording
 
 
 def _is_open(path: Path) -> bool:
@@ -218,5 +223,5 @@ def _is_open(path: Path) -> bool:
     try:
         return infix is not None and is_locked(path.parent / lock_name(infix))
     except OSError:
-        # Nobody knows.
+        # Unknown: leave its files alone.
         return True

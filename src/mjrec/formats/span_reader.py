@@ -17,8 +17,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ClosedError, UnreadableFile
-from .in_flight import find_recording, read_list
+from ..errors import ClosedError
+from .in_flight import get_recording, read_list
 from .json_fields import unreadable
 from .model_changes import LARGEST_CHANGE, unpack_change
 from .regular_files import open_regular
@@ -61,9 +61,7 @@ class SpanReader(TrajectoryReader):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        recording = find_recording(path)
-        if recording is None:
-            raise UnreadableFile(path, "there is no such file, and no log of it")
+        recording = get_recording(path)
         spans = recording.spans
         assert spans.header is not None
         self._log = spans.log
@@ -151,7 +149,7 @@ class SpanReader(TrajectoryReader):
 
     def _snapshots(self, start: int, stop: int) -> NDArray[np.uint8]:
         snapshots = self._column("snapshot", self._frame_rows[start:stop])
-        # What MuJoCo has between its arrays is nobody's.
+        # Padding holds whatever lies between MuJoCo's arrays.
         snapshots[:, self.header.snapshot.padding] = 0
         return snapshots
 

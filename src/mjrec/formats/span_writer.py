@@ -48,7 +48,7 @@ ROW_HEAD = struct.Struct("=qqdQ")
 
 
 class SpanLogs:
-    """The logs of one monitor, of which one at a time is written.
+    """The logs of one monitor; one is written at a time.
 
     Args:
         directory: the monitor directory.
@@ -201,7 +201,7 @@ class OpenLog:
         self._look_size += len(record)
 
     def close(self) -> None:
-        """Write the last rows, and remove all if nobody needs it any more.
+        """Write the last rows, and remove the files if nothing is in flight.
 
         Raises:
             FileNotWritten: the disk is full; the next call tries again.
@@ -211,7 +211,7 @@ class OpenLog:
             self.say(closed=True)
         except FileNotWritten:
             if not self.path.exists():
-                # Somebody has removed the directory; there is nothing to try again.
+                # The directory was removed; there is nothing to try again.
                 self.release()
             raise
         self.release()

@@ -100,7 +100,7 @@ class Recording:
         row: its first.
         look: where to look for its changes of the model.
         stop: the row behind its last; None where it has not ended.
-        is_dropped: nobody needs it any more.
+        is_dropped: its rows were given up.
     """
 
     name: str
