@@ -37,7 +37,7 @@ from .pending import (
 )
 from .pool import WorkerPool
 from .progress import Progress
-from .recorded_clips import PendingClip
+from .recorded_clips import ClipKey, PendingClip
 from .shared_pool import SharedPool
 from .videos import render_video
 
@@ -113,10 +113,10 @@ def note_failure(directory: Path, name: str, reason: str) -> None:
 
     Args:
         directory: the monitor directory.
-        name: of the video; nothing is said of other files.
+        name: of the video, or of a clip's first part; nothing is said of other files.
         reason: why.
     """
-    if name.endswith(".mp4"):
+    if name.endswith(".mp4") or ClipKey.of(name) is not None:
         note_failure_of(directory / name, reason)
 
 
