@@ -207,7 +207,7 @@ def test_what_was_recovered_stands_in_the_manifest(
     details.pop("surroundings")
     assert details == {
         "format_version": 1,
-        "schedule": {"name": "<lambda>", "recorded": [0, 1, 2]},
+        "schedule": {"name": "monitor.<locals>.<lambda>", "recorded": [0, 1, 2]},
         "first_episode_id": 0,
         "next_episode_id": 3,
         "pending": [],
@@ -224,7 +224,7 @@ def test_deferred_episodes_become_trajectories_and_stay_pending(
     """The one in flight too, marked as killed; rendered, it shows what was recorded."""
     directory = killed(
         "env = cheetah(workers=0)\nrun(env)\nrun(env, 6)\n"
-        "env._recorder._states.finish()\ndie()"
+        "env._recorder._subject.states.finish()\ndie()"
     )
     before = results_of(directory)
     mjrec.recover(directory)

@@ -17,7 +17,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from ..errors import BlankVideo, DirectoryNotWritable, Error, GLError
+from ..errors import (
+    BlankVideo,
+    DirectoryNotWritable,
+    Error,
+    FileNotWritten,
+    GLError,
+)
 from ..formats.in_flight import drop_recording, list_paths, remove_if_done
 from ..formats.pending_videos import forget_failure
 from ..formats.pending_videos import note_failure as note_failure_of
@@ -85,10 +91,17 @@ def finish_pending(
     ) as finisher:
         for key in keys:
             finisher.add(key)
+        has_failed = False
         while finisher:
             _, outcome = finisher.finish_next()
+            has_failed = has_failed or outcome.failure is not None
             yield outcome
-    bring_up_to_date(directory)
+    try:
+        bring_up_to_date(directory)
+    except FileNotWritten:
+        # On a full disk, what failed has said so; the manifest comes with the next try.
+        if not has_failed:
+            raise
 
 
 def bring_up_to_date(directory: Path) -> None:
