@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from ..annotation import Caption
-from ..errors import NoPictures, PicturesDiffer
 from ..formats.monitor_directory import (
     Infix,
     clip_video_prefix,
@@ -29,10 +28,10 @@ from .opening import OpenDirectory
 from .options import LIVE, RecorderOptions
 from .run_journal import RunJournal
 from .stats_recorder import StatsRecorder
-from .subject import EpisodePictures, Subject, what_is_missing
+from .subject import EpisodePictures, Subject, check_refusal
 from .trajectory_recorder import Pace
 from .versions import versions
-from .video_recorder import VideoRecorder, can_give_pictures
+from .video_recorder import VideoRecorder
 
 logger = logging.getLogger(__name__)
 
@@ -155,27 +154,16 @@ class MonitoredRun:
         Why not is said once.
 
         Raises:
-            PicturesDiffer: they cannot, and nothing else was asked for.
-            NoPictures: they cannot, nor can they be drawn live.
+            PicturesDiffer, NoPictures: as `check_refusal`.
         """
-        if start.refusal is None:
+        refusal = start.refusal
+        if refusal is None:
             return True
-        subject = self.subject
-        if subject.rendering.is_forced:
-            raise PicturesDiffer(
-                f"The videos of {subject.env_id} were to be rendered later, from "
-                f'recorded states, and cannot be: {start.refusal}. Use render="live".'
-            )
-        if not can_give_pictures(subject.pictures):
-            raise NoPictures(
-                f"The videos of {subject.env_id} cannot be rendered from its states: "
-                f"{start.refusal}. They cannot be drawn live either: "
-                f"{what_is_missing(subject.pictures)}."
-            )
-        if start.refusal not in self._said:
-            self._said.add(start.refusal)
+        check_refusal(self.subject, refusal)
+        if refusal not in self._said:
+            self._said.add(refusal)
             logger.warning(
-                "The videos of %s are drawn live: %s.", subject.env_id, start.refusal
+                "The videos of %s are drawn live: %s.", self.subject.env_id, refusal
             )
         return False
 
