@@ -36,9 +36,12 @@ from ..formats.monitor_directory import (
 )
 from ..formats.pending_videos import pending_video
 from ..formats.spans import FINISHED
-from ..formats.trajectory_file import amend_trajectory, find_trajectory
+from ..formats.trajectory_file import (
+    amend_trajectory,
+    find_trajectory,
+    finish_trajectory,
+)
 from ..formats.video_metadata import is_done
-from ..rendering.log_finishing import finish_log
 from ..rendering.pending import EpisodeKey, claim, recorded_episodes
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.rendered_manifests import update_manifest
@@ -139,7 +142,7 @@ def finish_logs(folder: Path, monitor: str) -> None:
         path = folder / f"{key.trajectory_name}{FINISHED}"
         if is_in_flight(path):
             with _claimed(folder, key):
-                finish_log(path)
+                finish_trajectory(path)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,7 +222,7 @@ def _settle_episode(folder: Path, key: EpisodeKey, verdicts: _Verdicts) -> bool:
         amend(path, verdict)
         facts.update(verdict)
     if is_in_flight(path):
-        finish_log(path)
+        finish_trajectory(path)
     return bool(facts.get("video"))
 
 

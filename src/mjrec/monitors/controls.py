@@ -252,9 +252,9 @@ def _note_last_error(recorder: Recorder) -> None:
 
 def _finish_log(log: Path) -> None:
     # Not at the top: it loads h5py, which the simulation has no use for.
-    from ..rendering.log_finishing import finish_log
+    from ..formats.trajectory_file import finish_trajectory
 
-    finish_log(log)
+    finish_trajectory(log)
 
 
 def _close(

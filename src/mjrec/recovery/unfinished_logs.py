@@ -15,7 +15,6 @@ from ..formats.trajectory import FORMAT_VERSION
 from ..formats.trajectory_file import finish_trajectory, open_trajectory
 from ..formats.video_metadata import is_done
 from ..json_text import loads
-from ..rendering.log_finishing import finish_log
 from ..rendering.videos import video_path
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
@@ -37,7 +36,7 @@ def finish_log_of_dead(path: Path, known: KnownEpisodes) -> RecoveredFile | None
 
     Raises:
         UnreadableFile: it may not be read; it stays.
-        Error: as `finish_log`.
+        Error: as `finish_trajectory`.
     """
     if path.exists():
         return None
@@ -50,12 +49,12 @@ def finish_log_of_dead(path: Path, known: KnownEpisodes) -> RecoveredFile | None
     number = episode_of(path.name)
     entry = None if number is None else known.entry(number)
     if "complete" in facts:
-        path = finish_log(path)
+        path = finish_trajectory(path)
     elif entry is not None and entry.length == steps:
         # All of it is there but the last words.
         path = finish_trajectory(path, facts=_ending(entry))
     else:
-        path = finish_log(path)
+        path = finish_trajectory(path)
         return RecoveredFile(path.name, f"{_count(steps)}, incomplete: killed")
     return RecoveredFile(path.name, _count(steps))
 
