@@ -23,8 +23,8 @@ import mjrec
 from mjrec.commands import main
 from mjrec.formats.in_flight import add_facts, drop_recording
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.rendering.finishing import finish_pending
-from mjrec.rendering.pending import key_of, look_at, recordings
+from mjrec.rendering import finish as module
+from mjrec.rendering.recordings import key_of, look_at, recordings
 
 
 class Blinking(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -87,7 +87,7 @@ def record(directory: Path, env: Any, steps: int, **options: Any) -> None:
 
 def finish(directory: Path) -> list[Any]:
     """Render what is pending."""
-    return list(finish_pending(directory, recordings(directory), workers=1))
+    return list(module.finish(directory, recordings(directory), workers=1))
 
 
 def parts(directory: Path) -> list[str]:
@@ -415,7 +415,7 @@ def test_a_clip_is_written_at_the_rate_that_was_asked_for(tmp_path: Path) -> Non
         fps=12,
         max_fps=62.5,
     )
-    assert not next(finish_pending(tmp_path, recordings(tmp_path), workers=1)).failure
+    assert not finish(tmp_path)[0].failure
     [about] = told(tmp_path)
     assert about["frame_count"] == 5
     assert about["fps"] == "12"

@@ -12,9 +12,8 @@ from ..errors import UnreadableFile
 from ..formats.journal import MOST_EPISODES
 from ..formats.pending_videos import pending_clip
 from ..formats.video_metadata import is_done
-from ..rendering.recorded_clips import ClipKey, clip_parts
-from ..rendering.recorded_facts import open_for_rendering
-from ..rendering.videos import video_path
+from ..rendering.recorded_facts import open_for_rendering, video_path
+from ..rendering.recordings import RecordingKey, key_of, parts_of
 from .remains import Remains
 
 _END = ".meta.json"
@@ -26,7 +25,7 @@ def pending_clips(remains: Remains) -> list[dict[str, Any]]:
 
     One that cannot be read is named by nobody; whoever renders the directory says so.
     """
-    keys = {ClipKey.of(path.name) for path in remains.clip_parts}
+    keys = {key_of(path.name) for path in remains.clip_parts}
     clips = (_pending(remains.directory, key) for key in keys if key is not None)
     return sorted(
         (clip for clip in clips if clip is not None), key=lambda clip: clip["clip"]
@@ -44,8 +43,8 @@ def last_clip_episode(remains: Remains) -> int:
     return max((_episode_of(path) for path in remains.clip_parts), default=-1)
 
 
-def _pending(directory: Path, key: ClipKey) -> dict[str, Any] | None:
-    parts = clip_parts(directory, key)
+def _pending(directory: Path, key: RecordingKey) -> dict[str, Any] | None:
+    parts = parts_of(directory, key)
     if not parts:
         return None
     try:

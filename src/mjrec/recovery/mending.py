@@ -19,7 +19,7 @@ from ..errors import Error, UnreadableFile
 from ..formats.in_flight import remove_list
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import Infix
-from ..rendering.pending import EpisodeKey, claim
+from ..rendering.recordings import claim, key_of
 from ..rendering.rendered_manifests import update_manifest
 from .known_episodes import KnownEpisodes
 from .live_videos import finish_video
@@ -136,7 +136,7 @@ class Mending:
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
         """Hold the lock of a file's episode; False where somebody keeps it."""
-        key = EpisodeKey.of(path.name) or EpisodeKey.of(_final_name(path.name))
+        key = key_of(path.name) or key_of(_final_name(path.name))
         if key is None:
             yield True
             return

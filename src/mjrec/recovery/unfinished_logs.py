@@ -15,7 +15,7 @@ from ..formats.trajectory import FORMAT_VERSION
 from ..formats.trajectory_file import finish_trajectory, open_trajectory
 from ..formats.video_metadata import is_done
 from ..json_text import loads
-from ..rendering.videos import video_path
+from ..rendering.recorded_facts import video_path
 from .known_episodes import KnownEpisodes
 from .report import RecoveredFile
 

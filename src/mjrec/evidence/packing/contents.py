@@ -39,8 +39,8 @@ from ...formats.monitor_directory import (
 )
 from ...formats.regular_files import regular_path
 from ...recovery.remains import Remains, has_work, is_open, remains_of
-from ...rendering.pending import look_at, recordings
 from ...rendering.recorded_facts import open_for_rendering
+from ...rendering.recordings import look_at, recordings
 from ...results import iter_episodes
 from ...results.monitor_files import monitors_of
 

@@ -20,7 +20,7 @@ from trajectories_by_hand import write_log
 
 import mjrec
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
-from mjrec.rendering.recorded_pictures import chosen_frames
+from mjrec.rendering.recorded_frames import chosen_frames
 
 SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS
 SIZE: dict[str, Any] = {"height": HEIGHT, "width": WIDTH}
