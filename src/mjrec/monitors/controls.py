@@ -21,7 +21,7 @@ from ..recorder.recorder import Recorder
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.subject import Subject
 from ..recorder.video_recorder import VideoRecorder
-from ..rendering.render_service import RenderService
+from ..rendering.background import Background
 from ..simulation.inside import simulation_time
 from .cameras import CameraPictures
 from .lifetime import MonitorLifetime
@@ -238,9 +238,7 @@ class MonitorControls(MonitorLifetime):
 def _rendering(options: RecorderOptions) -> Callable[[Path], Finisher] | None:
     if options.workers == 0:
         return None
-    return functools.partial(
-        RenderService, workers=options.workers, strict=options.strict
-    )
+    return functools.partial(Background, workers=options.workers, strict=options.strict)
 
 
 def _note_last_error(recorder: Recorder) -> None:

@@ -33,9 +33,8 @@ from ..results.sources import MonitorResults
 from .cut_texts import finish_text
 from .cut_videos import finish_video
 from .known_episodes import KnownEpisodes
-from .pending import EpisodeKey, claim
-from .recorded_clips import ClipKey, clip_parts
-from .recorded_facts import open_for_rendering
+from .recorded_facts import open_for_rendering, video_path
+from .recordings import claim, key_of, parts_of
 from .recovery_report import RecoveredFile
 from .remains import (
     Remains,
@@ -44,7 +43,6 @@ from .remains import (
     model_leftovers,
     unfinished_logs,
 )
-from .videos import video_path
 
 logger = logging.getLogger(__name__)
 
@@ -175,7 +173,7 @@ class DeadMonitors:
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
         """Hold the lock of a file's episode; False where somebody keeps it."""
-        key = EpisodeKey.of(path.name) or EpisodeKey.of(_final_name(path.name))
+        key = key_of(path.name) or key_of(_final_name(path.name))
         if key is None:
             yield True
             return
@@ -271,11 +269,11 @@ def _missing_clips(remains: Remains) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
     One that cannot be read is left out; whoever renders the directory hears of it.
     """
-    keys = {ClipKey.of(path.name) for path in remains.clip_parts}
+    keys = {key_of(path.name) for path in remains.clip_parts}
     for key in keys - {None}:
         assert key is not None
         with contextlib.suppress(UnreadableFile, IndexError):
-            parts = clip_parts(remains.directory, key)
+            parts = parts_of(remains.directory, key)
             facts, last = _facts_of(parts[0]), _facts_of(parts[-1])
             yield (
                 "clip",
