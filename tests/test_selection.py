@@ -81,39 +81,23 @@ def with_rewards(rewards: Sequence[float]) -> list[FinishedEpisode]:
     return [episode(3 + 2 * k, reward) for k, reward in enumerate(rewards)]
 
 
-@given(some_rewards, st.integers(1, 5))
-def test_worst_are_those_with_fewer_than_n_before_them(
-    rewards: list[float], count: int
+@given(some_rewards, st.integers(1, 5), st.sampled_from(["best", "worst"]))
+def test_chosen_are_those_with_fewer_than_n_before_them(
+    rewards: list[float], count: int, kind: str
 ) -> None:
-    """Before an episode stand the worse ones, and the earlier of equal ones."""
+    """Before one stand the worse (better) ones and earlier equal ones; NaN is worst."""
     episodes = with_rewards(rewards)
-    assert chosen(f"worst:{count}", episodes) == [
+
+    def is_before(one: FinishedEpisode, other: FinishedEpisode) -> bool:
+        one_first, other_first = worse(one, other), worse(other, one)
+        if one_first == other_first:
+            return one.episode_id < other.episode_id
+        return one_first == (kind == "worst")
+
+    assert chosen(f"{kind}:{count}", episodes) == [
         this.episode_id
         for this in episodes
-        if sum(
-            worse(other, this)
-            or (not worse(this, other) and other.episode_id < this.episode_id)
-            for other in episodes
-        )
-        < count
-    ]
-
-
-@given(some_rewards, st.integers(1, 5))
-def test_best_are_those_with_fewer_than_n_before_them(
-    rewards: list[float], count: int
-) -> None:
-    """The same, the other way round; NaN is still the worst."""
-    episodes = with_rewards(rewards)
-    assert chosen(f"best:{count}", episodes) == [
-        this.episode_id
-        for this in episodes
-        if sum(
-            worse(this, other)
-            or (not worse(other, this) and other.episode_id < this.episode_id)
-            for other in episodes
-        )
-        < count
+        if sum(is_before(other, this) for other in episodes) < count
     ]
 
 
@@ -185,7 +169,7 @@ def test_an_episode_may_be_told_of_twice(rewards: list[float], rule: str) -> Non
 
 
 def test_failures_are_decided_at_once() -> None:
-    """And after the last of so many nothing can be chosen any more."""
+    """And after the last of N nothing can be chosen any more."""
     selection = selection_from("failures:1")
     selection.add(episode(0, terminated=False))
     assert selection.standing(0) is Standing.DROPPED
@@ -196,7 +180,7 @@ def test_failures_are_decided_at_once() -> None:
     assert selection.chosen == [1]
 
 
-def test_function_gets_the_finished_episodes() -> None:
+def test_a_function_gets_the_finished_episodes() -> None:
     """All of them, in their order, once; NumPy's numbers will do."""
     calls = []
 
@@ -205,9 +189,7 @@ def test_function_gets_the_finished_episodes() -> None:
         return np.array([4, 0])
 
     selection = told(longest, [episode(k) for k in range(5)])
-    assert selection.name == f"{test_function_gets_the_finished_episodes.__name__}" + (
-        ".<locals>.longest"
-    )
+    assert selection.name.endswith("finished_episodes.<locals>.longest")
     assert {selection.standing(k) for k in range(5)} == {Standing.CANDIDATE}
     selection.close()
     selection.close()
@@ -217,7 +199,6 @@ def test_function_gets_the_finished_episodes() -> None:
 
 
 def no_function(episodes: Sequence[FinishedEpisode]) -> Any:
-    """Raise."""
     raise ZeroDivisionError("of the user")
 
 
@@ -233,7 +214,7 @@ def no_function(episodes: Sequence[FinishedEpisode]) -> Any:
         (lambda episodes: episodes[:1], "TypeError"),
     ],
 )
-def test_function_that_cannot_choose_is_named(
+def test_a_function_that_cannot_choose_is_named(
     keep: Callable[..., Any], what: str
 ) -> None:
     """And nothing is decided, so that nothing needs to be deleted."""
@@ -250,42 +231,44 @@ def test_without_episodes_nothing_is_chosen(rule: str) -> None:
     assert chosen(rule, []) == []
 
 
-@pytest.mark.parametrize("keep", ["wurst:3", "", "median:2", "best-3", ":3", "all"])
-def test_unknown_rule_is_told_which_there_are(keep: str) -> None:
-    """The names as they are to be written."""
-    with pytest.raises(UnknownName, match=r"best:N, worst:N, failures.* median"):
-        selection_from(keep)
-
-
 @pytest.mark.parametrize(
-    "keep",
-    ["worst", "worst:", "worst:0", "best:-1", "best:x", "failures:0", "worst:1.5"],
+    ("keeps", "error", "what"),
+    [
+        (
+            ["wurst:3", "", "median:2", "best-3", ":3", "all", "undecided"],
+            UnknownName,
+            r"best:N, worst:N, failures.* median",
+        ),
+        (
+            [
+                "worst",
+                "worst:",
+                "worst:0",
+                "best:-1",
+                "best:x",
+                "failures:0",
+                "worst:1.5",
+            ],
+            InvalidArgument,
+            "1 or more",
+        ),
+        ([3, True, ["worst:3"], b"worst:3"], InvalidArgument, "must be one of best:N"),
+    ],
 )
-def test_rule_without_a_number_of_episodes(keep: str) -> None:
-    """The error says where it stands."""
-    with pytest.raises(InvalidArgument, match="1 or more"):
-        selection_from(keep)
-
-
-@pytest.mark.parametrize("keep", [3, True, ["worst:3"], b"worst:3"])
-def test_what_is_neither_text_nor_function(keep: Any) -> None:
-    """Is an error that lists the rules."""
-    with pytest.raises(InvalidArgument, match="must be one of best:N"):
-        selection_from(keep)
+def test_what_is_no_rule_is_an_error(
+    keeps: list[Any], error: type[Exception], what: str
+) -> None:
+    """It lists the rules as they are to be written."""
+    for keep in keeps:
+        with pytest.raises(error, match=what):
+            selection_from(keep)
 
 
 def test_what_is_decided_elsewhere_stays_open() -> None:
     """All are candidates, also when there are no more."""
-    episodes = [episode(number, float(number)) for number in range(3)]
-    selection = told(UNDECIDED, episodes)
+    selection = told(UNDECIDED, [episode(number, float(number)) for number in range(3)])
     selection.close()
     assert selection.is_left_open
     assert selection.undecided == 3
     assert {selection.standing(n) for n in range(3)} == {Standing.CANDIDATE}
     assert selection.chosen == []
-
-
-def test_no_text_of_a_users_leaves_it_open() -> None:
-    """Whoever gives a rule gets a decision."""
-    with pytest.raises(UnknownName):
-        selection_from("undecided")
