@@ -259,16 +259,6 @@ def test_clips_wait_to_be_rendered(
     assert not finish(tmp_path)
 
 
-@pytest.mark.thorough
-def test_a_clip_that_runs_at_close_is_as_long_as_it_is(tmp_path: Path) -> None:
-    """It says that it is shorter than asked for, and why."""
-    record(tmp_path, hopper(), 7, step_trigger=lambda step: step == 4, video_length=99)
-    [about] = metadata_in(tmp_path)
-    assert (about["complete"], about["reason"]) == (False, "close")
-    assert (about["length"], about["frame_count"]) == (3, 5)
-    assert len(mjrec.load_results(tmp_path)["videos"]) == 1
-
-
 def test_a_running_clip_is_not_rendered(tmp_path: Path) -> None:
     """It may go on, also between two episodes; its video's name finds it."""
     with mjrec.Monitor(hopper(), tmp_path, **CLIP) as monitor:

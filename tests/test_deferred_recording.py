@@ -8,7 +8,6 @@ import copy
 import gc
 import hashlib
 import itertools
-import json
 import logging
 import os
 import shutil
@@ -415,23 +414,6 @@ def test_a_plugin_that_draws_is_recorded_live_or_refused(
 # --- frames --------------------------------------------------------------------------
 
 
-def test_same_pixels_as_the_environment_shows(tmp_path: Path) -> None:
-    """Every frame is that of `env.render()` at that moment."""
-    env = make("HalfCheetah-v5", render_mode="rgb_array")
-    env.reset(seed=0)
-    env.action_space.seed(0)
-    frames = [env.render()]
-    for _ in range(3):
-        env.step(env.action_space.sample())
-        frames.append(env.render())
-    env.close()
-    with mjrec.Monitor(make("HalfCheetah-v5"), tmp_path, workers=0) as env:
-        steps(env, 3)
-    [path] = tmp_path.glob("*.h5")
-    for shown, later in zip(frames, mjrec.render(path), strict=True):
-        np.testing.assert_array_equal(shown, later)
-
-
 # Takes more than five seconds: the same video by several numbers of workers.
 def test_a_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
     """One worker or three."""
@@ -444,22 +426,6 @@ def test_a_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
         hashes.add(hashlib.sha256(video.read_bytes()).hexdigest())
         hashes.add(metadata_of(directory, 0)["file_sha256"])
     assert len(hashes) == 1
-
-
-# Takes more than five seconds: frames enough for all workers.
-def test_one_episode_uses_all_workers(tmp_path: Path) -> None:
-    """Its frames come in order, drawn by as many processes as were asked for."""
-    with mjrec.Monitor(make("Hopper-v5"), tmp_path, workers=0) as env:
-        steps(env, 12)
-    [path] = tmp_path.glob("*.h5")
-    before = children()
-    frames = mjrec.render(path, workers=2)
-    first = [next(frames) for _ in range(6)]
-    assert len(children() - before) == 2
-    one_by_one = [*first, *frames]
-    for frame, same in zip(one_by_one, mjrec.render(path), strict=True):
-        np.testing.assert_array_equal(frame, same)
-    assert children() == before
 
 
 def test_what_changes_in_the_model_shows(tmp_path: Path) -> None:
@@ -504,23 +470,6 @@ def test_no_opengl_in_the_simulation(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout == "[]\n"
     assert len(frames_in(tmp_path, 0)) == 2
-
-
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Humanoid-v5"])
-def test_recording_does_not_disturb(env_id: str, tmp_path: Path) -> None:
-    """Observations, rewards, states and random numbers are bit for bit the same."""
-
-    def run(env: Any) -> list[Any]:
-        seen = []
-        for seed in (3, None):
-            seen.append(env.reset(seed=seed)[0])
-            env.action_space.seed(1)
-            for _ in range(5):
-                observation, reward, *_ = env.step(env.action_space.sample())
-                seen += [observation, reward, env.unwrapped.data.qacc_warmstart.copy()]
-        return [np.asarray(value).tobytes() for value in seen]
-
-    assert run(make(env_id)) == run(monitored(make(env_id), tmp_path, workers=0))
 
 
 def test_model_and_data_may_be_replaced_and_deleted(tmp_path: Path) -> None:
@@ -599,20 +548,3 @@ def test_works_in_a_script_without_a_main_guard(tmp_path: Path) -> None:
     """Workers never import the user's main module."""
     assert run_file(SCRIPT + "print('once')\nenv.close()\n", tmp_path) == "once\n"
     assert len(list((tmp_path / "out").glob("*.mp4"))) == 1
-
-
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_forked_child_gets_an_error(tmp_path: Path) -> None:
-    """The monitor belongs to the process that made it; nothing hangs."""
-    with mjrec.Monitor(make(), tmp_path, workers=1) as env:
-        steps(env, 1)
-        pid = os.fork()
-        if pid == 0:
-            try:
-                env.step(np.zeros(1))
-            except mjrec.Error as error:
-                (tmp_path / "told.json").write_text(json.dumps(str(error)))
-            os._exit(0)
-        assert os.waitpid(pid, 0)[1] == 0
-    assert "forked" in json.loads((tmp_path / "told.json").read_text())
-    assert videos_in(tmp_path) == [0]

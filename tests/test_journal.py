@@ -6,11 +6,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import random
-import signal
-import subprocess
-import sys
+import re
 import threading
-import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -62,27 +59,25 @@ def changed(**facts: Any) -> JournalEntry:
     return dataclasses.replace(ENTRY, **facts)
 
 
+def read(path: Path) -> list[JournalEntry]:
+    return list(read_journal(path))
+
+
 @pytest.mark.parametrize(
     "facts",
     [
         {},
         {"success": True, "chosen": False, "recording": None},
         {"success": journal.UNKNOWN},
-        *({"reward": reward} for reward in (math.inf, -math.inf)),
+        *({"reward": reward} for reward in (math.inf, -math.inf, math.nan)),
     ],
 )
 def test_entries_come_back_as_they_were(path: Path, facts: dict[str, Any]) -> None:
     """Also what the environment did not say, and what JSON has no number for."""
     write(path, changed(**facts), NEXT)
-    assert list(read_journal(path)) == [changed(**facts), NEXT]
-    assert "Infinity" not in path.read_text()
-
-
-def test_nan_comes_back(path: Path) -> None:
-    """In a file that is JSON."""
-    write(path, changed(reward=math.nan))
-    assert "NaN" not in path.read_text()
-    assert [math.isnan(entry.reward) for entry in read_journal(path)] == [True]
+    # NaN is equal to nothing; its text is.
+    assert repr(read(path)) == repr([changed(**facts), NEXT])
+    assert not re.search("NaN|Infinity", path.read_text())
 
 
 @pytest.mark.parametrize(
@@ -104,7 +99,7 @@ def test_an_entry_is_in_the_file_when_append_returns(path: Path) -> None:
     writer = JournalWriter(path)
     assert not path.exists()
     writer.append(ENTRY)
-    assert list(read_journal(path)) == [ENTRY]
+    assert read(path) == [ENTRY]
     writer.close()
     writer.close()
     with pytest.raises(ClosedError, match="jsonl"):
@@ -120,7 +115,7 @@ def test_the_first_line_describes_the_run(path: Path) -> None:
     writer.append(ENTRY)
     writer.close()
     write(path, NEXT, run={"env_info": {}})
-    assert list(read_journal(path)) == [ENTRY, NEXT]
+    assert read(path) == [ENTRY, NEXT]
     assert path.read_text().count('"run"') == 1
 
 
@@ -155,7 +150,7 @@ def test_a_last_line_cut_anywhere_is_left_out(
     for kept in range(1, len(second) - 1):
         path.write_bytes(first + second[:kept])
         caplog.clear()
-        assert list(read_journal(path)) == [ENTRY]
+        assert read(path) == [ENTRY]
         (record,) = caplog.records
         assert f"{path}: 1 line left out: line 2" in record.getMessage()
         assert "cut off" in record.getMessage()
@@ -164,9 +159,9 @@ def test_a_last_line_cut_anywhere_is_left_out(
     assert list(reader) == [ENTRY]
     assert (reader.count, reader.dropped, reader.last_episode_id) == (1, 1, 4)
     write(path, later)
-    assert list(read_journal(path)) == [ENTRY, later]
+    assert read(path) == [ENTRY, later]
     path.write_bytes(whole.rstrip(b"\n"))
-    assert list(read_journal(path)) == [ENTRY, NEXT]
+    assert read(path) == [ENTRY, NEXT]
 
 
 @pytest.mark.parametrize(
@@ -174,9 +169,6 @@ def test_a_last_line_cut_anywhere_is_left_out(
     [
         (b"\0\0\0\n", "not whole JSON"),
         (b"{}\n", "no 'episode_id'"),
-        (b"[1]\n", "an object belongs there"),
-        (b"\n", "not whole JSON"),
-        (b'{"episode_id": true}\n', "a whole number belongs there"),
         (b'{"episode_id": "1"}\n', "a whole number belongs there, not a text"),
         (b'{"episode_id": -1}\n', "negative"),
         (b'{"episode_id": 1e99}\n', "larger than any count"),
@@ -193,7 +185,7 @@ def test_damage_in_the_middle_costs_one_line(
     write(path, ENTRY, NEXT)
     first, second = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(first + damage + second)
-    assert list(read_journal(path)) == [ENTRY, NEXT]
+    assert read(path) == [ENTRY, NEXT]
     (record,) = caplog.records
     assert f"{path}: 1 line left out: line 2" in record.getMessage()
     assert reason in record.getMessage()
@@ -203,7 +195,7 @@ def test_an_episode_counts_once(path: Path, caplog: pytest.LogCaptureFixture) ->
     """Of two lines with one number the first is read, in any order of numbers."""
     late = changed(episode_id=10**14)
     write(path, late, ENTRY, NEXT, changed(reward=9.0), late)
-    assert list(read_journal(path)) == [late, ENTRY, NEXT]
+    assert read(path) == [late, ENTRY, NEXT]
     assert "2 lines left out: first line 4 (episode 3)" in caplog.text
 
 
@@ -214,14 +206,14 @@ def test_what_is_no_journal_is_given_up_on(
     write(path, ENTRY)
     line = path.read_bytes()
     path.write_bytes(b"\n" * 999 + line)
-    assert list(read_journal(path)) == [ENTRY]
+    assert read(path) == [ENTRY]
     path.write_bytes(b"\n" * 1000 + line)
-    assert list(read_journal(path)) == []
+    assert read(path) == []
     assert "1000 lines and all that follows left out" in caplog.text
     path.write_bytes(line)
     with path.open("r+b") as file:
         file.truncate(1 << 40)
-    assert list(read_journal(path)) == [ENTRY]
+    assert read(path) == [ENTRY]
     assert "1 line and all that follows left out: line 2" in caplog.text
     assert "too long" in caplog.text
     assert count_lines(path) == 1
@@ -251,38 +243,13 @@ def test_what_cannot_be_read_is_one_error(
 ) -> None:
     """A missing file, and a disk that fails while it is read."""
     with pytest.raises(UnreadableFile, match="No such file"):
-        list(read_journal(path))
+        read(path)
     # A file that can be opened, and of which no byte can be read.
     memory = Path("/proc/self/mem")
     monkeypatch.setattr(journal, "open_regular", lambda _: memory.open("rb"))
-    for read in (count_lines, lambda path: list(read_journal(path))):
+    for each in (count_lines, read):
         with pytest.raises(UnreadableFile, match="Input/output error"):
-            read(path)
-
-
-def test_reading_streams(path: Path) -> None:
-    """Memory does not grow with the journal."""
-    write(path, *(changed(episode_id=i, options="x" * 1000) for i in range(5000)))
-    tracemalloc.start()
-    count = sum(1 for _ in read_journal(path))
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert count == 5000
-    assert peak < path.stat().st_size / 10
-
-
-def test_a_killed_writer_leaves_whole_lines(path: Path) -> None:
-    """After SIGKILL every episode that was appended is there."""
-    code = (
-        "import os, pathlib, sys, mjrec.formats.journal as j\n"
-        "w = j.JournalWriter(pathlib.Path(sys.argv[1]))\n"
-        "for i in range(5):\n"
-        "    w.append(j.JournalEntry(i, 1, 1.0, 't', 0.0, 1.0, 0, None, True, False))\n"
-        "os.kill(os.getpid(), 9)\n"
-    )
-    child = subprocess.run([sys.executable, "-c", code, str(path)], check=False)
-    assert child.returncode == -signal.SIGKILL
-    assert [entry.episode_id for entry in read_journal(path)] == [0, 1, 2, 3, 4]
+            each(path)
 
 
 def test_a_line_that_does_not_fit_is_taken_back(path: Path) -> None:
@@ -299,7 +266,7 @@ def test_a_line_that_does_not_fit_is_taken_back(path: Path) -> None:
         file.write(b'{"episode_id": 4, "le')
     writer.append(NEXT)
     writer.close()
-    assert list(read_journal(path)) == [ENTRY, NEXT]
+    assert read(path) == [ENTRY, NEXT]
 
 
 def test_a_journal_that_was_removed_is_noticed(path: Path) -> None:
@@ -312,4 +279,4 @@ def test_a_journal_that_was_removed_is_noticed(path: Path) -> None:
     assert not path.exists()
     writer.append(ENTRY)
     writer.close()
-    assert list(read_journal(path)) == [ENTRY]
+    assert read(path) == [ENTRY]

@@ -28,48 +28,24 @@ from recordings import (
 import mjrec
 from conftest import Corridor
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.recorder import kept_videos
 from mjrec.recorder.selection import UNDECIDED
 from mjrec.recorder.tracking import FinishedVideo, Tracker
 from mjrec.rendering.finishing import finish_pending
 from mjrec.rendering.pending import recorded_episodes
 
-# Of the walks of `Walk`, in their order.
+# Of the episodes of `pendulum`, in their order.
 RETURNS = [5.0, 2.0, 4.0, 1.0, 4.0, 2.0, 3.0, 6.0]
-
-
-class Walk(Corridor):
-    """A corridor whose episodes have given lengths, which are their returns."""
-
-    def __init__(
-        self,
-        returns: Sequence[float] = RETURNS,
-        *,
-        success: Sequence[bool | None] = (),
-        **arguments: Any,
-    ) -> None:
-        super().__init__(**arguments)
-        self.returns = list(returns)
-        self.success = list(success)
-
-    def reset(self, **options: Any) -> Any:
-        self.length = int(self.returns.pop(0))
-        return super().reset(**options)
-
-    def step(self, action: Any) -> Any:
-        observation, _, terminated, truncated, info = super().step(action)
-        said = self.success.pop(0) if terminated and self.success else None
-        if said is not None:
-            info = {"is_success": said}
-        return observation, 1.0, terminated, truncated, info
 
 
 class Limited(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Ends an episode after as many steps as its return is to be."""
 
-    def __init__(self, env: Any, returns: Sequence[float] = RETURNS) -> None:
+    def __init__(
+        self, env: Any, returns: Sequence[float], success: Sequence[bool] = ()
+    ) -> None:
         super().__init__(env)
         self.lengths = [int(number) for number in returns]
+        self.success = list(success)
 
     def reset(self, **options: Any) -> Any:
         self.left = self.lengths.pop(0)
@@ -78,6 +54,8 @@ class Limited(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         observation, _, _, _, info = self.env.step(action)
         self.left -= 1
+        if not self.left and self.success:
+            info = {"is_success": self.success.pop(0)}
         return observation, 1.0, False, self.left == 0, info
 
 
@@ -92,9 +70,9 @@ class OneStep(Limited):
 def pendulum(
     returns: Sequence[float] = RETURNS, *, kind: type = Limited, **arguments: Any
 ) -> Any:
-    """Return a small environment whose frames can be deferred."""
-    size = {"width": 64, "height": 64}
-    return kind(gymnasium.make("InvertedPendulum-v5", **size, **arguments), returns)
+    """Return a small environment."""
+    size = {"width": 64, "height": 64, "render_mode": "rgb_array"}
+    return kind(gymnasium.make("InvertedPendulum-v5", **size), returns, **arguments)
 
 
 def run(env: Any, episodes: int) -> None:
@@ -150,23 +128,25 @@ class Listener(Tracker):
 # --- what is kept --------------------------------------------------------------------
 
 
-@parametrize("kind", ["live", "deferred"], default=2)
-def test_the_worst_n_are_kept(tmp_path: Path, kind: str) -> None:
+both_ways = pytest.mark.parametrize("way", ["live", "deferred"])
+
+
+@both_ways
+def test_the_worst_n_are_kept(tmp_path: Path, way: Any) -> None:
     """Never more candidates than N; only the chosen are drawn, named, notified."""
-    env = Walk() if kind == "live" else pendulum()
-    held = videos_in if kind == "live" else logs_of
     listener = Listener()
     options: dict[str, Any] = {"workers": 1, "trackers": listener, "name_prefix": "w"}
-    with mjrec.Monitor(env, tmp_path, keep="worst:2", **options) as monitor:
+    with mjrec.Monitor(
+        pendulum(), tmp_path, keep="worst:2", render=way, **options
+    ) as monitor:
         for number in range(8):
             run(monitor, 1)
             so_far = sorted(range(number + 1), key=lambda k: (RETURNS[k], k))[:2]
-            assert held(tmp_path) == sorted(so_far)
-        assert kind == "live" or videos_in(tmp_path) == []
+            assert logs_of(tmp_path) == sorted(so_far)
+            assert videos_in(tmp_path) == (sorted(so_far) if way == "live" else [])
         assert not list(tmp_path.glob("w-*"))
         assert listener.videos == {}
     assert videos_in(tmp_path) == h5_of(tmp_path) == [1, 3]
-    assert logs_of(tmp_path) == []
     assert not list(tmp_path.glob(".*"))
     assert not list(tmp_path.glob("*00000[024567]*"))
     named = sorted(path.name for path in tmp_path.glob("w-*.mp4"))
@@ -182,6 +162,7 @@ def test_the_worst_n_are_kept(tmp_path: Path, kind: str) -> None:
     assert details["keep"] == {**chosen, "chosen": [1, 3]}
     for number in (1, 3):
         assert metadata_of(tmp_path, number)["selection"] == chosen
+        assert facts_of(tmp_path, number)["video"]["selection"] == chosen
         assert len(frames_in(tmp_path, number)) == RETURNS[number] + 1
     assert len(journal_of(tmp_path)) == 8
 
@@ -208,9 +189,9 @@ def test_the_disk_holds_n_candidates_and_the_running_episode(
 
 def test_failures_are_what_the_environment_calls_so(tmp_path: Path) -> None:
     """Decided at the end of each; after N no frame is recorded any more."""
-    success = [True, False, True, False, False, True, False, False]
+    made = pendulum(success=[True, False, True, False, False, True, False, False])
     with mjrec.Monitor(
-        Walk(success=success), tmp_path, keep="failures:2", mode="training"
+        made, tmp_path, keep="failures:2", mode="training", render="live"
     ) as env:
         run(env, 3)
         assert videos_in(tmp_path) == [1]
@@ -261,25 +242,11 @@ def longest_two(episodes: Sequence[Any]) -> list[int]:
 
 def test_a_function_chooses_among_finished_episodes(tmp_path: Path) -> None:
     """Live as well; its name stands in the manifest."""
-    with mjrec.Monitor(Walk(), tmp_path, keep=longest_two) as env:
+    with mjrec.Monitor(pendulum(), tmp_path, keep=longest_two, render="live") as env:
         run(env, 8)
         assert videos_in(tmp_path) == [*range(8)]
     assert videos_in(tmp_path) == [0, 7]
     assert manifest_of(tmp_path)["mjrec"]["schedule"]["name"] == "keep:longest_two"
-
-
-def test_live_videos_take_their_trajectories_with_them(tmp_path: Path) -> None:
-    """Both go, and both stay."""
-    env = pendulum([3, 2, 4, 1], render_mode="rgb_array")
-    with mjrec.Monitor(env, tmp_path, keep="worst:1", render="live") as env:
-        for number in range(4):
-            run(env, 1)
-            assert logs_of(tmp_path) == videos_in(tmp_path)
-            assert len(logs_of(tmp_path)) == 1, number
-    assert videos_in(tmp_path) == h5_of(tmp_path) == [3]
-    selection = facts_of(tmp_path, 3)["video"]["selection"]
-    assert selection == metadata_of(tmp_path, 3)["selection"]
-    assert selection["decided"]
 
 
 @pytest.mark.parametrize(
@@ -306,13 +273,12 @@ def test_trajectories_are_kept_as_asked(
     assert metadata_of(tmp_path, 2)["selection"]["rule"] == "best:1"
 
 
-@parametrize("kind", ["live", "deferred"], default=2)
-def test_incomplete_episodes_are_never_chosen(tmp_path: Path, kind: str) -> None:
+@both_ways
+def test_incomplete_episodes_are_never_chosen(tmp_path: Path, way: Any) -> None:
     """Neither one that was reset nor the one that was closed; nothing of them stays."""
-    returns = [3, 5, 4]
-    env = Walk(returns) if kind == "live" else pendulum(returns)
+    options: dict[str, Any] = {"render": way, "allow_early_reset": True}
     with mjrec.Monitor(
-        env, tmp_path, keep="worst:3", workers=1, allow_early_reset=True
+        pendulum([3, 5, 4]), tmp_path, keep="worst:3", workers=1, **options
     ) as monitor:
         run(monitor, 1)
         for _ in range(2):
@@ -352,16 +318,15 @@ def confused(episodes: Sequence[Any]) -> list[int]:
 
 
 @parametrize(
-    ("kind", "options"),
+    ("way", "options"),
     [("live", {}), ("deferred", {"wait": True}), ("deferred", {"wait": False})],
     default=2,
 )
 def test_a_function_that_cannot_choose_loses_nothing(
-    tmp_path: Path, kind: str, options: dict[str, bool]
+    tmp_path: Path, way: Any, options: dict[str, bool]
 ) -> None:
     """One error names it; all is closed, and all videos are there or pending."""
-    made = Walk() if kind == "live" else pendulum()
-    env = mjrec.Monitor(made, tmp_path, keep=confused, workers=1)
+    env = mjrec.Monitor(pendulum(), tmp_path, keep=confused, workers=1, render=way)
     run(env, 3)
     with pytest.raises(mjrec.InvalidArgument, match=r"confused returned 3, .* 0, 1, 2"):
         env.close(**options)
@@ -372,33 +337,13 @@ def test_a_function_that_cannot_choose_loses_nothing(
     assert not details["keep"]["decided"]
     assert details["keep"]["chosen"] == []
     assert "returned 3" in details["keep"]["failure"]
-    if kind == "deferred":
+    if way == "deferred":
         assert pending_in(tmp_path) == [0, 1, 2]
         render(tmp_path)
     assert videos_in(tmp_path) == [0, 1, 2]
     assert len(manifest_of(tmp_path)["videos"]) == 3
     selection = {"rule": "confused", "decided": False}
     assert metadata_of(tmp_path, 0)["selection"] == selection
-
-
-def test_an_interrupted_deletion_is_taken_up_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Ctrl-C before what has fallen out is gone: it goes when the monitor closes."""
-    env = mjrec.Monitor(pendulum(), tmp_path, keep="worst:1", workers=0)
-    run(env, 1)
-
-    def interrupted(trajectory: Path) -> None:
-        monkeypatch.undo()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(kept_videos, "drop_recording", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run(env, 1)
-    assert logs_of(tmp_path) == [0, 1]
-    env.close()
-    assert h5_of(tmp_path) == [1]
-    assert logs_of(tmp_path) == []
 
 
 def test_an_interrupted_choice_is_taken_up_again(tmp_path: Path) -> None:
@@ -411,7 +356,7 @@ def test_an_interrupted_choice_is_taken_up_again(tmp_path: Path) -> None:
             raise KeyboardInterrupt
         return [0]
 
-    env = mjrec.Monitor(Walk(), tmp_path, keep=choose)
+    env = mjrec.Monitor(pendulum(), tmp_path, keep=choose, render="live")
     run(env, 3)
     with pytest.raises(KeyboardInterrupt):
         env.close()
@@ -449,10 +394,9 @@ PROGRAM = """
 import os, sys
 import mjrec
 sys.path.insert(0, sys.argv[3])
-from test_keep import pendulum, run, Walk
-env = Walk() if sys.argv[2] == "live" else pendulum()
-env = mjrec.Monitor(env, sys.argv[1], keep="worst:2", workers=1,
-                    write_upon_reset=True)
+from test_keep import pendulum, run
+env = mjrec.Monitor(pendulum(), sys.argv[1], keep="worst:2", workers=1,
+                    render=sys.argv[2], write_upon_reset=True)
 run(env, 5)
 env.reset(seed=0)
 env.step(env.action_space.sample())
@@ -472,7 +416,7 @@ def test_a_killed_run_leaves_its_candidates(
     here = str(Path(__file__).parent)
     command = [sys.executable, "-c", PROGRAM, str(tmp_path), kind, here]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
-    assert kind == "live" or logs_of(tmp_path) == [1, 3, 5]
+    assert logs_of(tmp_path) == [1, 3, 5]
     if recovers:
         mjrec.recover(tmp_path)
         details = manifest_of(tmp_path)["mjrec"]
@@ -528,15 +472,15 @@ def test_impossible_options_are_refused_before_anything_is_made(
 ) -> None:
     """The directory is not even there; without frames there is nothing to keep."""
     with pytest.raises(mjrec.InvalidArgument, match=what):
-        mjrec.Monitor(Walk(), tmp_path / "run", **options)
+        mjrec.Monitor(pendulum(), tmp_path / "run", **options)
     with pytest.raises(mjrec.NoPictures):
-        mjrec.Monitor(Walk(render_mode=None), tmp_path / "run", keep="worst:1")
+        mjrec.Monitor(Corridor(render_mode=None), tmp_path / "run", keep="worst:1")
     assert not (tmp_path / "run").exists()
 
 
 def test_nothing_was_finished(tmp_path: Path) -> None:
     """The manifest says that it was decided among none."""
-    mjrec.Monitor(Walk(), tmp_path, keep="median").close()
+    mjrec.Monitor(pendulum(), tmp_path, keep="median").close()
     assert manifest_of(tmp_path)["mjrec"]["keep"] == {
         "rule": "median",
         "decided": True,

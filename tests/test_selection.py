@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from mjrec.errors import InvalidArgument, UnknownName
 from mjrec.recorder.selection import (
-    UNDECIDED,
     Selection,
     Standing,
     selection_from,
@@ -62,13 +61,6 @@ def chosen(keep: Any, episodes: Sequence[FinishedEpisode]) -> list[int]:
     return selection.chosen
 
 
-def worse(one: FinishedEpisode, other: FinishedEpisode) -> bool:
-    """Tell whether a return is worse, as a person would say it."""
-    if math.isnan(other.reward):
-        return False
-    return math.isnan(one.reward) or one.reward < other.reward
-
-
 # Few different ones, so that there are ties.
 some_rewards = st.lists(
     st.sampled_from([0.0, -0.0, 1.0, -2.5, 7.25, math.nan, math.inf, -math.inf]),
@@ -81,39 +73,21 @@ def with_rewards(rewards: Sequence[float]) -> list[FinishedEpisode]:
     return [episode(3 + 2 * k, reward) for k, reward in enumerate(rewards)]
 
 
-@given(some_rewards, st.integers(1, 5), st.sampled_from(["best", "worst"]))
-def test_chosen_are_those_with_fewer_than_n_before_them(
-    rewards: list[float], count: int, kind: str
-) -> None:
-    """Before one stand the worse (better) ones and earlier equal ones; NaN is worst."""
+@given(some_rewards, st.integers(1, 5))
+def test_returns_are_ranked(rewards: list[float], count: int) -> None:
+    """NaN is the worst; of equal ones the earlier counts; the median is the lower."""
     episodes = with_rewards(rewards)
-
-    def is_before(one: FinishedEpisode, other: FinishedEpisode) -> bool:
-        one_first, other_first = worse(one, other), worse(other, one)
-        if one_first == other_first:
-            return one.episode_id < other.episode_id
-        return one_first == (kind == "worst")
-
-    assert chosen(f"{kind}:{count}", episodes) == [
-        this.episode_id
-        for this in episodes
-        if sum(is_before(other, this) for other in episodes) < count
-    ]
-
-
-@given(some_rewards)
-def test_median_is_the_first_episode_in_the_lower_middle(rewards: list[float]) -> None:
-    """At most half of the others are worse, and fewer than half are better."""
-    episodes = with_rewards(rewards)
-    half = (len(episodes) - 1) // 2
-    middle = [
-        this.episode_id
-        for this in episodes
-        if sum(worse(other, this) for other in episodes)
-        <= half
-        < len(episodes) - sum(worse(this, other) for other in episodes)
-    ]
-    assert chosen("median", episodes) == middle[:1]
+    # Python's sort is stable, and so is it in reverse.
+    known = {e.episode_id: not math.isnan(e.reward) for e in episodes}
+    rank = {e.episode_id: (known[e.episode_id], e.reward) for e in episodes}
+    rank |= {number: (False, 0.0) for number in known if not known[number]}
+    worst = sorted(rank, key=lambda number: rank[number])
+    best = sorted(rank, key=lambda number: rank[number], reverse=True)
+    assert chosen(f"worst:{count}", episodes) == sorted(worst[:count])
+    assert chosen(f"best:{count}", episodes) == sorted(best[:count])
+    middle = [rank[number] for number in worst][(len(worst) - 1) // 2 :][:1]
+    first = [number for number in rank if rank[number] in middle][:1]
+    assert chosen("median", episodes) == first
 
 
 @given(
@@ -135,6 +109,10 @@ def test_failures_are_what_the_environment_calls_so(
     ]
     assert chosen("failures", episodes) == failed
     assert chosen(f"failures:{most}", episodes) == failed[:most]
+    # At the end of each, so that after the last nothing is recorded any more.
+    selection = told(f"failures:{most}", episodes)
+    assert selection.chosen == failed[:most]
+    assert selection.is_full == (len(failed) >= most)
 
 
 @given(some_rewards, st.integers(1, 3), st.sampled_from(["best", "worst"]))
@@ -166,18 +144,6 @@ def test_an_episode_may_be_told_of_twice(rewards: list[float], rule: str) -> Non
     twice = [each for each in episodes for _ in range(2)]
     assert told(rule, twice).finished == len(episodes)
     assert chosen(rule, twice) == chosen(rule, episodes)
-
-
-def test_failures_are_decided_at_once() -> None:
-    """And after the last of N nothing can be chosen any more."""
-    selection = selection_from("failures:1")
-    selection.add(episode(0, terminated=False))
-    assert selection.standing(0) is Standing.DROPPED
-    assert not selection.is_full
-    selection.add(episode(1))
-    assert selection.standing(1) is Standing.CHOSEN
-    assert selection.is_full
-    assert selection.chosen == [1]
 
 
 def test_a_function_gets_the_finished_episodes() -> None:
@@ -225,12 +191,6 @@ def test_a_function_that_cannot_choose_is_named(
     assert selection.undecided == 3
 
 
-@pytest.mark.parametrize("rule", ["worst:2", "best:1", "failures", "median"])
-def test_without_episodes_nothing_is_chosen(rule: str) -> None:
-    """A run may be closed before anything has finished."""
-    assert chosen(rule, []) == []
-
-
 @pytest.mark.parametrize(
     ("keeps", "error", "what"),
     [
@@ -262,13 +222,3 @@ def test_what_is_no_rule_is_an_error(
     for keep in keeps:
         with pytest.raises(error, match=what):
             selection_from(keep)
-
-
-def test_what_is_decided_elsewhere_stays_open() -> None:
-    """All are candidates, also when there are no more."""
-    selection = told(UNDECIDED, [episode(number, float(number)) for number in range(3)])
-    selection.close()
-    assert selection.is_left_open
-    assert selection.undecided == 3
-    assert {selection.standing(n) for n in range(3)} == {Standing.CANDIDATE}
-    assert selection.chosen == []
