@@ -15,7 +15,7 @@ from ..environments.gymnasium_pictures import close_environment, free_viewers
 from ..errors import Error, InvalidArgument
 from ..recorder.declared_rate import declared_rate
 from ..recorder.options import RecorderOptions
-from ..rendering.shared_rendering import SharedRendering
+from ..rendering.background import Background
 from ..simulation.inside import simulation_time
 from .gymnasium_monitor import GymnasiumMonitor, env_id_of
 from .vector_recording import VectorRecording, opened_together, options_of
@@ -67,7 +67,9 @@ class InsideRecording(VectorRecording):
         self._closing = _Closing()
         shared = None
         if options.workers != 0:
-            shared = SharedRendering(workers=options.workers, strict=options.strict)
+            shared = Background(
+                directory, workers=options.workers, strict=options.strict
+            )
         env_id = env_id or _common_env_id(envs)
         # A tiled video of several cameras is each sub-environment's own.
         tiled = options.tiled and isinstance(view["camera"], list | tuple)
@@ -83,7 +85,7 @@ class InsideRecording(VectorRecording):
                     **view,
                     env_id=env_id,
                     env_index=index,
-                    rendering=None if shared is None else shared.share,
+                    rendering=None if shared is None else lambda _: shared.share(),
                     close_environment=self._closing,
                 )
                 monitors.append(monitor)

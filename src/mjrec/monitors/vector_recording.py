@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..recorder.options import RecorderOptions
-from ..rendering.shared_rendering import SharedRendering
+from ..rendering.background import Background
 from .controls import MonitorControls
 
 T = TypeVar("T")
@@ -33,7 +33,7 @@ class VectorRecording:
         self,
         monitors: Iterable[MonitorControls],
         *,
-        shared: SharedRendering | None = None,
+        shared: Background | None = None,
         clock: Callable[[], float | None] = lambda: None,
         declared: Callable[[], Fraction],
     ) -> None:
