@@ -14,7 +14,7 @@ from mjrec.formats.trajectory import RowLayout
 from mjrec.recorder.deferral import Deferral
 from mjrec.recorder.options import DEFERRED, RenderingChoice
 from mjrec.recorder.subject import Subject
-from mjrec.simulation.state_source import EpisodeStart
+from mjrec.simulation.capture import EpisodeStart
 
 POSSIBLE = EpisodeStart(state=(), snapshot=RowLayout(), model={}, scene=None)
 REFUSED = dataclasses.replace(POSSIBLE, refusal="a plugin draws")

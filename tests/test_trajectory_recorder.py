@@ -25,8 +25,8 @@ from mjrec.formats.trajectory import (
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.stats_recorder import StatsRecorder
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
-from mjrec.simulation.gathering import words_of
-from mjrec.simulation.state_source import EpisodeStart, MomentMemory
+from mjrec.simulation.capture import EpisodeStart
+from mjrec.simulation.memory import words_of
 
 
 class Counter:
@@ -84,12 +84,11 @@ class Remembered(Counter):
         super().__init__()
         self.asked: list[int] = []
         self.numbers = np.zeros(6)
-        memory = MomentMemory(
+        self.start = dataclasses.replace(
+            Counter.start,
             words=words_of([self.numbers]),
-            owners=self.numbers,
             is_current=self.is_current,
         )
-        self.start = dataclasses.replace(Counter.start, memory=memory)
 
     def is_current(self) -> bool:
         self.numbers[:] = (self.time(), self.step, -self.step, *[self.step] * 3)
@@ -102,7 +101,7 @@ class Remembered(Counter):
 
 def recorder(
     path: Path,
-    states: Counter | None,
+    states: Any,
     *,
     max_fps: Any = None,
     observation: Any = None,

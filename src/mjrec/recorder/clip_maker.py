@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..formats.span_writer import SpanLogs
-from ..simulation.state_source import EpisodeStart
 from .clips import Clip
 from .deferred_clip import ClipLogs, DeferredClip
 from .ended_trajectories import EndedTrajectories
@@ -18,6 +17,9 @@ from .subject import Subject
 from .trajectory_recorder import Pace
 from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder
+
+if TYPE_CHECKING:
+    from ..simulation.capture import EpisodeStart
 
 
 class ClipMaker:

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import logging
+from typing import TYPE_CHECKING
 
 from ..errors import NoPictures, PicturesDiffer
-from ..simulation.state_source import EpisodeStart
 from .subject import Subject, what_is_missing
 from .video_recorder import can_give_pictures
+
+if TYPE_CHECKING:
+    from ..simulation.capture import EpisodeStart
 
 logger = logging.getLogger(__name__)
 

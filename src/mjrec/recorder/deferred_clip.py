@@ -22,13 +22,15 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import FileNotWritten, PicturesDiffer
 from ..formats.monitor_directory import Infix, clip_part_name
 from ..formats.span_writer import SpanLogs
-from ..simulation.state_source import EpisodeStart, StateSource
 from .trajectory_recorder import Pace, TrajectoryRecorder
+
+if TYPE_CHECKING:
+    from ..simulation.capture import Capture, EpisodeStart
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +55,7 @@ class ClipLogs:
 
     logs: SpanLogs
     infix: Infix
-    states: StateSource
+    states: Capture
     pace: Pace
     facts: Callable[[EpisodeStart], Mapping[str, Any]]
     before: Callable[[], Mapping[str, Any]]

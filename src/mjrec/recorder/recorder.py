@@ -14,7 +14,7 @@ import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..annotation import Caption
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
@@ -26,7 +26,6 @@ from ..formats.monitor_directory import (
 )
 from ..formats.span_writer import SpanLogs
 from ..results.recorded_environment import GYM_VERSION
-from ..simulation.state_source import EpisodeStart, StateSource
 from .begun_episode import BegunEpisode
 from .clip_maker import ClipMaker
 from .clips import Clips
@@ -54,6 +53,9 @@ from .tracking import FinishedEpisode, Run
 from .trajectory_recorder import Pace, TrajectoryRecorder
 from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder
+
+if TYPE_CHECKING:
+    from ..simulation.capture import Capture, EpisodeStart
 
 logger = logging.getLogger(__name__)
 
@@ -459,7 +461,7 @@ class Recorder:
             if self._clips is not None:
                 self._clips.close(self._ending or {"reason": CLOSE})
 
-    def _all_states(self) -> list[StateSource]:
+    def _all_states(self) -> list[Capture]:
         return [each for each in (self._states, self._clip_states) if each is not None]
 
     def _new_clips(self) -> Clips:
@@ -495,7 +497,7 @@ class Recorder:
             "reset_time": self._reset_clock,
         }
 
-    def _finish_models(self, states: StateSource) -> None:
+    def _finish_models(self, states: Capture) -> None:
         try:
             states.finish()
         except Error as error:

@@ -5,14 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..machine import machine_fingerprint
-from ..simulation.state_source import EpisodeStart
 from .begun_episode import BegunEpisode
 from .options import LIVE
 from .subject import Subject
 from .versions import versions
+
+if TYPE_CHECKING:
+    from ..simulation.capture import EpisodeStart
 
 
 @dataclass(frozen=True, kw_only=True)

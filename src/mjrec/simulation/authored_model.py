@@ -38,8 +38,7 @@ from numpy.typing import NDArray
 from ..errors import UnreadableFile
 from ..formats.regular_files import open_regular
 from ..json_text import loads
-from .model_differences import differing_fields
-from .model_fields import apply_fields
+from .fields import apply_fields, differing_fields
 
 logger = logging.getLogger(__name__)
 

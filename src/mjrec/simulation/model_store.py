@@ -108,7 +108,7 @@ class ModelStore:
             `bytes` of it, `mjb` and `xml` (base names; `xml` may be None), `mujoco`
             (the version).
         """
-        compiled = _compiled(model)
+        compiled = saved_model(model)
         digest = hashlib.sha256(compiled.data).hexdigest()
         stem = f"{FILE_PREFIX}.model.{digest[:16]}"
         facts = {
@@ -291,11 +291,17 @@ def _not_loadable(
     )
 
 
-def _compiled(model: mujoco.MjModel) -> NDArray[np.uint8]:
+def saved_model(model: mujoco.MjModel) -> NDArray[np.uint8]:
+    """Return a model as `mj_saveModel` writes it, with all that it refers to."""
     whole = with_embedded_files(model)
     buffer = np.empty(mujoco.mj_sizeModel(whole), np.uint8)
     mujoco.mj_saveModel(whole, None, buffer)
     return buffer
+
+
+def model_digest(model: mujoco.MjModel) -> str:
+    """Return the sha256 of a saved model, as recordings say it."""
+    return hashlib.sha256(saved_model(model).data).hexdigest()
 
 
 def _can_hold(path: Path, size: int) -> bool:
