@@ -27,8 +27,8 @@ from mjrec.errors import (
     UnknownName,
 )
 from mjrec.gl import probe
-from mjrec.simulation import gl_strings, gl_thread
-from mjrec.simulation.gl_strings import current_gl_strings
+from mjrec.simulation import gl_info, gl_thread
+from mjrec.simulation.gl_info import current_gl_strings
 from mjrec.simulation.gl_thread import GLThread
 from mjrec.simulation.renderer import SceneRenderer
 
@@ -643,7 +643,7 @@ def test_a_picture_beyond_the_driver_is_refused(
     table: tuple[mujoco.MjModel, mujoco.MjData], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The limit that OpenGL tells is named; a smaller one than any real driver's."""
-    told = gl_strings.raw_opengl()
+    told = gl_info.raw_opengl()
     name_of_limit = 0x84E8
 
     def tell(name: int, limit: Any) -> None:
@@ -894,7 +894,7 @@ def test_a_driver_that_hangs_is_not_waited_for(
     thread: GLThread, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The next calls fail at once, and closing returns."""
-    monkeypatch.setattr(gl_thread, "_PATIENCE_S", 0.05)
+    monkeypatch.setattr(gl_thread, "_TIMEOUT_S", 0.05)
     driver = threading.Event()
 
     with pytest.raises(GLError, match="no answer within"):

@@ -63,7 +63,7 @@ class Drawing:
 
     @property
     def gl_facts(self) -> dict[str, Any]:
-        """Who draws, and on which device: `gl_strings.current_gl_facts`."""
+        """Who draws, and on which device: `gl_info.current_gl_facts`."""
         return self._cameras[0].renderer.gl_facts
 
     def draw(self, index: int, *, out: Frame | None = None) -> Frame:

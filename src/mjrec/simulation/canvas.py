@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import InvalidArgument
 from ..frames import Frame, check_quality, check_size
 from .fields import holder_of
-from .gl_strings import current_gl_strings, largest_picture
+from .gl_info import current_gl_strings, largest_picture
 from .gl_thread import GLStrings, GLThread, gl_error
 
 
@@ -139,7 +139,7 @@ class Canvas:
 
     @property
     def gl_facts(self) -> dict[str, Any]:
-        """What metadata says of who draws, as `gl_strings.current_gl_facts`."""
+        """What metadata says of who draws, as `gl_info.current_gl_facts`."""
         return self._thread.facts
 
     def go_over_to(

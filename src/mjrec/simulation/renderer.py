@@ -108,7 +108,7 @@ class SceneRenderer:
 
     @property
     def gl_facts(self) -> dict[str, Any]:
-        """What metadata says of who draws, as `gl_strings.current_gl_facts`."""
+        """What metadata says of who draws, as `gl_info.current_gl_facts`."""
         return self._canvas.gl_facts
 
     @property

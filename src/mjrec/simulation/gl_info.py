@@ -1,15 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""EGL's devices, as EGL tells of them."""
+"""Which OpenGL draws, on which of EGL's devices, in whose context.
+
+Needs no mujoco: whether that can be imported is part of what `gl_probe` tries.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import importlib
+import sys
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..gl.egl_device import EglDevice
 
+_NAMES = ("GL_VENDOR", "GL_RENDERER", "GL_VERSION")
+_MAX_RENDERBUFFER_SIZE = 0x84E8
+
+# Of EGL.
 _EXTENSIONS = 0x3055
 _DEVICE = 0x322C
 _CUDA_DEVICE = 0x323A
@@ -19,6 +29,98 @@ _DEVICE_UUID = 0x335C
 _UUID_LENGTH = 16
 # mujoco 3 itself asks for ten.
 _MOST_DEVICES = 256
+
+
+def raw_opengl() -> Any:
+    """Return PyOpenGL's functions of OpenGL 1.0, for use on a thread with a context.
+
+    Not `OpenGL.GL`, which takes longer to import than a picture to draw.
+    """
+    # It chooses its platform when it is imported, and mujoco sets which one when it
+    # imports its context class: not before there is a context.
+    return importlib.import_module("OpenGL.raw.GL.VERSION.GL_1_0")
+
+
+def current_gl_strings() -> dict[str, str]:
+    """Return vendor, renderer and version of the context current on this thread.
+
+    The keys are `gl_vendor`, `gl_renderer` and `gl_version`; empty where no context
+    is current, or none was made through PyOpenGL.
+    """
+    # Whoever drew has imported it already, and nobody else may do it here.
+    if "OpenGL.platform" not in sys.modules:
+        return {}
+    gl = raw_opengl()
+    strings = {}
+    for name in _NAMES:
+        try:
+            pointer = gl.glGetString(getattr(gl, name))
+        except sys.modules["OpenGL.error"].Error:
+            return {}
+        value = ctypes.cast(pointer, ctypes.c_char_p).value
+        if value is None:
+            return {}
+        strings[name.lower()] = value.decode(errors="replace")
+    return strings
+
+
+def largest_picture() -> int:
+    """Return the longest side that the driver of this thread's context can draw."""
+    limit = ctypes.c_int()
+    raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limit)
+    return limit.value
+
+
+def current_gl_facts() -> dict[str, Any]:
+    """Return what metadata says of who draws on this thread.
+
+    These are the strings and, where EGL tells on which of its devices it draws,
+    `gl_device`: its `index` in EGL's list and, of a GPU whose driver says them, its
+    `file` and its `uuid`. CUDA's number is not asked for, because that would begin
+    CUDA in a process that may be somebody else's and forked later.
+    """
+    facts: dict[str, Any] = current_gl_strings()
+    if facts and _is_egl():
+        for device in egl_devices(with_cuda=False):
+            if device.in_use:
+                known = {"file": device.device_file, "uuid": device.uuid}
+                said = {name: value for name, value in known.items() if value}
+                facts["gl_device"] = {"index": device.index, **said}
+    return facts
+
+
+def _is_egl() -> bool:
+    platform = getattr(sys.modules["OpenGL.platform"], "PLATFORM", None)
+    return type(platform).__name__ == "EGLPlatform"
+
+
+@contextlib.contextmanager
+def current_context_kept() -> Iterator[None]:
+    """Make the context that is current before the block current again after it.
+
+    With EGL. The other backends cannot make a context current that somebody else
+    made; with them the block's context stays current.
+    """
+    # Whoever made a context has loaded it.
+    egl = sys.modules.get("OpenGL.EGL")
+    before = None if egl is None else egl.eglGetCurrentContext()
+    if egl is None or not before:
+        yield
+        return
+    display = egl.eglGetCurrentDisplay()
+    surfaces = [egl.eglGetCurrentSurface(kind) for kind in (egl.EGL_DRAW, egl.EGL_READ)]
+    try:
+        yield
+    finally:
+        if _address(egl.eglGetCurrentContext()) != _address(before):
+            # The block may have freed it.
+            with contextlib.suppress(sys.modules["OpenGL.error"].Error):
+                egl.eglMakeCurrent(display, *surfaces, before)
+
+
+def _address(context: Any) -> int | None:
+    # No context is a null pointer, which has no address.
+    return int(context.address) if context else None
 
 
 def egl_devices(*, with_cuda: bool = True) -> list[EglDevice]:
