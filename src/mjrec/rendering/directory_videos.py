@@ -18,7 +18,7 @@ from ..formats.in_flight import is_in_flight, list_paths, read_list
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
 from ..formats.trajectory_file import find_trajectory
 from ..machine import usable_cpus
-from ..simulation.model_trust import trusting_all_models
+from ..simulation.model_trust import trusting_models
 from .again import Variant, render_again
 from .finishing import finish_pending
 from .on_engine import finish_on_engine, given_engine, render_again_on_engine
@@ -262,7 +262,7 @@ def _unreadable_lists(directory: Path) -> Iterator[Outcome]:
 
 
 def _trusting(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
-    with trusting_all_models():
+    with trusting_models():
         yield from outcomes
 
 

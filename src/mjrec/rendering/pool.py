@@ -22,7 +22,7 @@ from ..gl.backends import (
     environment_for,
     rendering_is_off,
 )
-from ..simulation.model_trust import with_all_models_trusted
+from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
 from .pool_worker import FRAME, PoolWorker
 from .views import PlainCamera, View, plain_camera
 
@@ -76,7 +76,7 @@ class WorkerPool:
             )
         self._environ = _environment(os.environ, alone=count == 1)
         if trust_models:
-            self._environ = with_all_models_trusted(self._environ)
+            self._environ = {**self._environ, TRUST_VARIABLE: ALL_MODELS}
         self._workers = [PoolWorker() for _ in range(count)]
         self.limit = count
         self.gl_facts: dict[str, Any] = {}
