@@ -20,7 +20,7 @@ from ..errors import InvalidArgument
 from ..frames import Frame, check_quality, check_size
 from .fields import holder_of
 from .gl_info import current_gl_strings, largest_picture
-from .gl_thread import GLStrings, GLThread, gl_error
+from .gl_thread import GLThread, gl_error
 
 
 class _Upload(NamedTuple):
@@ -133,11 +133,6 @@ class Canvas:
             raise
 
     @property
-    def gl_strings(self) -> GLStrings:
-        """Who draws: OpenGL's vendor, renderer and version."""
-        return self._thread.strings
-
-    @property
     def gl_facts(self) -> dict[str, Any]:
         """What metadata says of who draws, as `gl_info.current_gl_facts`."""
         return self._thread.facts
@@ -177,10 +172,6 @@ class Canvas:
             GLError: in a forked child, or the driver hangs.
         """
         return self._thread.call(self._context.draw, scene, out)
-
-    def check_usable(self) -> None:
-        """Raise ClosedError or GLError if `draw` would, without waiting."""
-        self._thread.check_usable()
 
     def settle(self) -> None:
         """Return when nothing is drawn any more, which may be after Ctrl-C."""

@@ -22,7 +22,7 @@ import threading
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import mujoco
 
@@ -47,14 +47,6 @@ _WINDOW_SIDE = 16
 _making_context = threading.Lock()
 
 _Requests: TypeAlias = "queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None]"
-
-
-class GLStrings(NamedTuple):
-    """Who drew: OpenGL's vendor, renderer and version."""
-
-    vendor: str
-    renderer: str
-    version: str
 
 
 class GLThread:
@@ -104,12 +96,6 @@ class GLThread:
         atexit.register(self._exit_hook)
         weakref.finalize(self, atexit.unregister, self._exit_hook).atexit = False
 
-    @property
-    def strings(self) -> GLStrings:
-        """Who draws: OpenGL's vendor, renderer and version."""
-        names = ("gl_vendor", "gl_renderer", "gl_version")
-        return GLStrings(*(self.facts.get(name, "") for name in names))
-
     def call(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Return `function(*args, **kwargs)`, called on the thread.
 
@@ -142,7 +128,7 @@ class GLThread:
         Raises:
             ClosedError, GLError: as `call`.
         """
-        self.check_usable()
+        self._check_usable()
         if not self._last.done():
             concurrent.futures.wait([self._last], _TIMEOUT_S)
 
@@ -159,8 +145,8 @@ class GLThread:
         if not self._hangs:
             self._thread.join(timeout_s)
 
-    def check_usable(self) -> None:
-        """Raise ClosedError or GLError if a call would, without waiting."""
+    def _check_usable(self) -> None:
+        """Raise ClosedError or GLError if a call would."""
         if self._closed:
             raise ClosedError("The renderer is closed.")
         if os.getpid() != self._process_id:
