@@ -19,6 +19,7 @@ import os
 import queue
 import sys
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -38,6 +39,7 @@ T = TypeVar("T")
 # without a GPU; a driver that hangs does.
 _TIMEOUT_S = 300.0
 _TIMEOUT_AT_EXIT_S = 10.0
+_SLICE_S = 0.5
 
 # What mujoco allocates for the window, which is never drawn into: everything goes to
 # the offscreen buffer of the `MjrContext`.
@@ -129,8 +131,7 @@ class GLThread:
             ClosedError, GLError: as `call`.
         """
         self._check_usable()
-        if not self._last.done():
-            concurrent.futures.wait([self._last], _TIMEOUT_S)
+        _wait_for(self._last)
 
     def close(self, timeout_s: float = _TIMEOUT_S) -> None:
         """Call `finish`, free the context and end the thread. Idempotent.
@@ -161,14 +162,23 @@ class GLThread:
             )
 
     def _result(self, future: Future[T]) -> T:
-        done, _ = concurrent.futures.wait([future], _TIMEOUT_S)
-        if done:
+        if _wait_for(future):
             return future.result()
         self._hangs = True
         raise GLError(
             f"The OpenGL driver gave no answer within {_TIMEOUT_S:.0f} seconds. "
             "Run `mjrec doctor` to see which backend works; end this process."
         )
+
+
+def _wait_for(future: Future[Any]) -> bool:
+    """Wait until a request is answered; tell whether it is."""
+    deadline = time.monotonic() + _TIMEOUT_S
+    while not future.done() and (left := deadline - time.monotonic()) > 0:
+        # In slices: a signal that comes just before the wait does not end it, and
+        # Ctrl-C would be noticed only after it.
+        concurrent.futures.wait([future], min(left, _SLICE_S))
+    return future.done()
 
 
 def _idle() -> Future[Any]:
