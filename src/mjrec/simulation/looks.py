@@ -30,9 +30,13 @@ from .fields import (
 from .memory import address_of, raw_memory
 from .view import SceneView
 
-# Long arrays are compared at resets only, but for those that each frame is drawn from.
-_LONG = 4096
-_DRAWN = ("geom_", "site_", "mat_", "light_", "cam_", "tendon_")
+# What each frame is drawn from; whole groups, because a few long pieces are compared
+# faster than what the visualiser is known to read. Other arrays are compared at resets.
+_DRAWN = (
+    *("geom_", "site_", "mat_", "light_", "cam_", "tendon_", "actuator_cranklength"),
+    *("skin_matid", "skin_group", "skin_rgba", "skin_inflate"),
+    *("flex_matid", "flex_group", "flex_rgba", "flex_radius"),
+)
 
 # How far a camera and an option reach before their first and behind their last array.
 # Nothing beyond is looked at: it belongs to somebody else, and may change any time.
@@ -42,9 +46,9 @@ _REACH = {mujoco.MjvCamera: (16, 32), mujoco.MjvOption: (8, 8)}
 class Looks:
     """Remembers a model and a view, and tells which of their fields have changed.
 
-    At a reset any field of the model counts, in between all but the long arrays that
-    have to be uploaded to the graphics card or that no frame shows. The model is only
-    read, and kept alive.
+    At a reset any field of the model counts, in between what each frame is drawn from:
+    not textures and meshes, which have to be uploaded to the graphics card. The model
+    is only read, and kept alive.
 
     Args:
         model: the model, as it is stored now.
@@ -187,10 +191,9 @@ def _array_pieces(model: mujoco.MjModel) -> list[_Piece]:
     together = _lie_together(model, arrays)
 
     def kind(item: tuple[str, NDArray[Any]]) -> tuple[bool, str | None]:
-        name, array = item
-        is_watched = array.nbytes <= _LONG or name.startswith(_DRAWN)
+        name, _ = item
         # Should they not lie together, each is a piece of its own.
-        return is_watched, None if together else name
+        return name.startswith(_DRAWN), None if together else name
 
     pieces = []
     for (is_watched, _), group in itertools.groupby(arrays, kind):
