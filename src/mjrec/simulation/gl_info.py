@@ -11,7 +11,7 @@ import ctypes
 import importlib
 import sys
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from ..gl.egl_device import EglDevice
@@ -151,98 +151,74 @@ class _Egl:
     """
 
     def __init__(self) -> None:
-        self._library = ctypes.CDLL("libEGL.so.1")
-        get = self._library.eglGetProcAddress
-        get.restype, get.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
-        number = ctypes.POINTER(ctypes.c_int)
-        value = ctypes.POINTER(ctypes.c_ssize_t)
-        device, key = ctypes.c_void_p, ctypes.c_int
-        self._query_devices = self._function(
-            "eglQueryDevicesEXT", ctypes.c_int, ctypes.POINTER(device), number
-        )
-        self._query_string = self._function(
-            "eglQueryDeviceStringEXT", device, key, result=ctypes.c_char_p
-        )
-        self._query_attribute = self._function(
-            "eglQueryDeviceAttribEXT", device, key, value
-        )
-        self._query_binary = self._function(
-            *("eglQueryDeviceBinaryEXT", device, key, ctypes.c_int),
-            *(ctypes.c_void_p, number),
-        )
-        self._current_display = self._function(
-            "eglGetCurrentDisplay", result=ctypes.c_void_p
-        )
-        self._query_display = self._function(
-            "eglQueryDisplayAttribEXT", ctypes.c_void_p, key, value
-        )
+        self._address_of = ctypes.CDLL("libEGL.so.1").eglGetProcAddress
+        self._address_of.restype = ctypes.c_void_p
+        self._address_of.argtypes = [ctypes.c_char_p]
 
     def devices(self) -> list[int]:
         """Return EGL's handles of its devices."""
         found = (ctypes.c_void_p * _MOST_DEVICES)()
         count = ctypes.c_int()
-        if not self._query_devices or not self._query_devices(
-            _MOST_DEVICES, found, ctypes.byref(count)
-        ):
-            return []
+        most = ctypes.c_int(_MOST_DEVICES)
+        self._call("eglQueryDevicesEXT", most, found, ctypes.pointer(count))
         return [handle for handle in found[: count.value] if handle is not None]
 
     def device_in_use(self) -> int | None:
         """Return the device of the context current on this thread, if EGL can tell."""
-        if not self._current_display or not self._query_display:
+        display = self._call("eglGetCurrentDisplay", result=ctypes.c_void_p)
+        if not display:
             return None
-        display = self._current_display()
-        value = ctypes.c_ssize_t()
-        if display is None:
-            return None
-        found = self._query_display(display, _DEVICE, ctypes.byref(value))
-        return value.value if found else None
+        return self._attribute("eglQueryDisplayAttribEXT", display, _DEVICE)
 
     def about(
         self, index: int, device: int, *, in_use: bool, with_cuda: bool
     ) -> EglDevice:
         """Return what EGL tells of a device."""
         extensions = self._string(device, _EXTENSIONS).split()
-        file = ""
+        file, cuda_id, identity = "", None, ""
         if "EGL_EXT_device_drm_render_node" in extensions:
             file = self._string(device, _DRM_RENDER_NODE_FILE)
         if not file and "EGL_EXT_device_drm" in extensions:
             file = self._string(device, _DRM_DEVICE_FILE)
-        has_number = with_cuda and "EGL_NV_device_cuda" in extensions
-        has_uuid = "EGL_EXT_device_persistent_id" in extensions
+        if with_cuda and "EGL_NV_device_cuda" in extensions:
+            name = "eglQueryDeviceAttribEXT"
+            cuda_id = self._attribute(name, device, _CUDA_DEVICE)
+        if "EGL_EXT_device_persistent_id" in extensions:
+            identity = self._uuid(device)
         return EglDevice(
             index=index,
             device_file=file,
-            cuda_id=self._cuda_id(device) if has_number else None,
+            cuda_id=cuda_id,
             software="EGL_MESA_device_software" in extensions,
             in_use=in_use,
-            uuid=self._uuid(device) if has_uuid else "",
+            uuid=identity,
         )
 
     def _string(self, device: int, name: int) -> str:
-        if not self._query_string:
-            return ""
-        return (self._query_string(device, name) or b"").decode(errors="replace")
+        handle, key = ctypes.c_void_p(device), ctypes.c_int(name)
+        found = self._call(
+            "eglQueryDeviceStringEXT", handle, key, result=ctypes.c_char_p
+        )
+        return (found or b"").decode(errors="replace")
 
-    def _cuda_id(self, device: int) -> int | None:
+    def _attribute(self, function: str, holder: int, name: int) -> int | None:
         value = ctypes.c_ssize_t()
-        if not self._query_attribute or not self._query_attribute(
-            device, _CUDA_DEVICE, ctypes.byref(value)
-        ):
-            return None
-        return value.value
+        handle, key = ctypes.c_void_p(holder), ctypes.c_int(name)
+        found = self._call(function, handle, key, ctypes.pointer(value))
+        return value.value if found else None
 
     def _uuid(self, device: int) -> str:
-        value = ctypes.create_string_buffer(_UUID_LENGTH)
-        size = ctypes.c_int()
-        if not self._query_binary or not self._query_binary(
-            device, _DEVICE_UUID, _UUID_LENGTH, value, ctypes.byref(size)
-        ):
-            return ""
-        return f"GPU-{uuid.UUID(bytes=value.raw)}"
+        value = (ctypes.c_char * _UUID_LENGTH)()
+        found = self._call(
+            *("eglQueryDeviceBinaryEXT", ctypes.c_void_p(device)),
+            *(ctypes.c_int(_DEVICE_UUID), ctypes.c_int(_UUID_LENGTH)),
+            *(value, ctypes.pointer(ctypes.c_int())),
+        )
+        return f"GPU-{uuid.UUID(bytes=value.raw)}" if found else ""
 
-    def _function(
-        self, name: str, *arguments: Any, result: Any = ctypes.c_uint
-    ) -> Callable[..., Any] | None:
-        address = self._library.eglGetProcAddress(name.encode())
-        return ctypes.CFUNCTYPE(result, *arguments)(address) if address else None
+    def _call(self, name: str, *arguments: Any, result: Any = ctypes.c_uint) -> Any:
+        """Return what a function returns; None where there is no such function."""
+        address = self._address_of(name.encode())
+        if not address:
+            return None
+        return ctypes.CFUNCTYPE(result, *map(type, arguments))(address)(*arguments)
