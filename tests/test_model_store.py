@@ -432,16 +432,6 @@ def test_a_damaged_file_is_one_clear_error(
         load(directory, {**facts, "xml": facts["xml"] if kind == "xml" else None})
 
 
-def test_another_compiled_model_is_not_taken_for_it(directory: Path) -> None:
-    """It is whole, of the same size, and not the recorded one."""
-    model = sphere()
-    facts = stored(directory, model)
-    model.geom_size[0] = 7
-    (directory / facts["mjb"]).write_bytes(gzip.compress(content_of(model)))
-    with pytest.raises(UnreadableFile, match="not what was recorded"):
-        load_model(directory, facts)
-
-
 def test_a_damaged_compiled_model_is_compiled_again(
     directory: Path, mjcf: Path
 ) -> None:
