@@ -42,11 +42,6 @@ _SETTLING_THE_LAYOUT = (
     *("tendon_limited", "tendon_matid", "tendon_plasticadr"),
     "sensor_",
 )
-# Of what the model consists of, only this is drawn.
-_DRAWN = (
-    *("geom_", "site_", "mat_", "light_", "cam_", "tendon_", "skin_", "flex_"),
-    *("mesh_", "tex_", "sensor_", "wrap_", "actuator_trn", "body_weldid"),
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,12 +298,12 @@ class Capture:
         changed = self._stored.looks.changed(anything=self._looks_at_everything)
         self._looks_at_everything = False
         fixed = [name for name in changed or () if not is_settable(name)]
-        if drawn := [name for name in fixed if name.startswith(_DRAWN)]:
+        if fixed:
             raise _differs(
-                f"{', '.join(drawn)} of the model has changed in mid-episode, which "
+                f"{', '.join(fixed)} of the model has changed in mid-episode, which "
                 "changes what the model consists of"
             )
-        return {k: v for k, v in (changed or {}).items() if k not in fixed} or None
+        return changed
 
     def _end_quick_look(self) -> None:
         """Look closely from here on, whoever has been told of the memory."""
