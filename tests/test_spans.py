@@ -1470,25 +1470,31 @@ def test_a_line_that_says_nothing_is_passed_over(path: Path, line: str) -> None:
     assert not read_list(spans).is_closed
 
 
+def change_with(header: str, values: bytes = b"", *, step: int = 0) -> bytes:
+    """Return a change of a model whose record has a header of somebody's own."""
+    start = struct.pack("<q", step) + b"\x93NUMPY\1\0"
+    return start + struct.pack("<H", len(header)) + header.encode() + values
+
+
+RECORD = "{{'descr': [('a', {})], 'fortran_order': False, 'shape': {}}}"
+
+
 @pytest.mark.parametrize(
     "payload",
     [
         b"x",
-        struct.pack("<qQ", 0, 1 << 40),
-        struct.pack("<qQ", 0, (1 << 64) - 1),
-        struct.pack("<qQ", -1, 2) + b"[]",
-        struct.pack("<qQ", 0, 3) + b"[{]",
-        struct.pack("<qQ", 0, 2) + b"[]x",
-        struct.pack("<qQ", 0, 44)
-        + b'[{"name": "a", "dtype": "|O", "shape": [1]}]'
-        + bytes(8),
-        struct.pack("<qQ", 0, 51)
-        + b'[{"name": "a", "dtype": "<f8", "shape": [10000000]}]'[:51],
-        struct.pack("<qQ", 0, 100_000) + b"[" * 100_000,
+        change_with(RECORD.format("'<f8'", "()"), bytes(8), step=-1),
+        change_with(RECORD.format("'<f8'", "()"), bytes(9)),
+        change_with(RECORD.format("'<f8'", "(2,)"), bytes(16)),
+        change_with(RECORD.format("'|O'", "()"), bytes(8)),
+        change_with(RECORD.format("'<f8', (10000000,)", "()")),
+        change_with(RECORD.format("'<f8', (1 << 62,)", "()")),
+        change_with("[" * 60_000),
+        change_with("__import__('os')"),
     ],
 )
 def test_a_hostile_model_change_is_refused(path: Path, payload: bytes) -> None:
-    """Its table is believed only where it fits what is there."""
+    """Its header is believed only where it fits what is there."""
     write(new_logs(path.parent, INFIX), 0)
     *_, looks = files_of(path.parent)
     looks.write_bytes(LOOK_PREFIX.pack(0, len(payload)) + payload)

@@ -209,7 +209,7 @@ class Trajectory:
             InvalidArgument: there is no such step.
         """
         # Here, because reading needs no simulator.
-        from .model_fields import apply_fields
+        from .fields import apply_fields
         from .model_store import load_model
 
         step = self._step(step)
@@ -243,7 +243,7 @@ class Trajectory:
                 data's model.
         """
         # Here, because reading needs no simulator.
-        from .integration_state import set_state
+        from .replay import set_state
 
         row = self.states[self._step(step)]
         set_state(data.model, data, self._header.state, row)

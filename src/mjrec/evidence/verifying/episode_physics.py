@@ -20,12 +20,8 @@ from ...environments.made_again import (
 from ...errors import InvalidArgument, UnreadableFile
 from ...formats.trajectory_reader import TrajectoryReader
 from ...recorder.versions import versions
-from ...simulation.compiled_models import (
-    changed_model,
-    differing_from,
-    keeps_paths,
-    model_digest,
-)
+from ...simulation.fields import changed_model, differing_from, keeps_paths
+from ...simulation.model_store import model_digest
 from ..verification import Check, Level, Verdict
 from .differences import Differences, judged
 from .environment_replay import Replay, action_kinds, replay_episode

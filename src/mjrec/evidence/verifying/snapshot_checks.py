@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...formats.trajectory_reader import TrajectoryReader
-from ...simulation.snapshot_steps import (
+from ...simulation.replay import (
     SnapshotSteps,
     column_names,
     live_snapshot,

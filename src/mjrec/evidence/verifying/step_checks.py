@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ...formats.trajectory import ModelChange
 from ...formats.trajectory_reader import TrajectoryReader
-from ...simulation.state_steps import StateSteps
+from ...simulation.replay import StateSteps
 from .differences import Differences, compared_columns
 from .recorded_models import is_of_pictures
 
