@@ -12,7 +12,7 @@ import pytest
 from gymnasium.wrappers import RecordEpisodeStatistics
 
 import mjrec
-from mjrec.monitors.success import success_in
+from mjrec.monitors.gymnasium_monitor import success_in
 
 
 def last_info(env: Any) -> list[dict[str, Any]]:

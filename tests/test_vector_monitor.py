@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import hashlib
 import json
@@ -140,6 +141,24 @@ def test_trajectories_have_states_in_every_mode(tmp_path: Path) -> None:
         assert trajectory.states.shape[0] == 4
         assert np.isfinite(trajectory.states).all()
         assert trajectory.truncated[-1]
+
+
+# Takes more than five seconds: each of 64 monitors writes files of its own.
+def test_sub_environments_share_one_budget_of_tails(tmp_path: Path) -> None:
+    """Each of 64 is recorded, and their logs' tails have 4 MiB together."""
+    make = functools.partial(gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2)
+    vector = SyncVectorEnv([make] * 64)
+    with mjrec.Monitor(vector, tmp_path, False, mode="evaluation", render="off") as env:
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+        tails = [path.stat().st_size for path in tmp_path.glob("*.tail")]
+        assert len(tails) == 64
+        assert sum(tails) < 5 << 20
+        env.step(env.action_space.sample())
+    assert env.get_episode_lengths() == [[2]] * 64
+    for monitor in env.monitors:
+        name = f"openaigym.trajectory.{monitor.infix}.episode000000.h5"
+        assert len(mjrec.load_trajectory(tmp_path / name).actions) == 2
 
 
 def test_numbers_and_schedules_are_each_ones_own(

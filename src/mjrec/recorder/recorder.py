@@ -156,7 +156,12 @@ class Recorder:
         self._trajectory: EpisodeTrajectory | None = None
         numbers = itertools.count()
         self._logs, self._clip_logs = (
-            SpanLogs(self.directory, self._place.infix, numbers=numbers)
+            SpanLogs(
+                self.directory,
+                self._place.infix,
+                numbers=numbers,
+                tail_bytes=options.tail_bytes,
+            )
             for _ in range(2)
         )
         self._deferral = Deferral(subject)
