@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Callable
 from typing import Any
 
-from ..gl.egl_device import EglDevice
+from ..gl.probing import EglDevice
 
 _EXTENSIONS = 0x3055
 _DEVICE = 0x322C

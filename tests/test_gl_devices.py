@@ -14,7 +14,7 @@ import pytest
 
 from mjrec.errors import InvalidArgument
 from mjrec.gl import EglDevice, probe, render_on_given_gpu, visible_gpus
-from mjrec.gl.given_gpu import device_of_gpu
+from mjrec.gl.devices import device_of_gpu
 
 # As EGL told of them on a machine with one NVIDIA H100 (driver 580.159.04) while
 # CUDA_VISIBLE_DEVICES was not set, "0" or its UUID.
