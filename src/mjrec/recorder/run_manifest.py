@@ -9,7 +9,7 @@ from typing import Any
 
 from ..file_digests import file_sha256
 from ..formats.manifest import Manifest, write_manifest
-from ..surroundings import look_around
+from ..provenance import look_around
 from .episode_choice import EpisodeChoice
 from .episode_videos import EpisodeVideos
 from .faults import Faults
