@@ -12,7 +12,7 @@ from finished_files import episode
 
 import mjrec.trackers
 from mjrec.errors import InvalidArgument
-from mjrec.trackers.scalars import group_of, scalars_of
+from mjrec.trackers.services import group_of, scalars_of
 
 # As if a package were not installed; everything else is there.
 LACK = """
