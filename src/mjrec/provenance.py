@@ -91,7 +91,7 @@ class Provenance:
         """
         if wait:
             self._thread.join(_SECONDS_AT_THE_END)
-        return self._found
+        return self._found if wait or not self._thread.is_alive() else None
 
     def _look(self) -> None:
         try:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ..formats.span_writer import SpanLogs
@@ -13,7 +14,7 @@ from .deferred_clip import ClipLogs, DeferredClip
 from .ended_trajectories import EndedTrajectories
 from .episode_videos import EpisodeVideos
 from .live_videos import LiveClip, LiveVideoMaker
-from .options import DEFERRED
+from .options import DEFERRED, LIVE
 from .subject import Subject
 from .trajectory_recorder import Pace
 from .video_promises import VideoPromises
@@ -33,7 +34,8 @@ class ClipMaker:
         before: returns what was before that moment in the episode.
         can_be_deferred: tells whether what begins so can be rendered later.
         tolerates: tells whether to go on after an error.
-        videos: lists those that are over.
+        note: writes down one that is over.
+        videos: watches for their videos.
         ended: takes over the recordings of those that are over.
         logs: where clips are recorded.
     """
@@ -49,6 +51,7 @@ class ClipMaker:
         before: Callable[[], Mapping[str, Any]],
         can_be_deferred: Callable[[EpisodeStart], bool],
         tolerates: Callable[[Exception], bool],
+        note: Callable[[Mapping[str, Any]], object],
         videos: EpisodeVideos,
         ended: EndedTrajectories,
         logs: SpanLogs,
@@ -57,6 +60,7 @@ class ClipMaker:
         self._live = live
         self._can_be_deferred = can_be_deferred
         self._tolerates = tolerates
+        self._note_clip = note
         self._videos = videos
         self._ended = ended
         self._logs: ClipLogs | None = None
@@ -106,9 +110,16 @@ class ClipMaker:
         )
 
     def _add_live(self, recorders: Sequence[VideoRecorder]) -> None:
-        for recorder in recorders:
-            self._videos.add_live(recorder)
+        first = recorders[0]
+        if first.path is not None:
+            facts = {"episode_id": first.metadata["episode_id"], "recording": LIVE}
+            self._note(Path(first.path), facts)
 
     def _add_deferred(self, clip: DeferredClip) -> None:
-        self._videos.add_deferred_clip(clip)
+        facts = {"episode_id": clip.episode_id, "clip": clip.first_part.name}
+        self._note(clip.video, facts)
         self._ended.add_clip(clip.first_part)
+
+    def _note(self, video: Path, facts: Mapping[str, Any]) -> None:
+        self._note_clip({**facts, "video": video.name})
+        self._videos.expect(video)

@@ -9,7 +9,7 @@ anybody may render once the monitor is gone. What falls out is deleted at once.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -59,14 +59,22 @@ class KeptVideos:
 
     Args:
         selection: chooses.
-        videos: learns of the videos that are chosen.
+        note_dropped: told the number of an episode whose video falls out, though its
+            trajectory stays.
+        videos: watches for the videos that are chosen.
         ended: takes over trajectories about which nothing is left to decide.
     """
 
     def __init__(
-        self, selection: Selection, *, videos: EpisodeVideos, ended: EndedTrajectories
+        self,
+        selection: Selection,
+        *,
+        note_dropped: Callable[[int], object],
+        videos: EpisodeVideos,
+        ended: EndedTrajectories,
     ) -> None:
         self._selection = selection
+        self._note_dropped = note_dropped
         self._videos = videos
         self._ended = ended
         # Number of the last episode that was judged, and how it stands.
@@ -79,11 +87,6 @@ class KeptVideos:
         self._left: list[int] = []
 
     @property
-    def recorded(self) -> list[int]:
-        """The numbers of the episodes that get a video, as far as that is known."""
-        return self._left or self._selection.chosen
-
-    @property
     def is_left_open(self) -> bool:
         """Whether somebody else decides, when the monitor is gone."""
         return self._selection.is_left_open
@@ -91,6 +94,11 @@ class KeptVideos:
     def facts(self) -> dict[str, Any]:
         """Return what is said of a video by which it may be known as hand-picked."""
         return {"rule": self._selection.name, "decided": False}
+
+    def rule(self) -> dict[str, Any]:
+        """Return what the journal says of the choice from its beginning."""
+        left_open = {"left_open": True} if self.is_left_open else {}
+        return {"rule": self._selection.name, **left_open}
 
     def chosen_facts(self) -> dict[str, Any]:
         """Return the same of a video that is chosen."""
@@ -203,7 +211,7 @@ class KeptVideos:
         self._hand_on(order)
 
     def details(self) -> dict[str, Any]:
-        """Return what the manifest says of the choice."""
+        """Return what the journal says of the choice, once it is made."""
         failure = {} if self._failure is None else {"failure": self._failure}
         return {
             "rule": self._selection.name,
@@ -211,6 +219,7 @@ class KeptVideos:
             "chosen": self._selection.chosen,
             "finished": self._selection.finished,
             "most_bytes_held": self._most_bytes_held,
+            "recorded": self._left or self._selection.chosen,
             **({"left_open": True} if self.is_left_open else {}),
             **failure,
         }
@@ -239,9 +248,9 @@ class KeptVideos:
                 continue
             try:
                 if standing is Standing.CHOSEN:
-                    self._choose(episode_id, held)
+                    self._choose(held)
                 else:
-                    self._drop(held)
+                    self._drop(episode_id, held)
             except Error as error:
                 failed.append(error)
             self._bytes_held -= held.size
@@ -249,7 +258,7 @@ class KeptVideos:
         if failed:
             raise failed[0]
 
-    def _choose(self, episode_id: int, held: _Held) -> None:
+    def _choose(self, held: _Held) -> None:
         try:
             for recorder in held.live:
                 _say_in_metadata(recorder, self.chosen_facts())
@@ -258,18 +267,18 @@ class KeptVideos:
                 add_facts(held.trajectory, verdict)
                 self._ended.add(held.trajectory)
         finally:
-            self._list(episode_id, held)
+            self._expect(held)
 
-    def _list(self, episode_id: int, held: _Held) -> None:
+    def _expect(self, held: _Held) -> None:
         for recorder in held.live:
-            self._videos.add_live(recorder)
-        for recorder in held.live:
+            if recorder.path is not None and "first_video" not in recorder.metadata:
+                self._videos.expect(Path(recorder.path))
             if recorder.finished and "also_named" in recorder.metadata:
                 give_second_names(Path(str(recorder.path)))
         if held.deferred is not None and held.trajectory is not None:
-            self._videos.add_deferred(episode_id, held.trajectory, held.deferred)
+            self._videos.expect(Path(held.deferred.path))
 
-    def _drop(self, held: _Held) -> None:
+    def _drop(self, episode_id: int, held: _Held) -> None:
         # The last one that was finished is the sign that all are there.
         for recorder in reversed(held.live):
             _remove(_files_of(recorder))
@@ -279,13 +288,14 @@ class KeptVideos:
             verdict = self.verdict(Standing.DROPPED, held.promise)
             add_facts(held.trajectory, verdict)
             self._ended.add(held.trajectory)
+            self._note_dropped(episode_id)
         else:
             drop_recording(held.trajectory)
 
     def _leave_all(self) -> None:
         for episode_id in list(self._held):
             self._left.append(episode_id)
-            self._list(episode_id, self._held.pop(episode_id))
+            self._expect(self._held.pop(episode_id))
 
 
 def _files_of(recorder: VideoRecorder) -> Iterator[Path]:

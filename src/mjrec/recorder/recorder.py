@@ -18,13 +18,18 @@ from typing import Any
 
 from ..annotation import Caption
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
+from ..formats.journal import JournalEntry
 from ..formats.monitor_directory import (
+    episode_of,
     journal_name,
-    manifest_name,
     stats_prefix,
     trajectory_prefix,
+    video_prefix,
 )
+from ..formats.pending_videos import note_failure, reason_of
 from ..formats.span_writer import SpanLogs
+from ..formats.spans import FINISHED
+from ..results.listing import write_listing
 from ..results.recorded_environment import GYM_VERSION
 from ..simulation.state_source import EpisodeStart, StateSource
 from .begun_episode import BegunEpisode
@@ -35,7 +40,6 @@ from .deferred_video import DeferredVideo
 from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
 from .episode_choice import EpisodeChoice
-from .episode_journal import EpisodeJournal
 from .episode_trajectory import EpisodeTrajectory
 from .episode_videos import EpisodeVideos
 from .fast_path import FastPath, counting
@@ -45,7 +49,7 @@ from .live_videos import LiveVideoMaker, LiveVideos
 from .opening import OpenDirectory, open_directory
 from .options import DEFERRED, LIVE, RecorderOptions, type_of_mode
 from .recording_facts import RecordingFacts
-from .run_manifest import RunManifest
+from .run_journal import RunJournal
 from .selection import Standing
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import Subject, check_pictures
@@ -98,7 +102,9 @@ class Recorder:
         self._is_forked = False
         _recorders.add(self)
         self._videos = EpisodeVideos()
-        self._faults = Faults(options.on_error)
+        self._faults = Faults(
+            options.on_error, lambda fault: self._journal.note("fault", fault)
+        )
         # Why the running episode ends early, once the environment has raised.
         self._ending: dict[str, Any] | None = None
         # What the last step said.
@@ -122,15 +128,24 @@ class Recorder:
         self._kept: KeptVideos | None = None
         if self._choice.selection is not None:
             self._kept = KeptVideos(
-                self._choice.selection, videos=self._videos, ended=self._ended
+                self._choice.selection,
+                note_dropped=lambda number: self._journal.note("dropped", number),
+                videos=self._videos,
+                ended=self._ended,
             )
         self._next_episode_id = self._place.first_episode_id
         self._episode: BegunEpisode | None = None
-        self._journal = EpisodeJournal(
+        self._journal = RunJournal(
             self.directory / journal_name(self._place.infix),
             env_info=env_info,
+            schedule=self._choice.schedule_name,
+            keep=None if self._kept is None else self._kept.rule(),
+            first_episode_id=self._place.first_episode_id,
+            options=options,
             tolerates=functools.partial(self._tolerates, "journal"),
         )
+        # The last episode that the journal has.
+        self._journaled = -1
         self.stats_recorder = StatsRecorder(
             str(self.directory),
             stats_prefix(self._place.infix),
@@ -186,16 +201,6 @@ class Recorder:
             infix=str(self._place.infix), subject=subject, selection=selection
         )
         self._clips = self._new_clips() if options.has_clips else None
-        self._manifest = RunManifest(
-            self.directory / manifest_name(self._place.infix),
-            env_info=env_info,
-            options=options,
-            first_episode_id=self._place.first_episode_id,
-            choice=self._choice,
-            kept=self._kept,
-            videos=self._videos,
-            faults=self._faults,
-        )
         self.closed = False
         # What the next step may be recorded with; None where it needs a closer look.
         self.fast: FastPath | None = None
@@ -380,7 +385,7 @@ class Recorder:
             if done:
                 # First of all, so that no failing video can lose the episode.
                 self._finished = self._finished_episode()
-                self._journal.add(self._finished)
+                self._journal_episode(self._finished)
         finally:
             try:
                 if self._trajectory is not None:
@@ -477,6 +482,7 @@ class Recorder:
             before=self._before_clip,
             can_be_deferred=self._deferral.is_possible,
             tolerates=functools.partial(self._tolerates, "video"),
+            note=functools.partial(self._journal.note, "clip"),
             videos=self._videos,
             ended=self._ended,
             logs=self._clip_logs,
@@ -508,8 +514,9 @@ class Recorder:
                 raise
 
     def add_video(self, video: VideoRecorder) -> None:
-        """List one more video of an episode, which is closed, in the manifest."""
-        self._videos.add_live(video)
+        """Let trackers know of one more video of an episode, which is closed."""
+        if video.path is not None:
+            self._videos.expect(Path(video.path))
 
     def failures(self) -> Mapping[str, str]:
         """Return why videos could not be rendered, by their names."""
@@ -520,12 +527,11 @@ class Recorder:
         # error in any case: no simulation is disturbed, and nothing else would say it.
         self._tell_of_videos()
         self._trackers.end()
-        self._write_results(is_last=True)
+        pending = self._write_last_results()
         self.closed = True
         self.stats_recorder.closed = True
         self._journal.close()
         self._place.lock.release()
-        pending = len(self._videos.pending())
         is_left_open = self._kept is not None and self._kept.is_left_open
         if pending and not is_left_open:
             # Said aloud: nobody else will render them.
@@ -571,6 +577,9 @@ class Recorder:
         self._trajectory = self._live_videos = self.video_recorder = None
         episode_id = episode.episode_id
         wanted = self._choice.decide(episode_id)
+        chosen = wanted and self._kept is None
+        self._journal.run.begin(episode_id, chosen=chosen)
+        self._journal.begin()
         if self._clips is not None:
             self._clips.reset(episode_id, is_chosen=wanted)
             # The episode has no video of its own.
@@ -683,6 +692,35 @@ class Recorder:
             **self._flags,
         )
 
+    def _journal_episode(self, episode: FinishedEpisode) -> None:
+        """Write down an episode that is complete."""
+        facts = {**vars(episode), **self._choice_facts(is_complete=True)}
+        del facts["total_steps"]
+        self._journaled = episode.episode_id
+        self._journal.add(JournalEntry(**facts))
+
+    def _journal_cut(self, facts: Mapping[str, Any]) -> None:
+        """Write down an episode that is no part of the statistics."""
+        episode = self._episode
+        is_over = self.stats_recorder.done is not False
+        if is_over or episode is None or self._journaled == episode.episode_id:
+            return
+        self._journaled = episode.episode_id
+        cut = {"episode_id": episode.episode_id, "reason": facts.get("reason")}
+        self._journal.note("cut", {**cut, **self._choice_facts(is_complete=False)})
+
+    def _choice_facts(self, *, is_complete: bool) -> dict[str, Any]:
+        """Return whether the running episode was chosen, and how it is filmed."""
+        standing = self._standing(is_complete=is_complete)
+        chosen = self._choice.is_scheduled and standing is Standing.CHOSEN
+        recording = None
+        if self._trajectory is not None and self._trajectory.deferred is not None:
+            recording = DEFERRED
+        elif self._live_videos is not None:
+            recording = LIVE
+        is_out = standing is Standing.DROPPED
+        return {"chosen": chosen, "recording": None if is_out else recording}
+
     def _tell_of_episode(self) -> None:
         if not self._trackers:
             return
@@ -758,6 +796,7 @@ class Recorder:
         facts = self._how_it_ended(otherwise)
         standing = self._standing(is_complete=facts["complete"])
         try:
+            self._journal_cut(facts)
             self._end_trajectory(facts, standing)
         finally:
             if self._live_videos is not None:
@@ -805,7 +844,7 @@ class Recorder:
             )
             return
         if deferred is not None and standing is Standing.CHOSEN:
-            self._videos.add_deferred(episode_id, trajectory.path, deferred)
+            self._videos.expect(Path(deferred.path))
         self._ended.add(trajectory.path)
 
     def _end_live_videos(
@@ -823,8 +862,8 @@ class Recorder:
         def list_one(recorder: VideoRecorder) -> None:
             if kept is not None and standing is Standing.CANDIDATE:
                 kept.hold_live(self._running.episode_id, recorder)
-            else:
-                self._videos.add_live(recorder)
+            elif recorder.path is not None and "first_video" not in recorder.metadata:
+                self._videos.expect(Path(recorder.path))
 
         try:
             videos.end(known, list_one)
@@ -836,14 +875,39 @@ class Recorder:
         """Return what is known of a live video from its episode's beginning."""
         return self._facts.of_live_video(self._running)
 
-    def _write_results(self, *, is_last: bool = False) -> None:
-        self.stats_recorder.flush()
-        self._manifest.write(
-            stats=Path(self.stats_recorder.path),
-            next_episode_id=self._next_episode_id,
-            failures=self.failures(),
-            is_last=is_last,
+    def _write_last_results(self) -> int:
+        """Write what the run amounts to; return how many videos are pending."""
+        self._journal.note_surroundings(wait=True)
+        if self._kept is not None:
+            self._journal.note("keep", self._kept.details())
+        self._journal.note("closed", {"next_episode_id": self._next_episode_id})
+        for name, why in self.failures().items():
+            # Most were written down by the process that has failed.
+            video = self.directory / self._video_of(name)
+            if video.suffix == ".mp4" and reason_of(video) is None:
+                note_failure(video, why)
+        return self._write_results()
+
+    def _video_of(self, name: str) -> str:
+        """Return the name of the video of a recording, or of a video."""
+        for video, clip in self._journal.run.clips.items():
+            if clip.get("clip") == name:
+                return video
+        number = episode_of(name)
+        if number is None or not name.endswith(FINISHED):
+            return name
+        return f"{video_prefix(self._place.infix, number)}.mp4"
+
+    def _write_results(self) -> int:
+        listing = write_listing(
+            self.directory,
+            self._place.infix,
+            run=self._journal.run,
+            stats=self.stats_recorder.stats(),
+            is_own=True,
         )
+        assert listing is not None, "nobody else has this monitor's lock"
+        return len(listing.pending)
 
 
 # Asking the system for the process's number at every step takes as long as counting it.

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..errors import UnreadableFile
 from ..formats.in_flight import find_recording
-from ..formats.journal import JournalReader
+from ..formats.journal import run_facts
 from ..formats.json_fields import json_object, read_object
 from ..formats.manifest import Manifest
 from .monitor_files import MonitorFiles
@@ -64,10 +64,7 @@ def _witnesses(
 
 
 def _in_journal(path: Path) -> object:
-    reader = JournalReader(path)
-    # Only the first line has it.
-    next(iter(reader), None)
-    return reader.env_info
+    return (run_facts(path) or {}).get("env_info")
 
 
 def _in_lock(path: Path) -> object:
