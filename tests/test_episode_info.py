@@ -46,15 +46,6 @@ def test_last_step_has_what_gymnasium_gives(tmp_path: Path) -> None:
     assert 0 < last["episode"]["t"] < 60
 
 
-def test_time_is_that_of_the_episode(tmp_path: Path) -> None:
-    """Not of the run: a second episode is no longer than it took."""
-    with monitor(tmp_path, episode_info=True) as env:
-        first = last_info(env)[-1]["episode"]["t"]
-        spent = sum(last_info(env)[-1]["episode"]["t"] for _ in range(20))
-    assert spent < 20 * 60
-    assert first > 0
-
-
 def test_key_that_is_there_stays(tmp_path: Path) -> None:
     """The environment below, or a wrapper of it, has said it already."""
     inner = RecordEpisodeStatistics(gymnasium.make("CartPole-v1"))

@@ -79,23 +79,18 @@ def test_a_program_in_a_repository(repository: Path) -> None:
     }
 
 
-def test_changed_code_is_dirty(repository: Path) -> None:
-    """A file that git knows and that is other than committed."""
-    around = Provenance(repository).found(wait=True)
-    assert around is not None
-    assert around["code"]["dirty"] is False
+def test_code_that_changed_or_is_in_no_repository(
+    repository: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Files that git knows count; elsewhere there is nothing to say of code."""
     (repository / "train.py").write_text("pass\n")
-    around = Provenance(repository).found(wait=True)
-    assert around is not None
-    assert around["code"]["dirty"] is True
-
-
-def test_code_in_no_repository(tmp_path: Path) -> None:
-    """Then there is nothing to say of it, and the rest is there."""
-    around = Provenance(tmp_path).found(wait=True)
-    assert around is not None
-    assert around["code"] is None
-    assert "numpy" in around["packages"]
+    changed = Provenance(repository).found(wait=True)
+    assert changed is not None
+    assert changed["code"]["dirty"] is True
+    elsewhere = Provenance(tmp_path_factory.mktemp("none")).found(wait=True)
+    assert elsewhere is not None
+    assert elsewhere["code"] is None
+    assert "numpy" in elsewhere["packages"]
 
 
 def test_the_policys_file_must_be_there(corridor: Any, tmp_path: Path) -> None:
@@ -125,7 +120,7 @@ gripper/__init__.py,sha256=abc,12"""
 def install(directory: Path, version: str, record: str | None = None) -> None:
     """Put what an installer leaves of a package called Gripper into a directory."""
     info = directory / f"gripper-{version}.dist-info"
-    info.mkdir(parents=True)
+    info.mkdir(parents=True, exist_ok=True)
     (info / "METADATA").write_text(f"Name: Gripper\nVersion: {version}\n")
     if record is not None:
         (info / "RECORD").write_text(record)
@@ -170,25 +165,16 @@ def test_hashes_are_of_what_a_wheel_consists_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever the order of its lines, and whatever its installer adds to them."""
+    install(tmp_path, "1.5")
+    # What is no text on the path is passed over, as Python's own import does.
+    monkeypatch.setattr(sys, "path", [tmp_path, None, str(tmp_path), *sys.path])
+    found = installed_packages()["Gripper"]
+    assert found == {"version": "1.5", "record_sha256": None}
     install(tmp_path, "1.5", RECORD)
-    monkeypatch.syspath_prepend(tmp_path)
     expected = hashlib.sha256(OF_THE_WHEEL.encode()).hexdigest()
     assert installed_packages()["Gripper"] == {
         "version": "1.5",
         "record_sha256": expected,
-    }
-
-
-@every_way
-def test_a_package_without_a_list_of_its_files_has_no_hash(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As those of a distribution's packager; it is named all the same."""
-    install(tmp_path, "2.0")
-    monkeypatch.syspath_prepend(tmp_path)
-    assert installed_packages()["Gripper"] == {
-        "version": "2.0",
-        "record_sha256": None,
     }
 
 
@@ -208,29 +194,6 @@ def test_the_first_on_the_path_counts(
     imported = importlib.metadata.version("gripper")
     assert imported in ("1.0", "2.0")
     assert installed_packages()["Gripper"]["version"] == imported
-
-
-@every_way
-def test_the_working_directory_counts_where_it_is_searched(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Python puts it on the path as an empty name."""
-    install(tmp_path / "work", "1.0")
-    monkeypatch.chdir(tmp_path / "work")
-    assert "Gripper" not in installed_packages()
-    monkeypatch.setattr(sys, "path", ["", *sys.path])
-    assert installed_packages()["Gripper"]["version"] == "1.0"
-
-
-@every_way
-def test_what_is_no_text_on_the_path_is_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As Python's own import does: a `Path` there finds nothing."""
-    install(tmp_path, "1.0")
-    before = installed_packages()
-    monkeypatch.setattr(sys, "path", [tmp_path, None, *sys.path])
-    assert installed_packages() == before
 
 
 @every_way
