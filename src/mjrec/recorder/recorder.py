@@ -53,8 +53,7 @@ from .run_journal import RunJournal
 from .selection import Standing
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import Subject, check_pictures
-from .told_trackers import ToldTrackers
-from .tracking import FinishedEpisode, Run
+from .tracking import FinishedEpisode, Run, Trackers
 from .trajectory_recorder import Pace, TrajectoryRecorder
 from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder
@@ -155,7 +154,7 @@ class Recorder:
         self.stats_recorder.type = type_of_mode(options.mode)
         # The simulated time of the reset, where it is to be written on pictures.
         self._reset_clock: float | None = None
-        self._trackers = ToldTrackers(
+        self._trackers = Trackers(
             Run(
                 directory=self.directory,
                 infix=str(self._place.infix),
