@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -119,22 +119,25 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
             shared = SharedRendering(workers=options.workers, strict=options.strict)
         # How a sub-environment is closed; until all have monitors, not at all.
         closing: dict[str, Callable[[Env], None]] = {"by": lambda env: None}
-        with _all_or_none(directory) as opened:
-            for index, each in enumerate(envs):
-                opened.append(
-                    (GymnasiumMonitor if inside else SlotMonitor)(
-                        each,
-                        directory,
-                        _options_of(index, len(envs), options, view),
-                        **view,
-                        env_id=env_id,
-                        env_index=index,
-                        rendering=None if shared is None else shared.share,
-                        close_environment=lambda env: closing["by"](env),
-                    )
+        kind = SlotMonitor if inside is None else GymnasiumMonitor
+        self.monitors: tuple[GymnasiumMonitor, ...] = _all_or_none(
+            directory,
+            [
+                functools.partial(
+                    kind,
+                    each,
+                    directory,
+                    _options_of(index, len(envs), options, view),
+                    **view,
+                    env_id=env_id,
+                    env_index=index,
+                    rendering=None if shared is None else shared.share,
+                    close_environment=lambda env: closing["by"](env),
                 )
+                for index, each in enumerate(envs)
+            ],
+        )
         closing["by"] = close_environment
-        self.monitors: tuple[GymnasiumMonitor, ...] = tuple(opened)
         self._shared = shared
         self._tiled = None
         # What `close` passes on to the environment's own.
@@ -472,11 +475,10 @@ def _options_of(
     return dataclasses.replace(options, **changed)
 
 
-@contextlib.contextmanager
 def _all_or_none(
-    directory: str | os.PathLike[str],
-) -> Iterator[list[GymnasiumMonitor]]:
-    """Yield a list for monitors that are opened one by one; undo all if one fails.
+    directory: str | os.PathLike[str], opens: Iterable[Callable[[], GymnasiumMonitor]]
+) -> tuple[GymnasiumMonitor, ...]:
+    """Return the monitors that the functions open; undo all if one fails.
 
     Their files are removed, and the directories made for them.
     """
@@ -484,7 +486,8 @@ def _all_or_none(
     missing = [each for each in (path, *path.parents) if not each.exists()]
     opened: list[GymnasiumMonitor] = []
     try:
-        yield opened
+        for open_one in opens:
+            opened.append(open_one())
     except BaseException:
         for monitor in opened:
             # What was raised first is what the user needs to see.
@@ -499,6 +502,7 @@ def _all_or_none(
             with contextlib.suppress(OSError):
                 made.rmdir()
         raise
+    return tuple(opened)
 
 
 def _warn_of_missing_frames(env: VectorEnv, is_outside: bool, is_tiled: bool) -> None:
