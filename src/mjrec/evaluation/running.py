@@ -26,7 +26,7 @@ from ..environments.policies import Policy, load_policy, policy_file, policy_fro
 from ..environments.working_directory import working_directory_importable
 from ..errors import Error, InvalidArgument, PolicyError
 from ..monitors import Monitor
-from ..monitors.rendering_choice import rendering_choice
+from ..monitors.base import rendering_choice
 from ..recorder.opening import JOIN
 from ..recorder.options import DEFERRED, RenderingChoice
 from ..recorder.selection import UNDECIDED

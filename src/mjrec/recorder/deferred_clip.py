@@ -31,7 +31,7 @@ from .options import DEFERRED
 from .trajectory_recorder import TrajectoryRecorder
 
 if TYPE_CHECKING:
-    from ..simulation.capture import EpisodeStart
+    from ..simulation.capture import Capture, EpisodeStart
 
 logger = logging.getLogger(__name__)
 

@@ -110,7 +110,13 @@ class MonitoredRun:
         self.selection = selection
         numbers = itertools.count()
         self.logs, self.clip_logs = (
-            SpanLogs(place.path, place.infix, numbers=numbers) for _ in range(2)
+            SpanLogs(
+                place.path,
+                place.infix,
+                numbers=numbers,
+                tail_bytes=options.tail_bytes,
+            )
+            for _ in range(2)
         )
         self.pace = Pace(
             clock=subject.clock, declared=subject.declared, max_fps=options.max_fps

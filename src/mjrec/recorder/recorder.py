@@ -43,8 +43,7 @@ from .run_journal import RunJournal, facts_of
 from .selection import Standing
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import Subject, check_pictures
-from .told_trackers import ToldTrackers
-from .tracking import FinishedEpisode, Run
+from .tracking import FinishedEpisode, Run, Trackers
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
@@ -129,7 +128,7 @@ class Recorder:
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
-        self._trackers = ToldTrackers(
+        self._trackers = Trackers(
             Run(
                 directory=self.directory,
                 infix=str(self._place.infix),

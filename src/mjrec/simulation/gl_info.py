@@ -14,7 +14,7 @@ import uuid
 from collections.abc import Iterator
 from typing import Any
 
-from ..gl.egl_device import EglDevice
+from ..gl.probing import EglDevice
 
 _NAMES = ("GL_VENDOR", "GL_RENDERER", "GL_VERSION")
 _MAX_RENDERBUFFER_SIZE = 0x84E8

@@ -6,17 +6,25 @@ from __future__ import annotations
 import functools
 import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVar
 
 from ..environments.scenes import Scenes
+from ..errors import NotPicklable, PicturesDiffer, RenderError
 from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
 from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
 from ..recorder.finisher import Finisher
-from ..recorder.options import DEFERRED, RecorderOptions
+from ..recorder.options import (
+    DEFERRED,
+    LIVE,
+    OFF,
+    WARN,
+    RecorderOptions,
+    RenderingChoice,
+)
 from ..recorder.recorder import Recorder
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.subject import Subject
@@ -24,16 +32,78 @@ from ..recorder.video_recorder import VideoRecorder
 from ..rendering.background import Background
 from ..simulation.inside import simulation_time
 from .cameras import CameraPictures
-from .lifetime import MonitorLifetime
-from .rendering_choice import rendering_choice
-from .waiting import waiting_display
+from .progress import render_progress
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+_NO_SIMULATION = "it has no MuJoCo model and data that can be seen"
 
-class MonitorControls(MonitorLifetime):
+
+class Closable:
+    """A context manager that waits for its videos unless it is left by an exception."""
+
+    _options: RecorderOptions
+    _reported_failures = False
+
+    @property
+    def directory(self) -> Path:
+        """The monitor directory, absolute."""
+        raise NotImplementedError
+
+    def close(self, *, wait: bool = True) -> None:
+        """Finish the recordings, then close the environment; `wait` for all videos."""
+        raise NotImplementedError
+
+    def _note_error(self, error: BaseException) -> None:
+        """Note that the environment, or its user, has raised."""
+        raise NotImplementedError
+
+    def _raise_failures(self, failures: Mapping[str, str]) -> None:
+        """Say once why videos could not be rendered.
+
+        Args:
+            failures: the reasons, by the names of the videos.
+
+        Raises:
+            RenderError: there are some, and `on_error` is "raise".
+        """
+        if not failures or self._reported_failures:
+            return
+        self._reported_failures = True
+        error = RenderError(self.directory, failures)
+        if self._options.on_error != WARN:
+            raise error
+        logger.warning("%s", error)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc_info: Any) -> Literal[False]:
+        _, first, _ = exc_info
+        if first is not None:
+            self._note_error(first)
+        try:
+            # Whoever leaves by an exception does not wait for videos.
+            self.close(wait=first is None)
+        except Exception as second:
+            if first is None:
+                raise
+            # What went wrong first is what the user needs to see.
+            first.add_note(f"Closing the monitor failed too: {second}")
+        return False
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
+        raise NotPicklable(
+            f"A {type(self).__name__} cannot be pickled or copied: it writes files, "
+            "and two would write the same ones. Make it in the process that uses it, "
+            "inside the function that makes the environment: "
+            "lambda: mjrec.Monitor(gymnasium.make(...), directory, resume=True)."
+        )
+
+
+class MonitorBase(Closable):
     """The part of a monitor that does not depend on the framework.
 
     Attributes:
@@ -42,10 +112,11 @@ class MonitorControls(MonitorLifetime):
     """
 
     allows_early_reset: ClassVar[bool]
+    # Why there are no states, where there are none.
+    _no_simulation: ClassVar[str] = _NO_SIMULATION
 
     _recorder: Recorder
     _guard: ExitGuard
-    _options: RecorderOptions
 
     @property
     def directory(self) -> Path:
@@ -131,12 +202,12 @@ class MonitorControls(MonitorLifetime):
         """
         try:
             if wait:
-                with waiting_display() as on_progress:
+                with render_progress(title="rendering ") as on_progress:
                     self._recorder.finish(on_progress)
         finally:
             self._guard.close()
         if wait:
-            self._raise_failures()
+            self._raise_failures(self._recorder.failures())
 
     def _note_error(self, error: BaseException) -> None:
         self._recorder.note_error(error)
@@ -152,33 +223,39 @@ class MonitorControls(MonitorLifetime):
             recorder.note_error(error)
             raise
 
-    def _failures(self) -> Mapping[str, str]:
-        return self._recorder.failures()
-
-    def _start(
+    def _open(
         self,
         env: Any,
         directory: str | os.PathLike[str],
+        options: RecorderOptions,
         *,
         env_id: str,
         view: CameraPictures,
-        scenes: Scenes,
-        options: RecorderOptions,
+        scenes: Callable[[], Scenes],
         close_environment: Callable[[Any], None],
-        clip_scenes: Scenes | None,
         env_index: int | None = None,
         rendering: Callable[[Path], Finisher] | None = None,
     ) -> None:
         """Open the directory; from here on the environment is this monitor's.
 
         What renders is made by `rendering`, or is a service of this monitor's own.
-        `clip_scenes` are `scenes` once more, for videos that are counted in steps;
-        None without any.
         """
-        choice = rendering_choice(options.render, scenes, env_id)
-        self._open(
+        known = scenes()
+        # Clips run beside episodes, and a source of states has one reader only.
+        clip_states = scenes().states if options.has_clips else None
+        choice = rendering_choice(
+            options.render, known, env_id, no_simulation=self._no_simulation
+        )
+        if choice.mode != DEFERRED or options.workers == 0:
+            rendering = None
+        elif rendering is None:
+            rendering = functools.partial(
+                Background, workers=options.workers, strict=options.strict
+            )
+        self._options = options
+        self._recorder = Recorder(
             directory,
-            Subject(
+            subject=Subject(
                 env_id=env_id,
                 env_index=env_index,
                 pictures=view.pictures,
@@ -187,40 +264,20 @@ class MonitorControls(MonitorLifetime):
                 clock=functools.partial(simulation_time, env),
                 declared=functools.partial(declared_rate, env),
                 rendering=choice,
-                states=scenes.states,
-                clip_states=None if clip_scenes is None else clip_scenes.states,
-                environment=scenes.environment,
-                random_state=scenes.random_state,
+                states=known.states,
+                clip_states=clip_states,
+                environment=known.environment,
+                random_state=known.random_state,
             ),
             options=options,
-            rendering=rendering or _rendering(options),
-            close_environment=functools.partial(close_environment, env),
+            finisher=rendering,
         )
-
-    def _open(
-        self,
-        directory: str | os.PathLike[str],
-        subject: Subject,
-        *,
-        options: RecorderOptions,
-        rendering: Callable[[Path], Finisher] | None,
-        close_environment: Callable[[], None],
-    ) -> None:
-        self._options = options
-        self._recorder = Recorder(
-            directory,
-            subject=subject,
-            options=options,
-            finisher=rendering if subject.rendering.mode == DEFERRED else None,
-        )
+        closings = [self._recorder.close]
+        closings += [each.close for each in (known.states, clip_states) if each]
+        closings.append(functools.partial(close_environment, env))
         self._guard = ExitGuard(
             self,
-            functools.partial(
-                _close,
-                self._recorder,
-                (subject.states, subject.clip_states),
-                close_environment,
-            ),
+            functools.partial(call_all, closings),
             at_exit=functools.partial(_note_last_error, self._recorder),
         )
 
@@ -235,27 +292,54 @@ class MonitorControls(MonitorLifetime):
             self._guard.run_first_at_exit()
 
 
-def _rendering(options: RecorderOptions) -> Callable[[Path], Finisher] | None:
-    if options.workers == 0:
-        return None
-    return functools.partial(Background, workers=options.workers, strict=options.strict)
+def rendering_choice(
+    asked: str | None,
+    scenes: Scenes,
+    env_id: str,
+    *,
+    no_simulation: str = _NO_SIMULATION,
+) -> RenderingChoice:
+    """Return when the pictures of an environment are drawn.
+
+    Args:
+        asked: `"deferred"`, `"live"`, `"off"`, or None for deferred where it is known
+            that the pictures follow from the states, else live.
+        scenes: what is known of the environment.
+        env_id: its name, for messages.
+        no_simulation: why there are no states, where there are none.
+
+    Raises:
+        PicturesDiffer: deferred was asked for, and the pictures do not follow.
+    """
+    if asked in (LIVE, OFF):
+        return RenderingChoice(mode=str(asked), is_forced=True)
+    obstacle = no_simulation if scenes.states is None else scenes.obstacle
+    if obstacle is None:
+        logger.info("The videos of %s are rendered from recorded states.", env_id)
+        return RenderingChoice(mode=DEFERRED, is_forced=asked == DEFERRED)
+    if asked == DEFERRED:
+        raise PicturesDiffer(
+            f'render="deferred" was asked for, and what {env_id} shows cannot be made '
+            f'from its recorded state: {obstacle}. Use render="live" (or None, which '
+            "chooses)."
+        )
+    logger.info("The videos of %s are drawn live: %s.", env_id, obstacle)
+    return RenderingChoice(mode=LIVE, reason=obstacle)
+
+
+def call_all(calls: Iterable[Callable[[], object]]) -> None:
+    """Call all, also where one raises; then raise what the first has raised."""
+    first: BaseException | None = None
+    for call in calls:
+        try:
+            call()
+        except BaseException as error:
+            first = first or error
+    if first is not None:
+        raise first
 
 
 def _note_last_error(recorder: Recorder) -> None:
     error = last_error()
     if error is not None:
         recorder.note_error(error)
-
-
-def _close(
-    recorder: Recorder,
-    acquired: tuple[Any, ...],
-    close_environment: Callable[[], None],
-) -> None:
-    try:
-        recorder.close()
-    finally:
-        for each in acquired:
-            if each is not None:
-                each.close()
-        close_environment()

@@ -14,7 +14,7 @@ import pytest
 
 from mjrec.errors import InvalidArgument
 from mjrec.gl import EglDevice, probe, render_on_given_gpu, visible_gpus
-from mjrec.gl.given_gpu import device_of_gpu
+from mjrec.gl.devices import device_of_gpu
 
 # As EGL told of them on a machine with one NVIDIA H100 (driver 580.159.04) while
 # CUDA_VISIBLE_DEVICES was not set, "0" or its UUID.
@@ -70,43 +70,35 @@ needs_gpu = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("gpu", ["0", "GPU-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b"])
-def test_the_device_that_has_a_cuda_number(gpu: str) -> None:
-    """It is the one that CUDA shows, wherever in EGL's list."""
-    last = replace(H100, index=2)
-    assert device_of_gpu([H100], gpu) is H100
-    assert device_of_gpu([LLVMPIPE, OTHER, last], gpu) is last
-
-
-@pytest.mark.parametrize("cuda_id", [0, 3])
-def test_the_number_may_count_all_gpus_or_the_shown_ones(cuda_id: int) -> None:
-    """Of four GPUs only the shown one has any."""
-    shown = replace(H100, index=2, cuda_id=cuda_id)
-    four = [HIDDEN, OTHER, shown, replace(OTHER, index=3)]
-    assert device_of_gpu(four, "3") is shown
-
-
-def test_a_uuid_needs_no_cuda() -> None:
-    """EGL tells UUIDs even where CUDA shows nothing; the beginning is enough."""
-    assert device_of_gpu([HIDDEN, OTHER], OTHER.uuid) is OTHER
-    assert device_of_gpu([HIDDEN, OTHER], "GPU-F3544F26") is HIDDEN
+SHOWN = replace(H100, index=2, cuda_id=3)
 
 
 @pytest.mark.parametrize(
-    ("devices", "gpu"),
+    ("devices", "gpu", "expected"),
     [
-        ([], "0"),
-        ([LLVMPIPE], "0"),
-        ([HIDDEN], "1"),
-        ([HIDDEN, OTHER], "GPU-"),
-        ([HIDDEN], "GPU-00000000-0000-0000-0000-000000000000"),
-        ([HIDDEN], "MIG-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b"),
-        ([H100, replace(H100, index=1)], "0"),
+        # The one that has a number for CUDA, wherever it is in EGL's list; the number
+        # may count all GPUs, or those that are shown.
+        ([H100], "0", H100),
+        ([LLVMPIPE, OTHER, SHOWN], "0", SHOWN),
+        ([HIDDEN, OTHER, SHOWN, replace(OTHER, index=3)], "3", SHOWN),
+        # EGL tells UUIDs also where CUDA shows nothing; the beginning is enough.
+        ([HIDDEN, OTHER], OTHER.uuid, OTHER),
+        ([HIDDEN, OTHER], "GPU-F3544F26", HIDDEN),
+        # Where none or several would do, it is none.
+        ([], "0", None),
+        ([LLVMPIPE], "0", None),
+        ([HIDDEN], "1", None),
+        ([HIDDEN, OTHER], "GPU-", None),
+        ([HIDDEN], "GPU-00000000-0000-0000-0000-000000000000", None),
+        ([HIDDEN], "MIG-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b", None),
+        ([H100, replace(H100, index=1)], "0", None),
     ],
 )
-def test_no_device_is_guessed(devices: list[EglDevice], gpu: str) -> None:
-    """Where none or several would do, it is none."""
-    assert device_of_gpu(devices, gpu) is None
+def test_egls_device_of_a_gpu(
+    devices: list[EglDevice], gpu: str, expected: EglDevice | None
+) -> None:
+    """It is found by CUDA's number or the UUID, and never guessed."""
+    assert device_of_gpu(devices, gpu) is expected
 
 
 @pytest.mark.parametrize(
@@ -156,30 +148,18 @@ def test_a_process_that_was_given_none(visible: str) -> None:
 
 @needs_no_gpu
 def test_one_warning_where_the_cpu_draws() -> None:
-    """It names the GPU and what draws instead; no variable changes."""
+    """It names GPU and CPU; no variable changes; an error where a GPU is required."""
     done = run(
         "before = dict(os.environ); given = render_on_given_gpu('3')\n"
         "assert dict(os.environ) == before\n"
         "assert given.device is None\n"
-        "print(given.warning)"
+        "print(given.warning)\n"
+        "render_on_given_gpu('GPU-1a2b', required=True)"
     )
-    assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("GPU 3 was given for rendering, and EGL has only")
     assert done.stdout.strip() in done.stderr
     assert done.stderr.count("WARNING") == 1
-
-
-@needs_no_gpu
-def test_an_error_where_it_is_required() -> None:
-    """With the same words, and no variable changed."""
-    done = run(
-        "before = dict(os.environ)\n"
-        "try: render_on_given_gpu(required=True)\n"
-        "finally: assert dict(os.environ) == before",
-        CUDA_VISIBLE_DEVICES="GPU-1a2b,GPU-3c4d",
-    )
     assert "GLError: GPU GPU-1a2b was given for rendering" in done.stderr
-    assert "WARNING" not in done.stderr
 
 
 @pytest.mark.parametrize("backend", ["osmesa", "glfw"])

@@ -193,10 +193,9 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
 
     When it raises, `env` is as it was, and no file is left.
     """
-    monitor = _monitor_class(env)
-    if resume is True and not force:
-        _recover(directory)
-    return monitor(
+    if allow_early_reset is None:
+        allow_early_reset = _monitor_class(env).allows_early_reset
+    return monitored(
         env,
         directory,
         RecorderOptions(
@@ -224,11 +223,7 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
             tiled=tiled,
             trackers=trackers,
             policy_file=policy_file,
-            allow_early_reset=(
-                monitor.allows_early_reset
-                if allow_early_reset is None
-                else allow_early_reset
-            ),
+            allow_early_reset=allow_early_reset,
         ),
         camera=camera,
         height=height,
@@ -237,14 +232,29 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
     )
 
 
-def _recover(directory: str | os.PathLike[str]) -> None:
-    """Put in order what killed monitors have left in a directory that is resumed."""
-    if Path(directory).is_dir():
+def monitored(
+    env: Any,
+    directory: str | os.PathLike[str],
+    options: RecorderOptions,
+    **view: Any,
+) -> GymnasiumMonitor | VectorMonitor | DmEnvMonitor:
+    """Do what `Monitor` does.
+
+    Args:
+        env: likewise.
+        directory: likewise.
+        options: likewise, in one.
+        **view: `camera`, `height`, `width` and `env_id`.
+    """
+    monitor = _monitor_class(env)
+    if options.resume is True and not options.force and Path(directory).is_dir():
+        # What killed monitors have left is put in order first.
         recovery = recover(directory)
         if recovery.failures:
             logger.warning("%s", recovery)
         elif recovery:
             logger.info("%s", recovery)
+    return monitor(env, directory, options, **view)
 
 
 def _monitor_class(

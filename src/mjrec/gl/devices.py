@@ -21,20 +21,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import GLError, InvalidArgument
-from .backends import backend_in_environment, environment_for, rendering_is_off
+from .backends import backend_in_environment, rendering_is_off
 from .choice import conflict_with, set_backend
-from .egl_device import EglDevice
-from .probing import Probe, probe
+from .probing import EglDevice, Probe, probe
 
 _LOG = logging.getLogger(__name__)
 
 CUDA_VISIBLE_DEVICES = "CUDA_VISIBLE_DEVICES"
 _CHOSEN = "MUJOCO_EGL_DEVICE_ID"
 _UUIDS = ("GPU-", "MIG-")
-_NONE_GIVEN = (
-    "This process was given no GPU for rendering: CUDA_VISIBLE_DEVICES names none. Ask "
-    "whoever starts it for one."
-)
 _DOCTOR = "`mjrec doctor` shows EGL's devices; `nvidia-smi -L` shows the GPUs."
 
 
@@ -197,28 +192,41 @@ def _refuse_latecomers() -> None:
 def _found(gpu: str, environ: Mapping[str, str]) -> tuple[GivenGpu, int | None]:
     """Return what came of it, and the number for `MUJOCO_EGL_DEVICE_ID`."""
     if not gpu:
-        return GivenGpu(gpu=gpu, warning=_NONE_GIVEN), None
+        warning = (
+            "This process was given no GPU for rendering: CUDA_VISIBLE_DEVICES names "
+            "none. Ask whoever starts it for one."
+        )
+        return GivenGpu(gpu=gpu, warning=warning), None
+    asked = f"GPU {gpu} was given for rendering"
     backend = None if rendering_is_off(environ) else backend_in_environment(environ)
     if backend not in (None, "egl"):
-        return GivenGpu(gpu=gpu, warning=_without_egl(gpu, str(backend))), None
+        warning = (
+            f"{asked}, and MUJOCO_GL={backend} cannot be told on which GPU to render: "
+            "unset MUJOCO_GL, or set it to egl."
+        )
+        return GivenGpu(gpu=gpu, warning=warning), None
     device, alone = _device(gpu, environ)
     if device is None:
-        warning = _without_device(gpu, alone)
+        warning = f"{asked}, and {_lack_of_device(alone)}"
         return GivenGpu(gpu=gpu, gl_renderer=alone.gl_renderer, warning=warning), None
     tried = alone
     for number, tried in _tries(device, gpu, alone, environ):
-        used = _in_use(tried)
-        if used is not None and used.index == device.index and not tried.software:
-            found = GivenGpu(gpu=gpu, device=used, gl_renderer=tried.gl_renderer)
+        used = [each for each in tried.devices if each.in_use]
+        if not tried.renders or tried.software or not used:
+            continue
+        if used[0].index == device.index:
+            found = GivenGpu(gpu=gpu, device=used[0], gl_renderer=tried.gl_renderer)
             return found, number
-    return GivenGpu(gpu=gpu, warning=_does_not_draw(gpu, device, tried)), None
+    why = f"it does not render. {tried.cause} {tried.fix}".strip()
+    if tried.renders:
+        why = "mujoco draws on another device whatever MUJOCO_EGL_DEVICE_ID is."
+    warning = f"{asked}, which is EGL's {_shown(device)}, and {why} {_DOCTOR}"
+    return GivenGpu(gpu=gpu, warning=warning), None
 
 
 def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Probe]:
     """Return EGL's device of a GPU, and what a process found that sees it alone."""
-    alone = probe(
-        "egl", environ=_with(environ, {CUDA_VISIBLE_DEVICES: gpu, _CHOSEN: "0"})
-    )
+    alone = probe("egl", environ={**environ, CUDA_VISIBLE_DEVICES: gpu, _CHOSEN: "0"})
     device = device_of_gpu(alone.devices, gpu)
     hardware = [device for device in alone.devices if not device.software]
     if device is not None or len(hardware) != 1:
@@ -228,7 +236,7 @@ def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Pro
     # The only one there is may be the GPU in spite of that: of another maker, or of a
     # driver without its CUDA part, so that nobody has a number.
     everything = {k: v for k, v in environ.items() if k != CUDA_VISIBLE_DEVICES}
-    seen = probe("egl", environ=_with(everything, {_CHOSEN: "0"}))
+    seen = probe("egl", environ={**everything, _CHOSEN: "0"})
     is_known_to_cuda = any(device.cuda_id is not None for device in seen.devices)
     return None if is_known_to_cuda else hardware[0], alone
 
@@ -244,64 +252,28 @@ def _tries(
     if environ.get(CUDA_VISIBLE_DEVICES) == gpu:
         yield 0, alone
     for number in dict.fromkeys([device.index, *range(len(alone.devices))]):
-        yield number, probe("egl", environ=_with(environ, {_CHOSEN: str(number)}))
+        yield number, probe("egl", environ={**environ, _CHOSEN: str(number)})
 
 
-def _with(
-    environ: Mapping[str, str], variables: Mapping[str, str]
-) -> Mapping[str, str]:
-    return environment_for("egl", {**environ, **variables})
-
-
-def _in_use(tried: Probe) -> EglDevice | None:
-    """Return the device that was drawn on, where something was drawn."""
-    used = [device for device in tried.devices if device.in_use]
-    return used[0] if tried.renders and used else None
-
-
-def _without_egl(gpu: str, backend: str) -> str:
-    return (
-        f"GPU {gpu} was given for rendering, and MUJOCO_GL={backend} cannot be told on "
-        "which GPU to render: unset MUJOCO_GL, or set it to egl."
-    )
-
-
-def _without_device(gpu: str, alone: Probe) -> str:
-    """Return what to say where none of EGL's devices is the given GPU."""
-    asked = _asked(gpu)
+def _lack_of_device(alone: Probe) -> str:
+    """Return why none of EGL's devices is the given GPU."""
     hardware = [device for device in alone.devices if not device.software]
     if not alone.devices:
-        return f"{asked}, and EGL has no device. {alone.cause} {alone.fix}".strip()
+        return f"EGL has no device. {alone.cause} {alone.fix}".strip()
     if not hardware:
         on = f" ({alone.gl_renderer})" if alone.gl_renderer else ""
         way = alone.warning() or (
             "There is no GPU here that EGL finds: no device file in /dev."
         )
-        return f"{asked}, and EGL has only the CPU{on}. {way}"
+        return f"EGL has only the CPU{on}. {way}"
     return (
-        f"{asked}, and none of EGL's {len(hardware)} GPUs is that: "
-        f"{'; '.join(map(_told, hardware))}. Parts of a GPU (MIG) mostly have no "
+        f"none of EGL's {len(hardware)} GPUs is that: "
+        f"{'; '.join(map(_shown, hardware))}. Parts of a GPU (MIG) mostly have no "
         f"graphics; what CUDA does not show cannot be found. {_DOCTOR}"
     )
 
 
-def _does_not_draw(gpu: str, device: EglDevice, tried: Probe) -> str:
-    if tried.renders:
-        why = "mujoco draws on another device whatever MUJOCO_EGL_DEVICE_ID is."
-    else:
-        why = f"it does not render. {tried.cause} {tried.fix}".strip()
-    return f"{_asked(gpu)}, which is EGL's {_told(device)}, and {why} {_DOCTOR}"
-
-
-def _asked(gpu: str) -> str:
-    return f"GPU {gpu} was given for rendering"
-
-
-def _told(device: EglDevice) -> str:
-    facts = [
-        device.uuid,
-        device.device_file,
-        "" if device.cuda_id is None else f"CUDA device {device.cuda_id}",
-    ]
-    known = ", ".join(filter(None, facts))
+def _shown(device: EglDevice) -> str:
+    cuda = "" if device.cuda_id is None else f"CUDA device {device.cuda_id}"
+    known = ", ".join(filter(None, [device.uuid, device.device_file, cuda]))
     return f"device {device.index}" + (f" ({known})" if known else "")

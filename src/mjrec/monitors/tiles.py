@@ -1,56 +1,70 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One video of all sub-environments of a vector environment."""
+"""One video of all sub-environments of a vector environment, side by side."""
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections.abc import Callable, Mapping
-from fractions import Fraction
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..environments.gymnasium_pictures import gymnasium_pictures
 from ..errors import InvalidArgument, NoPictures
 from ..formats.monitor_directory import Infix, video_prefix
+from ..recorder.declared_rate import declared_rate
 from ..recorder.endings import CLOSE, RESET, ending
 from ..recorder.live_videos import LiveVideos
 from ..recorder.options import OFF, WARN, RecorderOptions
 from ..recorder.video_recorder import VideoRecorder
 from ..schedules import disable_videos, to_schedule
-from .controls import MonitorControls
-from .vector_pictures import TilePictures
+from ..simulation.inside import simulation_time
+from .base import MonitorBase
+from .cameras import Tiles
 
 logger = logging.getLogger(__name__)
 
 
-def wants_tiles(options: RecorderOptions) -> bool:
-    """Tell whether tiled videos were asked for, and there are videos at all.
+def has_videos(options: RecorderOptions) -> bool:
+    """Tell whether there are videos at all."""
+    schedule = to_schedule(options.video_callable)
+    return options.render != OFF and schedule is not disable_videos
+
+
+def vector_tiles(
+    envs: Sequence[Any], options: RecorderOptions, view: Mapping[str, Any]
+) -> Tiles | None:
+    """Return what tiled videos of sub-environments show; None where there are none.
+
+    Args:
+        envs: the sub-environments.
+        options: what was asked for.
+        view: `camera`, `height` and `width`; of several cameras the first is taken.
 
     Raises:
-        InvalidArgument: nothing says which episodes they are to follow.
+        InvalidArgument: nothing says which episodes the videos are to follow.
+        NoPictures: not all sub-environments can be drawn.
     """
     if not options.tiled:
-        return False
+        return None
     if options.keep is not None or options.step_trigger is not None:
         raise InvalidArgument(
             "tiled=True records all sub-environments during the episodes that "
             "video_callable chooses of the first, and with keep or step_trigger no "
             "episode is chosen when it begins. Use video_callable."
         )
-    has_videos = to_schedule(options.video_callable) is not disable_videos
-    return has_videos and options.render != OFF
-
-
-def check_tiled(pictures: TilePictures) -> None:
-    """Check that all sub-environments can be drawn.
-
-    Raises:
-        NoPictures: they cannot.
-    """
-    if pictures.render_mode is None:
+    if not has_videos(options):
+        return None
+    camera = view["camera"]
+    if isinstance(camera, list | tuple) and camera:
+        view = {**view, "camera": camera[0]}
+    tiles = Tiles([gymnasium_pictures(each, **view) for each in envs])
+    if tiles.render_mode is None:
         raise NoPictures(
             "tiled=True was asked for, and a tiled video is drawn while the "
             "environments step, which needs pictures of each of them: make them with "
             'render_mode="rgb_array", and with the camera and the size that are wanted.'
         )
+    return tiles
 
 
 class TiledVideo:
@@ -59,29 +73,20 @@ class TiledVideo:
     Args:
         first: the monitor of the first sub-environment, whose manifest lists the
             videos.
-        pictures: of all.
+        tiles: of all.
         options: what was asked for.
-        clock: returns the simulated time of the first, or None.
-        declared: returns the rate to take where there is no simulated time.
+        env: the first sub-environment, which tells the rate.
     """
 
     def __init__(
-        self,
-        first: MonitorControls,
-        pictures: TilePictures,
-        options: RecorderOptions,
-        *,
-        clock: Callable[[], float | None],
-        declared: Callable[[], Fraction],
+        self, first: MonitorBase, tiles: Tiles, options: RecorderOptions, env: Any
     ) -> None:
         self._first = first
-        self._pictures = pictures
+        self._tiles = tiles
         self._options = options
-        self._clock = clock
-        self._declared = declared
+        self._env = env
         self._video: VideoRecorder | None = None
-        self._has_warned = False
-        # The episode that the pictures are of, and how far it has come.
+        # The episode that the frames are of, and how far it has come.
         self._episode_id = -1
         self._progress: dict[str, Any] = {}
         self._ending: dict[str, Any] | None = None
@@ -92,7 +97,7 @@ class TiledVideo:
         return self._video is not None
 
     def take_last(self) -> None:
-        """Take the picture of the last step, if it was left out."""
+        """Take the frame of the last step, if it was left out."""
         if self._video is not None and self._ending is None:
             self._videos(self._video).take_last()
 
@@ -100,10 +105,10 @@ class TiledVideo:
         """Follow the first sub-environment, which has just been reset."""
         episode_id = self._first.episode_id - 1
         if self._video is not None and episode_id == self._episode_id:
-            # Reset before any step: the number stays, the picture is another.
+            # Reset before any step: the number stays, the frame is another.
             self._video.discard()
             self._video = None
-        self._end(self._incomplete(RESET))
+        self._end_early(RESET)
         self._begin(episode_id)
 
     def after_step(self, *, terminated: bool, truncated: bool) -> None:
@@ -117,7 +122,15 @@ class TiledVideo:
         is_over = terminated or truncated
         self._ending = None
         if self._video is not None:
-            self._step(self._video, is_over, is_reset=episode_id != self._episode_id)
+            stats = self._first.stats_recorder
+            self._progress = {"length": stats.steps, "reward": stats.rewards}
+            if is_over:
+                self._progress["length"] = stats.episode_lengths[-1]
+                self._progress["reward"] = stats.episode_rewards[-1]
+            if episode_id != self._episode_id:
+                # SAME_STEP: the first tile shows the next episode already.
+                self._video.metadata["final_frame"] = "missing"
+            self._videos(self._video).take(is_there=True, last=is_over)
         if is_over:
             flags = {"terminated": terminated, "truncated": truncated}
             self._end({"complete": True, **flags})
@@ -131,7 +144,7 @@ class TiledVideo:
 
     def close(self) -> None:
         """Finish the running video. Idempotent."""
-        self._end(self._incomplete(CLOSE))
+        self._end_early(CLOSE)
 
     def _begin(self, episode_id: int) -> None:
         self._episode_id = episode_id
@@ -142,50 +155,25 @@ class TiledVideo:
             return
         infix = Infix.parse(self._first.infix)
         assert infix is not None
-        base = self._first.directory / f"{video_prefix(infix, episode_id)}.tiled"
+        options = self._options
         self._video = VideoRecorder(
-            self._pictures,
-            base_path=base,
+            self._tiles,
+            base_path=self._first.directory
+            / f"{video_prefix(infix, episode_id)}.tiled",
             metadata={
                 **self._first._recorder.live_video_facts(),
                 "tiled": True,
-                "sub_environments": self._pictures.count,
+                "sub_environments": len(self._tiles.sources),
             },
-            fps=self._options.fps,
-            max_fps=self._options.max_fps,
+            fps=options.fps,
+            max_fps=options.max_fps,
             frame_hashes=True,
-            clock=self._clock,
-            declared=self._declared,
-            facts=self._pictures.facts,
-            strict=self._options.strict,
+            clock=functools.partial(simulation_time, self._env),
+            declared=functools.partial(declared_rate, self._env),
+            facts=self._tiles.facts,
+            strict=options.strict,
         )
         self._videos(self._video).begin()
-
-    def _step(self, video: VideoRecorder, is_over: bool, *, is_reset: bool) -> None:
-        stats = self._first.stats_recorder
-        if is_over:
-            self._progress = {
-                "length": stats.episode_lengths[-1],
-                "reward": stats.episode_rewards[-1],
-            }
-        else:
-            self._progress = {"length": stats.steps, "reward": stats.rewards}
-        if is_reset:
-            # The first tile shows the next episode already; the others are right.
-            video.metadata["final_frame"] = "missing"
-            self._warn_of_missing_frames()
-        self._videos(video).take(is_there=True, last=is_over)
-
-    def _warn_of_missing_frames(self) -> None:
-        if self._has_warned:
-            return
-        self._has_warned = True
-        logger.warning(
-            "The last frame of each tiled video shows the first sub-environment after "
-            "its reset, and others that have ended likewise: with SAME_STEP all of "
-            "them are there to be drawn only when that is over. The sub-environments' "
-            "own videos are whole where they are objects in this process."
-        )
 
     def _videos(self, video: VideoRecorder) -> LiveVideos:
         return LiveVideos([video], tolerates=self._tolerates)
@@ -196,8 +184,8 @@ class TiledVideo:
         logger.warning("The tiled video %s: %s", self._video.path, error)
         return True
 
-    def _incomplete(self, reason: str) -> dict[str, Any]:
-        return {"complete": False, **(self._ending or {"reason": reason})}
+    def _end_early(self, reason: str) -> None:
+        self._end({"complete": False, **(self._ending or {"reason": reason})})
 
     def _end(self, facts: Mapping[str, Any]) -> None:
         if self._video is not None:

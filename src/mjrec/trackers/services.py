@@ -3,7 +3,27 @@
 
 from __future__ import annotations
 
+import importlib
+
+from ..errors import MissingDependency
 from ..recorder.tracking import FinishedEpisode, FinishedVideo
+
+
+def require(package: str, *, purpose: str) -> None:
+    """Import a service's package, which is also the name of our extra.
+
+    Raises:
+        MissingDependency: it is not installed.
+    """
+    try:
+        importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        # One that is installed and lacks something itself is another matter.
+        if error.name != package:
+            raise
+        raise MissingDependency(
+            package, purpose=purpose, install=f'pip install "mjrec[{package}]"'
+        ) from error
 
 
 def group_of(episode: FinishedEpisode | None) -> str:
