@@ -84,23 +84,15 @@ class Inspector:
 
 
 def _trajectory(path: Path) -> None:
-    from mjrec.formats.trajectory_file import open_trajectory
-
-    with open_trajectory(path) as reader:
-        reader.content()
-
-
-def _arrays(path: Path) -> None:
     from mjrec import load_trajectory
-
-    for values in vars(load_trajectory(path)).values():
-        str(values)
-
-
-def _rendering(path: Path) -> None:
     from mjrec.rendering.recorded_facts import open_for_rendering
 
-    open_for_rendering(path).close()
+    trajectory = load_trajectory(path)
+    for values in (*vars(trajectory).values(), trajectory.snapshots):
+        str(values)
+    with open_for_rendering(path) as reader:
+        for _ in reader.iter_model_changes():
+            pass
 
 
 def _finish(path: Path) -> None:
@@ -172,8 +164,6 @@ READERS: dict[str, Callable[[Path], None]] = {
     "journal": _journal,
     "metadata": _metadata,
     "trajectory": _trajectory,
-    "arrays": _arrays,
-    "rendering": _rendering,
     "finish": _finish,
     "model": _model,
     "source": _source,

@@ -95,7 +95,6 @@ FILES: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "journal": ("journal", journal),
     "metadata": ("metadata", metadata),
     "h5": ("trajectory", finished),
-    "arrays of an h5": ("arrays", finished),
     "mjb.gz": ("model", compiled),
     "zip": ("model", source),
     "mjcf": ("mjcf", mjcf),

@@ -25,6 +25,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sound_files import compiled, finished, source
 from trajectories_by_hand import INFIX, write_log
+from trajectory_contents import content_of
 
 from mjrec import Error, UnreadableFile
 from mjrec.formats.in_flight import recordings_in_flight
@@ -341,7 +342,7 @@ def read_log(path: Path) -> Any:
     refusal: UnreadableFile | None = None
     try:
         with open_trajectory(path) as reader:
-            content = reader.content()
+            content = content_of(reader)
         with contextlib.suppress(UnreadableFile):
             open_for_rendering(path).close()
         for found in recordings_in_flight(path.parent):
@@ -356,7 +357,7 @@ def read_log(path: Path) -> Any:
 
 def read_everything(path: Path) -> Any:
     with open_trajectory(path) as reader:
-        content = reader.content()
+        content = content_of(reader)
     with contextlib.suppress(Error):
         open_for_rendering(path).close()
     return content

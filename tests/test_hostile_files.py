@@ -28,7 +28,6 @@ from sound_files import (
     SPHERE,
     compiled,
     finished,
-    journal,
     manifest,
     metadata,
     source,
@@ -115,7 +114,7 @@ FINE = {
     # A file that the user names is the user's, links and all.
     *(("mjcf", link_elsewhere), ("mjcf", link_with_dots)),
     # A directory is an answer that lists what is in it.
-    ("arrays of an h5", folder),
+    ("h5", folder),
 }
 
 
@@ -174,37 +173,21 @@ def half_of_it(path: Path) -> None:
 SPOILS = (nothing, noise, a_hole_of_a_terabyte, half_of_it)
 
 
-@pytest.mark.parametrize(
-    ("kind", "spoil"),
-    [
-        (kind, spoil)
-        for kind in FILES
-        if kind not in ("journal", "video for an archive")
-        for spoil in SPOILS
-        # MuJoCo reads what the user names as it likes.
-        if (kind, spoil) != ("mjcf", a_hole_of_a_terabyte)
-    ],
-)
+@pytest.mark.parametrize("spoil", SPOILS)
+@pytest.mark.parametrize("kind", [k for k in FILES if k != "video for an archive"])
 def test_other_content_is_refused(
     inspector: Inspector, directory: Path, kind: str, spoil: Callable[[Path], None]
 ) -> None:
-    """Whatever the name says that it is."""
+    """Lines of a journal stand for themselves, and those that are none are left out."""
     reader, write = FILES[kind]
     path = write(directory)
     spoil(path)
-    inspector.refuses(reader, path)
-
-
-@pytest.mark.parametrize("spoil", [nothing, noise, a_hole_of_a_terabyte, half_of_it])
-def test_a_journal_of_anything_ends(
-    inspector: Inspector, directory: Path, spoil: Callable[[Path], None]
-) -> None:
-    """Its lines stand for themselves; those that are none are left out or refused."""
-    path = journal(directory)
-    spoil(path)
-    if spoil is a_hole_of_a_terabyte:
-        os.truncate(path, 1 << 28)
-    assert inspector.read("journal", path).kind in ("value", "refused")
+    if kind == "journal":
+        os.truncate(path, min(path.stat().st_size, 1 << 28))
+        assert inspector.read("journal", path).kind in ("value", "refused")
+    elif (kind, spoil) != ("mjcf", a_hole_of_a_terabyte):
+        # That one MuJoCo reads as it likes: the user has named it.
+        inspector.refuses(reader, path)
 
 
 # --- JSON ----------------------------------------------------------------------------
@@ -250,53 +233,29 @@ def test_counts_are_numbers_that_can_be_counted(
     assert "episode_lengths" in inspector.refuses("stats", path)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *(
-            "../x.mp4",
-            "/etc/passwd",
-            "a/b.mp4",
-            "..",
-            "a\\b",
-            "a\0b",
-            "a\nb",
-            "\x1b[2J",
-        ),
-        *("\ud800", "x" * 256, "é" * 128),
-    ],
+NO_NAMES = (
+    *("../x.mp4", "/etc/passwd", "a/b.mp4", "..", "a\\b", "a\0b", "a\nb", "\x1b[2J"),
+    *("\ud800", "x" * 256, "é" * 128),
 )
-@pytest.mark.parametrize("key", ["stats", "videos", "broken"])
-def test_names_in_a_manifest_are_base_names(
-    inspector: Inspector, directory: Path, key: str, name: str
-) -> None:
-    """Short ones, which can be printed."""
-    path = manifest(directory)
-    values = json.loads(path.read_text())
-    if key == "stats":
-        values["stats"] = name
-    elif key == "videos":
-        values["videos"] = [["a.mp4", name]]
-    else:
-        values["mjrec"] = {"broken": [name]}
-    path.write_text(json.dumps(values))
-    inspector.refuses("manifest", path)
 
 
 @pytest.mark.parametrize(
-    "details",
+    "values",
     [
-        *({"pending": 5}, {"pending": [5]}, {"broken": 5}, {"broken": [None]}),
-        *({"next_episode_id": -1}, {"next_episode_id": 1.5}, {"next_episode_id": True}),
-        {"next_episode_id": 10**30},
+        *({"stats": name} for name in NO_NAMES),
+        *({"videos": [["a.mp4", name]]} for name in NO_NAMES),
+        *({"mjrec": {"broken": [name]}} for name in NO_NAMES),
+        *({"mjrec": {"pending": wrong}} for wrong in (5, [5])),
+        *({"mjrec": {"broken": wrong}} for wrong in (5, [None])),
+        *({"mjrec": {"next_episode_id": n}} for n in (-1, 1.5, True, 10**30)),
     ],
 )
-def test_what_others_rely_on_in_a_manifest_is_as_it_should_be(
-    inspector: Inspector, directory: Path, details: dict[str, Any]
+def test_a_manifest_names_files_of_its_directory_and_counts(
+    inspector: Inspector, directory: Path, values: dict[str, Any]
 ) -> None:
-    """Rather than an error of Python's somewhere later."""
+    """By short names, which can be printed."""
     path = manifest(directory)
-    path.write_text(json.dumps({**json.loads(path.read_text()), "mjrec": details}))
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
     inspector.refuses("manifest", path)
 
 
@@ -361,6 +320,14 @@ def overflowing_frames(file: h5py.File) -> None:
     replaced("snapshots", data=np.zeros(5, file["snapshots"].dtype))(file)
 
 
+def change_of(file: h5py.File, name: str, **options: Any) -> h5py.Group:
+    group = file["model_changes"].create_group("0")
+    group.attrs["step"] = np.int64(0)
+    if options:
+        group.create_dataset(name, **options)
+    return group
+
+
 def half_a_billion_steps(file: h5py.File) -> None:
     """Zeros, which pack a thousandfold."""
     shape = (1 << 29,)
@@ -377,47 +344,54 @@ def half_a_billion_steps(file: h5py.File) -> None:
         dataset.write_direct_chunk((index << 24,), packed)
 
 
-def one_field_by_many_names(file: h5py.File) -> None:
-    group = file["model_changes"].create_group("0")
-    group.attrs["step"] = np.int64(0)
-    data = np.zeros(4 << 20)
-    group.create_dataset("geom_rgba", data=data, compression=9, chunks=data.shape)
-    for index in range(100):
-        group[f"n{index}"] = group["geom_rgba"]
+ZEROS = {"data": np.zeros(4 << 20), "compression": 9, "chunks": (4 << 20,)}
 
 
 def one_change_by_many_names(file: h5py.File) -> None:
-    group = file["model_changes"].create_group("0")
-    group.attrs["step"] = np.int64(0)
-    data = np.zeros(4 << 20)
-    group.create_dataset("geom_rgba", data=data, compression=9, chunks=data.shape)
-    for index in range(1, 1000):
+    group = change_of(file, "geom_rgba", **ZEROS)
+    for index in range(1, 5000):
         file["model_changes"][str(index)] = group
 
 
+def gigabytes_of_observations(file: h5py.File) -> None:
+    """Four, out of four megabytes."""
+    rows, length = 500, 1 << 20
+    for name, kind in [("rewards", "f8"), ("terminated", "?"), ("truncated", "?")]:
+        replaced(name, data=np.zeros(rows - 1, kind))(file)
+    replaced("states", data=np.zeros((rows, 1)))(file)
+    layout = json.loads(file.attrs["layout"])
+    layout["observation"] = {"dtype": "<f8", "shape": [length]}
+    text = json.dumps(layout).encode()
+    file.attrs["layout"] = np.bytes_(text)
+    file.attrs["crc32"] = np.int64(zlib.crc32(text, zlib.crc32(file.attrs["facts"])))
+    packed = zlib.compress(bytes(8 * length), 9)
+    observations = file.create_dataset(
+        "observations", (rows, length), "f8", chunks=(1, length), compression=9
+    )
+    for row in range(rows):
+        observations.id.write_direct_chunk((row, 0), packed)
+
+
 def linked_field(file: h5py.File) -> None:
-    group = file["model_changes"].create_group("0")
-    group.attrs["step"] = np.int64(0)
-    group["geom_rgba"] = h5py.ExternalLink("/etc/passwd", "/x")
+    change_of(file, "")["geom_rgba"] = h5py.ExternalLink("/etc/passwd", "/x")
 
 
 def object_field(file: h5py.File) -> None:
-    group = file["model_changes"].create_group("0")
-    group.attrs["step"] = np.int64(0)
-    group.create_dataset("geom_rgba", data=[b"cos\nsystem"], dtype=h5py.string_dtype())
+    change_of(file, "x", data=[b"cos\nsystem"], dtype=h5py.string_dtype())
 
 
+# Takes more than five seconds: one file is given up when it has had its CPU time.
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
         (virtual, "in a way that mjrec does not write"),
         (overflowing_frames, "not of its steps"),
-        (half_a_billion_steps, "more than 67108864 rewards"),
-        (replaced("states", shape=(5, 2**35), dtype="f8"), "more memory"),
+        (replaced("states", shape=(5, 2**35), dtype="f8"), "have the shape"),
         (replaced("rewards", shape=(2**40,), dtype="f8"), "more memory"),
         (replaced("rewards", shape=(2**40,), dtype="f8", chunks=(9,)), "more memory"),
-        (one_field_by_many_names, "too large|in one another"),
-        (one_change_by_many_names, "in one another"),
+        (half_a_billion_steps, "more memory"),
+        (gigabytes_of_observations, "more memory"),
+        (one_change_by_many_names, "SIGXCPU|SIGKILL"),
         (linked_field, "no 'geom_rgba' of its own"),
         (object_field, "no dtype"),
         (lambda file: file.attrs.create("format_version", True), "another type"),
@@ -429,42 +403,16 @@ def test_hostile_hdf5_is_refused(
     change: Callable[[h5py.File], None],
     reason: str,
 ) -> None:
-    """Before its data is read, within a gigabyte of memory."""
+    """Within a gigabyte of memory here, and limits in the sandbox that reads it."""
     path = finished(directory)
     with h5py.File(path, "r+") as file:
         change(file)
     assert re.search(reason, inspector.refuses("trajectory", path))
 
 
-def test_arrays_that_would_fill_the_memory_are_not_read(
-    inspector: Inspector, directory: Path
-) -> None:
-    """Four gigabytes of observations out of four megabytes."""
-    header = TrajectoryHeader(facts={}, observation=Array("<f8", (1 << 20,)))
-    logs = new_logs(directory)
-    span = logs.begin(NAME, header)
-    for step in range(2):
-        add_row(span, step)
-    logs.close()
-    path = finish_trajectory(logs.path_of(NAME))
-    rows = 500
-    with h5py.File(path, "r+") as file:
-        chunk = file["observations"].id.read_direct_chunk((0, 0))[1]
-        for name, kind in [("rewards", "f8"), ("terminated", "?"), ("truncated", "?")]:
-            replaced(name, data=np.zeros(rows - 1, kind))(file)
-        replaced("states", data=np.zeros((rows, 0)))(file)
-        shape = (rows, 1 << 20)
-        replaced(
-            "observations", shape=shape, dtype="f8", chunks=(1, 1 << 20), compression=1
-        )(file)
-        for row in range(rows):
-            file["observations"].id.write_direct_chunk((row, 0), chunk)
-    assert "claims to hold 4 GiB" in inspector.refuses("arrays", path)
-
-
 # --- recordings in flight ------------------------------------------------------------
 
-READERS = ["trajectory", "finish", "rendering"]
+READERS = ["trajectory", "finish"]
 PARTS = [".spans", ".log", ".tail", ".looks"]
 NAME = "openaigym.trajectory.0.7.episode000000"
 

@@ -25,6 +25,7 @@ import pytest
 from full_disk import file_size_limit
 from processes import forked, kill_self
 from trajectories_by_hand import add_row, new_logs
+from trajectory_contents import TrajectoryContent, content_of
 
 import mjrec.formats.span_reader as span_reader
 import mjrec.formats.span_writer as span_writer
@@ -58,7 +59,6 @@ from mjrec.formats.trajectory import (
     ModelChange,
     RowLayout,
     StateComponent,
-    TrajectoryContent,
     TrajectoryHeader,
 )
 
@@ -134,7 +134,7 @@ def write(
 
 def read(path: Path) -> TrajectoryContent:
     with SpanReader(path) as reader:
-        return reader.content()
+        return content_of(reader)
 
 
 def check(content: TrajectoryContent, steps: int, *, every: int = 1) -> None:
@@ -520,9 +520,9 @@ def test_a_living_recording_can_be_read(path: Path) -> None:
     with SpanReader(path) as reader:
         for step in range(3, 20):
             write_step(span, step)
-        check(reader.content(), 2)
+        check(content_of(reader), 2)
         logs.close()
-        check(reader.content(), 2)
+        check(content_of(reader), 2)
     check(read(path), 19)
 
 
@@ -1265,7 +1265,7 @@ def test_no_descriptor_stays(path: Path) -> None:
     span.add_change(ModelChange(step=3, fields={"a": np.ones(1)}))
     write_step(span, 4)
     with SpanReader(path) as reader:
-        reader.content()
+        content_of(reader)
     *_, looks = files_of(path.parent)
     looks.rename(looks.with_suffix(".kept"))
     looks.mkdir()

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from full_disk import file_size_limit
 from trajectories_by_hand import add_row, new_logs
+from trajectory_contents import TrajectoryContent, content_of
 
 import mjrec.formats.trajectory_file as trajectory_file
 import mjrec.formats.trajectory_hdf5 as trajectory_hdf5
@@ -32,8 +33,8 @@ from mjrec.formats.trajectory import (
     ModelChange,
     RowLayout,
     StateComponent,
-    TrajectoryContent,
     TrajectoryHeader,
+    added_up,
 )
 from mjrec.formats.trajectory_file import (
     TrajectoryReader,
@@ -41,7 +42,6 @@ from mjrec.formats.trajectory_file import (
     finish_trajectory,
     open_trajectory,
 )
-from mjrec.formats.trajectory_reader import added_up
 
 HEADER = TrajectoryHeader(
     facts={
@@ -127,7 +127,7 @@ def write(
 
 def read(path: Path) -> TrajectoryContent:
     with open_trajectory(path) as reader:
-        return reader.content()
+        return content_of(reader)
 
 
 def killed(content: TrajectoryContent) -> TrajectoryContent:
@@ -396,7 +396,7 @@ def test_a_reader_keeps_what_somebody_finishes(path: Path) -> None:
     content = read(path)
     with open_trajectory(path) as reader:
         finish_trajectory(path)
-        assert_same(reader.content(), content)
+        assert_same(content_of(reader), content)
 
 
 def test_nothing_to_finish_is_one_clear_error(path: Path) -> None:

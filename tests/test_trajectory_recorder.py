@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from trajectories_by_hand import INFIX, new_logs
+from trajectory_contents import TrajectoryContent, content_of
 
 from mjrec.errors import FileNotWritten, PicturesDiffer
 from mjrec.formats.in_flight import recordings_in_flight
@@ -20,7 +21,6 @@ from mjrec.formats.trajectory import (
     Array,
     RowLayout,
     StateComponent,
-    TrajectoryContent,
 )
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.stats_recorder import StatsRecorder
@@ -145,7 +145,7 @@ NAME = f"{trajectory_prefix(INFIX, 3)}.h5"
 def content(path: Path) -> TrajectoryContent:
     """Return what a log has of a trajectory."""
     with open_trajectory(path) as reader:
-        return reader.content()
+        return content_of(reader)
 
 
 def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:

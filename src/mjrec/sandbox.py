@@ -54,6 +54,8 @@ LIMITS: Final[Mapping[str, int]] = {
 
 # Says that a stranger's compiled models may be loaded.
 _TRUST_VARIABLE = "MJREC_TRUST_MODELS"
+# Says to what runs in a sandbox, and to what that starts, that it does.
+_INSIDE_VARIABLE = "MJREC_SANDBOX"
 
 _STANDARD_INPUT = 0
 _SECONDS_TO_DIE = 5.0
@@ -85,11 +87,14 @@ class Sandbox:
         limits: Mapping[str, int] = LIMITS,
     ) -> None:
         environ = {k: v for k, v in os.environ.items() if k != _TRUST_VARIABLE}
+        environ |= {"TMPDIR": str(place), _INSIDE_VARIABLE: "1"}
+        # Threads that nothing uses would take of the memory.
+        environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         self._stderr = (place / "words.txt").open("w+b")
         try:
             self._process = subprocess.Popen(
                 python_command(module),
-                env=environment_of_child({**environ, "TMPDIR": str(place)}),
+                env=environment_of_child(environ),
                 # MuJoCo's own log appears where it runs.
                 cwd=place,
                 stdin=subprocess.PIPE,
@@ -164,6 +169,11 @@ class Sandbox:
         # What Python says of a crash ends with the names of dozens of modules.
         words = " ".join(said.partition("\nExtension modules:")[0].split())
         return words[-_END_OF_STDERR:] or "(nothing)"
+
+
+def is_inside() -> bool:
+    """Tell whether this process runs in a sandbox already."""
+    return _INSIDE_VARIABLE in os.environ
 
 
 def enter() -> tuple[Any, Callable[..., None]]:

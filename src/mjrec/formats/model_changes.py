@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ..errors import InvalidArgument
 from ..json_text import loads
 from .json_fields import field, list_of, mapping
-from .trajectory import Array, ModelChange
-from .trajectory_layout import array_from_json, array_to_json, field_name
+from .trajectory import Array, ModelChange, array_from_json, array_to_json, field_name
 
 # Its step, and the length of its table.
 _PREFIX = struct.Struct("<qQ")

@@ -34,8 +34,7 @@ from .spans import (
     SpanList,
     row_dtype,
 )
-from .trajectory import ModelChange
-from .trajectory_reader import TrajectoryReader
+from .trajectory import ModelChange, TrajectoryReader
 
 # A row has a step, a frame, or both.
 _KINDS = STEP | FRAME

@@ -6,6 +6,8 @@ members bear MuJoCo's names: `file["snapshots"]["geom_xpos"]` is an array, and t
 shuffle filter, which goes by whole rows there, puts the same byte of one row after the
 other side by side, so that what does not change costs nothing. (Of what was measured
 that was the smallest form and the fastest to write; `docs/format.md` has numbers.)
+
+Nothing here bounds the memory or time that a file asks for: `trajectory_file` does.
 """
 
 from __future__ import annotations
@@ -28,24 +30,19 @@ from ..atomic_files import replacing
 from ..errors import ClosedError, FileNotWritten, UnreadableFile
 from ..json_text import dumps
 from .json_fields import json_object, unreadable
-from .model_changes import LARGEST_CHANGE
 from .regular_files import regular_path
 from .trajectory import (
     FORMAT_VERSION,
     Array,
     ModelChange,
     RowLayout,
-)
-from .trajectory_layout import (
-    LARGEST_ROW,
-    MOST_PARTS,
+    TrajectoryReader,
     array_from_json,
     check_version,
     field_name,
     header_from_json,
     layout_to_json,
 )
-from .trajectory_reader import TrajectoryReader
 
 # How every HDF5 file begins.
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -72,36 +69,6 @@ _BUFFER_BYTES = 1 << 22
 
 _LEVEL = 1
 _FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE))
-# Deflate makes at most 1032 bytes out of one.
-_MOST_EXPANSION = 1040
-_MOST_CHANGES = 1 << 20
-_LONGEST_TEXT = 1 << 26
-
-# What there is once for each step or frame is read when a file is opened, and a file
-# of a few kilobytes can claim any number of them. Two weeks at 50 steps a second.
-_MOST_STEPS = 1 << 26
-
-
-def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
-    """Write all that `reader` has as the HDF5 file `path`, whole or not at all.
-
-    Raises:
-        FileNotWritten: the disk is full, or the directory is gone.
-        UnreadableFile: what is read turned out to be damaged.
-    """
-    # In memory, compressed as it will be in the file: the HDF5 library does not survive
-    # a write that fails (it crashes the process when it closes what is left).
-    image = io.BytesIO()
-    with h5py.File(image, "w", libver=_LIBVER) as file:
-        _write(file, reader)
-    try:
-        with replacing(path) as temporary, temporary.open("xb") as output:
-            output.write(image.getbuffer())
-            output.flush()
-            # The log is removed next: what it held must not be in a cache alone.
-            os.fsync(output.fileno())
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror or error) from error
 
 
 class TrajectoryHdf5Reader(TrajectoryReader):
@@ -137,8 +104,6 @@ class TrajectoryHdf5Reader(TrajectoryReader):
             raise ValueError("its facts or its layout are damaged")
         self.header = header = header_from_json(json_object(facts), json_object(layout))
         self.dropped = _whole_number(attributes, "dropped")
-        self._stored_changes = 0
-        self._stored_by_change: dict[int, int] = {}
         self.rewards = self._column("rewards", "<f8")
         steps = len(self.rewards)
         self.terminated = self._column("terminated", "|b1", steps)
@@ -148,21 +113,20 @@ class TrajectoryHdf5Reader(TrajectoryReader):
         if self.row_count != steps + 1 and (self.row_count, steps) != (0, 0):
             raise ValueError(f"it has {self.row_count} states for {steps} steps")
         self.frame_steps = self._column("frame_steps", "<i8")
-        self._check_frames()
+        bounds = np.concatenate(([0], self.frame_steps, [max(self.row_count - 1, 0)]))
+        # Compared, because differences of such numbers may overflow.
+        is_disordered = (bounds[1:] < bounds[:-1]).any()
+        if is_disordered or (self.frame_count and not self.row_count):
+            raise ValueError("its frames are not of its steps, in order")
         self._action_rows = self._optional("actions", header.action, steps)
         self._observation_rows = self._optional(
             "observations", header.observation, self.row_count
         )
-        self._snapshot_type = _row_type(header.snapshot)
-        self._snapshot_rows = (
-            self._dataset("snapshots", self._snapshot_type, (), self.frame_count)
-            if header.snapshot.size
-            else None
+        self._snapshot_rows = header.snapshot.size and self._dataset(
+            "snapshots", _row_type(header.snapshot), (), self.frame_count
         )
-        self._changes = self._group(self._file, "model_changes")
+        self._changes = _group(self._file, "model_changes")
         self.change_count = len(self._changes)
-        if self.change_count > _MOST_CHANGES:
-            raise ValueError("it has too many changes of the model")
 
     def _states(self, start: int, stop: int) -> NDArray[np.float64]:
         return self._read(self._state_rows, start, stop)
@@ -183,45 +147,21 @@ class TrajectoryHdf5Reader(TrajectoryReader):
     def _model_change(self, index: int) -> ModelChange:
         self._check_open()
         with _reading(self.path):
-            group = self._group(self._changes, str(index))
+            group = _group(self._changes, str(index))
             step = _whole_number(group.attrs, "step")
             if step < 0:
                 raise ValueError("a change of the model is of no step")
-            datasets = self._changed(index, group)
-            fields = {name: _whole(dataset) for name, dataset in datasets.items()}
-            return ModelChange(step=step, fields=fields)
-
-    def _changed(self, index: int, group: h5py.Group) -> dict[str, Any]:
-        """Return the datasets of a change, which can all be read at once."""
-        if len(group) > MOST_PARTS:
-            raise ValueError(f"a change of the model has {len(group)} fields")
-        datasets = {
-            field_name(name): _checked_dataset(group, name, self.path) for name in group
-        }
-        if sum(map(_size, datasets.values())) > LARGEST_CHANGE:
-            raise ValueError("a change of the model is too large")
-        stored = sum(dataset.id.get_storage_size() for dataset in datasets.values())
-        self._stored_changes += stored - self._stored_by_change.get(index, 0)
-        self._stored_by_change[index] = stored
-        # The same data under a million names would be read a million times.
-        if self._stored_changes > self.path.stat().st_size:
-            raise ValueError("its changes of the model are stored in one another")
-        return datasets
-
-    def _check_frames(self) -> None:
-        steps = self.frame_steps
-        bounds = np.concatenate(([0], steps, [max(self.row_count - 1, 0)]))
-        # Compared, because differences of such numbers may overflow.
-        if (bounds[1:] < bounds[:-1]).any() or (len(steps) and not self.row_count):
-            raise ValueError("its frames are not of its steps, in order")
+            datasets = {field_name(name): _own_dataset(group, name) for name in group}
+            return ModelChange(
+                step=step,
+                fields={name: _whole(dataset) for name, dataset in datasets.items()},
+            )
 
     def _optional(self, name: str, kind: Array | None, count: int) -> Any:
         return kind and self._dataset(name, kind.dtype, kind.shape, count)
 
     def _column(self, name: str, dtype: str, count: int | None = None) -> NDArray[Any]:
         dataset = self._dataset(name, dtype, (), count)
-        if dataset.shape[0] > _MOST_STEPS:
-            raise ValueError(f"it has more than {_MOST_STEPS} {name}")
         return self._read(dataset, 0, dataset.shape[0])
 
     def _dataset(
@@ -232,7 +172,8 @@ class TrajectoryHdf5Reader(TrajectoryReader):
         count: int | None = None,
     ) -> Any:
         """Return a dataset with a row of `shape` for each of `count` things."""
-        dataset = _checked_dataset(self._file, name, self.path)
+        dataset = _own_dataset(self._file, name)
+        # Memory is made for what the layout says, and HDF5 fills it as the file says.
         if dataset.dtype != dtype:
             raise ValueError(f"its {name} are of dtype {dataset.dtype}")
         if dataset.shape[:1] + shape != dataset.shape:
@@ -240,12 +181,6 @@ class TrajectoryHdf5Reader(TrajectoryReader):
         if count not in (None, dataset.shape[0]):
             raise ValueError(f"it has {dataset.shape[0]} {name}, not {count}")
         return dataset
-
-    def _group(self, parent: h5py.Group, name: str) -> h5py.Group:
-        group = _linked(parent, name)
-        if not isinstance(group, h5py.Group):
-            raise ValueError(f"its {name} is no group")
-        return group
 
     def _read(self, dataset: Any, start: int, stop: int) -> NDArray[Any]:
         self._check_open()
@@ -267,13 +202,7 @@ def _reading(path: Path) -> Iterator[None]:
         with unreadable(path):
             yield
     except (AttributeError, LookupError, RuntimeError, TypeError) as error:
-        raise UnreadableFile(path, _reason(error)) from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return str(error) or type(error).__name__
+        raise UnreadableFile(path, str(error) or type(error).__name__) from error
 
 
 def _linked(group: h5py.Group, name: str) -> Any:
@@ -283,8 +212,15 @@ def _linked(group: h5py.Group, name: str) -> Any:
     return group[name]
 
 
-def _checked_dataset(group: h5py.Group, name: str, path: Path) -> Any:
-    """Return a dataset that can be read without harm, whoever made the file."""
+def _group(parent: h5py.Group, name: str) -> h5py.Group:
+    group = _linked(parent, name)
+    if not isinstance(group, h5py.Group):
+        raise ValueError(f"its {name} is no group")
+    return group
+
+
+def _own_dataset(group: h5py.Group, name: str) -> Any:
+    """Return a dataset whose data is in this file, packed as mjrec packs it."""
     dataset = _linked(group, name)
     if not isinstance(dataset, h5py.Dataset):
         raise ValueError(f"its {name} is no dataset")
@@ -302,16 +238,7 @@ def _checked_dataset(group: h5py.Group, name: str, path: Path) -> Any:
         raise ValueError(f"its {name} is stored in a way that mjrec does not write")
     if dataset.shape is None:
         raise ValueError(f"its {name} is no dataset")
-    item = dataset.dtype.itemsize
-    chunk = item * math.prod(dataset.chunks or (0,))
-    stored = min(dataset.id.get_storage_size(), path.stat().st_size)
-    if chunk > LARGEST_ROW or _size(dataset) > stored * _MOST_EXPANSION:
-        raise ValueError(f"its {name} would need more memory than it can hold")
     return dataset
-
-
-def _size(dataset: Any) -> int:
-    return int(dataset.dtype.itemsize * math.prod(dataset.shape))
 
 
 def _whole(dataset: Any) -> NDArray[Any]:
@@ -329,8 +256,6 @@ def _attribute(attributes: Any, name: str, kinds: str) -> Any:
     # that has no checksum, and the HDF5 library may never come back from there.
     if identifier.shape != () or identifier.dtype.kind not in kinds:
         raise ValueError(f"its attribute {name!r} is of another type")
-    if identifier.dtype.itemsize > _LONGEST_TEXT:
-        raise ValueError(f"its attribute {name!r} is too long")
     return attributes[name]
 
 
@@ -355,16 +280,31 @@ def _row_type(layout: RowLayout) -> np.dtype[Any]:
     )
 
 
-def _write(file: h5py.File, reader: TrajectoryReader) -> None:
-    # What is written is what a reader will accept.
-    if max(reader.step_count, reader.frame_count) > _MOST_STEPS:
-        raise UnreadableFile(reader.path, f"it has more than {_MOST_STEPS} steps")
-    _write_attributes(file, reader)
-    _write_steps(file, reader)
-    _write_frames(file, reader)
-    changes = file.create_group("model_changes")
-    for index, change in enumerate(reader.iter_model_changes()):
-        _write_change(changes.create_group(str(index)), change)
+def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
+    """Write all that `reader` has as the HDF5 file `path`, whole or not at all.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone.
+        UnreadableFile: what is read turned out to be damaged.
+    """
+    # In memory, compressed as it will be in the file: the HDF5 library does not survive
+    # a write that fails (it crashes the process when it closes what is left).
+    image = io.BytesIO()
+    with h5py.File(image, "w", libver=_LIBVER) as file:
+        _write_attributes(file, reader)
+        _write_steps(file, reader)
+        _write_frames(file, reader)
+        changes = file.create_group("model_changes")
+        for index, change in enumerate(reader.iter_model_changes()):
+            _write_change(changes.create_group(str(index)), change)
+    try:
+        with replacing(path) as temporary, temporary.open("xb") as output:
+            output.write(image.getbuffer())
+            output.flush()
+            # The log is removed next: what it held must not be in a cache alone.
+            os.fsync(output.fileno())
+    except OSError as error:
+        raise FileNotWritten(path, error.strerror or error) from error
 
 
 def _write_attributes(file: h5py.File, reader: TrajectoryReader) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..annotation import Caption
-from ..formats.trajectory_reader import TrajectoryReader
+from ..formats.trajectory import TrajectoryReader
 
 _BLOCK_BYTES = 1 << 20
 

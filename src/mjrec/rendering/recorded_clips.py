@@ -25,7 +25,7 @@ from ..formats.monitor_directory import (
     infix_of,
     lock_name,
 )
-from ..formats.trajectory_reader import added_up
+from ..formats.trajectory import added_up
 from ..formats.video_metadata import is_done
 from .recorded_facts import model_file, open_for_rendering
 from .recorded_pictures import ChosenFrames, chosen_frames, recorded_rate

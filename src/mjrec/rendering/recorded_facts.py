@@ -25,11 +25,12 @@ from ..formats.json_fields import (
     text,
     unreadable,
 )
+from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_file import open_trajectory
-from ..formats.trajectory_reader import TrajectoryReader
 from ..formats.video_names import is_second_name
 from ..frames import QUALITIES
 from ..rates import to_rate
+from ..simulation.foreign_trajectories import open_vetted_trajectory
 from .views import PlainCamera, plain_camera
 
 # Not all that `Fraction` takes: 1e20000000 keeps it busy for a minute.
@@ -39,22 +40,26 @@ _RATE = re.compile(r"\d{1,12}(/\d{1,12})?", re.ASCII)
 _ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/\d{1,40})?", re.ASCII)
 _BASE_NAME = re.compile(r"[\w.-]{1,200}", re.ASCII)
 _RECORDINGS = ("deferred", "live")
-_MOST_STEPS = 10**12
 # Each may have a file of its own.
 _MOST_CAMERAS = 100
 
 
-def open_for_rendering(path: Path) -> TrajectoryReader:
-    """Open a trajectory, as `open_trajectory` does, and check its facts.
+def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryReader:
+    """Open a trajectory, whoever made it, and check its facts.
 
     Afterwards `rate`, `timestep`, `scene`, `model`, `video` and `clip` are there as
     they should be, or None, or missing; `stride`, `kept` and `candidate` as they should
     be, or missing.
 
+    Args:
+        path: of the trajectory.
+        is_vetted: whether another process of ours has opened it before.
+
     Raises:
-        UnreadableFile: of `open_trajectory`; or a fact is of a kind that it cannot be.
+        UnreadableFile: of `open_vetted_trajectory`; or a fact is of a kind that it
+            cannot be.
     """
-    reader = open_trajectory(path)
+    reader = open_trajectory(path) if is_vetted else open_vetted_trajectory(path)
     try:
         with unreadable(path):
             _check(reader.header.facts)
@@ -179,7 +184,7 @@ def _count(value: Any) -> int:
 
 def _steps(value: Any, *, least: int) -> int:
     steps = integer(value)
-    if isinstance(value, float) or not least <= steps <= _MOST_STEPS:
+    if isinstance(value, float) or steps < least:
         raise ValueError(f"{steps!r:.80} is no number of steps")
     return steps
 

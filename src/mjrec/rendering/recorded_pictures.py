@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import Any, NamedTuple
 
 from ..errors import InvalidArgument, NoPictures
-from ..formats.trajectory_reader import TrajectoryReader
+from ..formats.trajectory import TrajectoryReader
 from ..rates import stride_for, to_rate
 
 logger = logging.getLogger(__name__)

@@ -27,7 +27,7 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.second_names import give_second_names, take_second_names
-from ..formats.trajectory_reader import TrajectoryReader, added_up
+from ..formats.trajectory import TrajectoryReader, added_up
 from ..formats.unfinished_video import VideoFile
 from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
 from ..formats.video_names import further_parts, second_name_of, with_part

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnreadableFile
-from ..formats.trajectory import ModelChange
-from ..formats.trajectory_reader import TrajectoryReader
+from ..formats.trajectory import ModelChange, TrajectoryReader
 from .baked_fields import is_kept_by_context
 from .cameras import check_camera
 from .model_fields import apply_fields

@@ -18,7 +18,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ...errors import Error, UnreadableFile
-from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.trajectory import TrajectoryReader
 from ...simulation.compiled_models import (
     are_same_models,
     changed_model,
