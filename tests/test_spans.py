@@ -1353,14 +1353,8 @@ def head(rows: str = ROWS, facts: str = "{}", version: str = "1") -> str:
         (head('"state": [["a/b", 0, 1]]'), "cannot name an array"),
         (head('"state": [["a", 0, 1], ["a", 1, 1]]'), "the same name"),
         (head(f'{ACTION}{{"dtype": "|O", "shape": []}}'), r"'\|O' is no dtype"),
-        (
-            head(f'{ACTION}{{"dtype": "<f8", "shape": [4294967296, 4294967296, 1]}}'),
-            "cannot be a number",
-        ),
-        (
-            head(f'{ACTION}{{"dtype": "<f8", "shape": [200000000, 200000000]}}'),
-            "too large",
-        ),
+        (head(f'{ACTION}{{"dtype": "<f8", "shape": [4294967296, 1]}}'), "C int"),
+        (head(f'{ACTION}{{"dtype": "<f8", "shape": [-1]}}'), "cannot be a number"),
     ],
 )
 def test_a_hostile_header_is_refused(path: Path, header: str, reason: str) -> None:

@@ -220,8 +220,8 @@ def header_from_json(
         ValueError: `layout` is of another shape, or its parts do not fit.
     """
     state = field(layout, "state", list_of(_component))
-    fields = field(layout, "snapshot", list_of(_field))
     _check_parts([(c.name, c.offset, c.length) for c in state])
+    fields = field(layout, "snapshot", list_of(_field))
     _check_parts([(f.name, f.offset, padded(f.array.size)) for f in fields])
     return TrajectoryHeader(
         facts=facts,
@@ -291,7 +291,7 @@ def _check_parts(parts: list[tuple[str, int, int]]) -> None:
 def _count(value: Any) -> int:
     number = integer(value)
     if number < 0:
-        raise ValueError(f"{number} is no number of things")
+        raise ValueError(f"{number} cannot be a number of things")
     return number
 
 
