@@ -11,7 +11,6 @@ import json
 import os
 import re
 import socket
-import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -40,7 +39,7 @@ from mjrec import UnreadableFile, load_trajectory
 from mjrec.formats.in_flight import list_paths
 from mjrec.formats.manifest import read_manifest
 from mjrec.formats.monitor_directory import Infix, episode_of, infix_of
-from mjrec.formats.span_writer import LOOK_PREFIX, SpanLogs
+from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.trajectory import Array, ModelChange, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.json_text import dumps, loads
@@ -541,42 +540,7 @@ def test_hostile_lines_of_a_list_take_little(
     assert outcome.seconds < SECONDS / 2, outcome
 
 
-def change(step: int, table: str, content: bytes) -> bytes:
-    return struct.pack("<qQ", step, len(table)) + table.encode() + content
-
-
 ONE = '{"name": "geom_rgba", "dtype": "|u1", "shape": [1]}'
-
-
-@pytest.mark.parametrize(
-    "packed",
-    [
-        change(-1, f"[{ONE}]", b"a"),
-        change(0, f"[{ONE}, {ONE}]", b"ab"),
-        change(0, '[{"name": "x", "dtype": "|O", "shape": [1]}]', bytes(8)),
-        change(0, '[{"name": "x", "dtype": "<f8", "shape": [1099511627776]}]', b""),
-        change(0, "[" * 1_000_000, b""),
-    ],
-    ids=["no step", "a field twice", "objects", "a terabyte", "nested"],
-)
-def test_hostile_changes_of_a_model_are_refused(
-    inspector: Inspector, directory: Path, packed: bytes
-) -> None:
-    """Before memory is taken for what they say."""
-    path, spans = in_flight(directory)
-    spans.with_suffix(".looks").write_bytes(LOOK_PREFIX.pack(0, len(packed)) + packed)
-    assert ".looks" in refuses(inspector, "trajectory", path, spans)
-
-
-def test_a_change_that_is_longer_than_any_is_not_read(
-    inspector: Inspector, directory: Path
-) -> None:
-    """A file of a terabyte takes no room on the disk."""
-    path, spans = in_flight(directory)
-    looks = spans.with_suffix(".looks")
-    looks.write_bytes(LOOK_PREFIX.pack(0, 1 << 39))
-    os.truncate(looks, 1 << 40)
-    assert inspector.read("trajectory", path).kind == "value"
 
 
 # --- what trajectories say -----------------------------------------------------------

@@ -451,10 +451,13 @@ def test_what_a_file_is_its_content_says(path: Path, tmp_path: Path) -> None:
     assert_same(read(Path(copy)), content)
 
 
-def test_a_closed_file_says_so(path: Path) -> None:
+@pytest.mark.parametrize("is_finished", [True, False])
+def test_a_closed_file_says_so(path: Path, is_finished: bool) -> None:
     """Closing is idempotent; what is in memory stays."""
     write(path)
-    reader = open_trajectory(finish_trajectory(path))
+    if is_finished:
+        finish_trajectory(path)
+    reader = open_trajectory(path)
     reader.close()
     reader.close()
     assert reader.step_count == 40
