@@ -67,7 +67,7 @@ _CHUNK_BYTES = 1 << 17
 # How much is in memory at a time while it is written.
 _BUFFER_BYTES = 1 << 22
 
-_LEVEL = 1
+_PACKING: Mapping[str, Any] = {"chunks": True, "compression": 1, "shuffle": True}
 _FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE))
 
 
@@ -340,107 +340,67 @@ def _plain_facts(facts: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def _write_steps(file: h5py.File, reader: TrajectoryReader) -> None:
     header, steps, rows = reader.header, reader.step_count, reader.row_count
-    states = _store(
-        file, "states", Array("<f8", (header.state_length,)), rows, reader.states
-    )
+    states = _store(file, "states", "<f8", (header.state_length,), rows, reader.states)
     states.attrs["components"] = [c.name for c in header.state]
     states.attrs["offsets"] = np.array([c.offset for c in header.state], np.int64)
     states.attrs["lengths"] = np.array([c.length for c in header.state], np.int64)
-    _store_all(file, "rewards", reader.rewards)
-    _store_all(file, "terminated", reader.terminated)
-    _store_all(file, "truncated", reader.truncated)
-    for component in header.state:
-        if component.name == "time" and component.length == 1:
-            _store_all(file, "time", _column_of(reader, component.offset))
-    if header.action is not None:
-        _store(file, "actions", header.action, steps, reader.actions)
-    if header.observation is not None:
-        _store(file, "observations", header.observation, rows, reader.observations)
+    for c in header.state:
+        if c.name == "time" and c.length == 1:
+            time = states[:, c.offset] if rows else np.empty(0)
+            _store(file, "time", "<f8", (), rows, _slices_of(time))
+    for name in ("rewards", "terminated", "truncated", "frame_steps"):
+        values = getattr(reader, name)
+        _store(file, name, values.dtype, (), len(values), _slices_of(values))
+    if (kind := header.action) is not None:
+        _store(file, "actions", kind.dtype, kind.shape, steps, reader.actions)
+    if (kind := header.observation) is not None:
+        _store(file, "observations", kind.dtype, kind.shape, rows, reader.observations)
 
 
 def _write_frames(file: h5py.File, reader: TrajectoryReader) -> None:
-    _store_all(file, "frame_steps", reader.frame_steps)
     size = reader.header.snapshot.size
     if not size:
         return
     kind = _row_type(reader.header.snapshot)
-    count = reader.frame_count
-    rows = min(_SNAPSHOT_CHUNK_ROWS, _SNAPSHOT_CHUNK_BYTES // size, count)
-    dataset = _create(file, "snapshots", kind, (count,), max(1, rows))
-    for start, stop in _parts(dataset):
-        dataset[start:stop] = reader.snapshots(start, stop).view(kind).reshape(-1)
+    _store(
+        *(file, "snapshots", kind, (), reader.frame_count),
+        lambda start, stop: reader.snapshots(start, stop).view(kind).reshape(-1),
+        chunk_bytes=min(_SNAPSHOT_CHUNK_BYTES, _SNAPSHOT_CHUNK_ROWS * size),
+    )
 
 
 def _write_change(group: h5py.Group, change: ModelChange) -> None:
     group.attrs["step"] = np.int64(change.step)
     for name, values in change.fields.items():
-        if values.ndim and values.size:
-            group.create_dataset(
-                name, data=values, chunks=True, compression=_LEVEL, shuffle=True
-            )
-        else:
-            group.create_dataset(name, data=values)
-
-
-def _column_of(reader: TrajectoryReader, offset: int) -> NDArray[np.float64]:
-    step = _rows_at_once(8 * reader.header.state_length)
-    parts = [
-        reader.states(start, min(start + step, reader.row_count))[:, offset]
-        for start in range(0, reader.row_count, step)
-    ]
-    return np.concatenate([np.empty(0), *parts])
+        packing = _PACKING if values.ndim and values.size else {}
+        group.create_dataset(name, data=values, **packing)
 
 
 def _store(
     file: h5py.File,
     name: str,
-    kind: Array,
+    dtype: Any,
+    shape: tuple[int, ...],
     count: int,
     read: Callable[[int, int], NDArray[Any] | None],
+    *,
+    chunk_bytes: int = _CHUNK_BYTES,
 ) -> Any:
-    """Write `count` rows, which `read(start, stop)` gives."""
-    rows = max(1, min(count, _CHUNK_BYTES // (kind.size or 1)))
-    dataset = _create(file, name, np.dtype(kind.dtype), (count, *kind.shape), rows)
-    for start, stop in _parts(dataset):
+    """Write `count` arrays of a shape, which `read(start, stop)` gives."""
+    row = np.dtype(dtype).itemsize * math.prod(shape)
+    if not count * row:
+        # Nothing to be cut into chunks.
+        return file.create_dataset(name, (count, *shape), dtype)
+    chunk = max(1, min(count, chunk_bytes // row))
+    packing = {**_PACKING, "chunks": (chunk, *shape)}
+    dataset = file.create_dataset(name, (count, *shape), dtype, **packing)
+    # Whole chunks.
+    step = max(1, _BUFFER_BYTES // row // chunk) * chunk
+    for start in range(0, count, step):
+        stop = min(start + step, count)
         dataset[start:stop] = read(start, stop)
     return dataset
 
 
-def _store_all(file: h5py.File, name: str, values: NDArray[Any]) -> None:
-    kind = Array(values.dtype.str, values.shape[1:])
-    _store(file, name, kind, len(values), lambda start, stop: values[start:stop])
-
-
-def _create(
-    file: h5py.File,
-    name: str,
-    dtype: np.dtype[Any],
-    shape: tuple[int, ...],
-    chunk_rows: int,
-) -> Any:
-    if math.prod(shape) == 0:
-        # Nothing to be cut into chunks.
-        return file.create_dataset(name, shape, dtype)
-    return file.create_dataset(
-        name,
-        shape,
-        dtype,
-        chunks=(chunk_rows, *shape[1:]),
-        compression=_LEVEL,
-        shuffle=True,
-    )
-
-
-def _parts(dataset: Any) -> Iterator[tuple[int, int]]:
-    """Yield ranges of rows to be written at once: whole chunks."""
-    if dataset.chunks is None:
-        return
-    row = dataset.dtype.itemsize * math.prod(dataset.shape[1:])
-    chunk = dataset.chunks[0]
-    step = max(1, _rows_at_once(row) // chunk) * chunk
-    for start in range(0, dataset.shape[0], step):
-        yield start, min(start + step, dataset.shape[0])
-
-
-def _rows_at_once(size: int) -> int:
-    return max(1, _BUFFER_BYTES // max(1, size))
+def _slices_of(values: NDArray[Any]) -> Callable[[int, int], NDArray[Any]]:
+    return lambda start, stop: values[start:stop]
