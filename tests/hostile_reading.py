@@ -73,6 +73,12 @@ class Inspector:
         self._process.stdin.flush()
         return Outcome(**json.loads(self._process.stdout.readline()))
 
+    def reads(self, reader: str, path: Path) -> None:
+        """Check that `path` is read, soon."""
+        outcome = self.read(reader, path)
+        assert outcome.kind == "value", outcome
+        assert outcome.seconds < SECONDS / 2, outcome
+
     def refuses(self, reader: str, path: Path) -> str:
         """Check that reading `path` is one error of ours, soon; return its reason."""
         outcome = self.read(reader, path)
@@ -96,9 +102,14 @@ def _trajectory(path: Path) -> None:
 
 
 def _finish(path: Path) -> None:
+    """Finish the episode that this is a file of."""
+    from mjrec import UnreadableFile
     from mjrec.formats.trajectory_file import finish_trajectory
 
-    finish_trajectory(path)
+    try:
+        finish_trajectory(path.with_name("openaigym.trajectory.0.7.episode000000.h5"))
+    except UnreadableFile as error:
+        raise UnreadableFile(path, error) from error
 
 
 def _manifest(path: Path) -> None:
