@@ -23,7 +23,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Protocol, Self
+from typing import IO, Self
 
 from ..errors import EncoderError, Error, InvalidArgument, MissingDependency
 from ..file_digests import file_sha256
@@ -117,13 +117,6 @@ def run_ffmpeg(
         return process.communicate(standard_input)
 
 
-class HasFileno(Protocol):
-    """What is an open file."""
-
-    def fileno(self) -> int:
-        """Return its descriptor."""
-
-
 class FfmpegProcess:
     """An ffmpeg that is fed through, or read from, a pipe.
 
@@ -139,7 +132,7 @@ class FfmpegProcess:
         what: what fails when it fails: the first sentence of the error.
         reads: whether it is fed through `write`.
         writes: whether it is read through `read`.
-        keeps: a file that it holds open.
+        keeps: the descriptor of a file that it holds open.
 
     Attributes:
         command: the program and its arguments.
@@ -155,7 +148,7 @@ class FfmpegProcess:
         what: str,
         reads: bool = False,
         writes: bool = False,
-        keeps: HasFileno | None = None,
+        keeps: int | None = None,
     ) -> None:
         self.command = [ffmpeg_executable(), *arguments]
         self._what = what
@@ -177,7 +170,7 @@ class FfmpegProcess:
                     # tells, not the end of it: Python ignores SIGXFSZ, and so does
                     # ffmpeg then.
                     restore_signals=False,
-                    pass_fds=() if keeps is None else (keeps.fileno(),),
+                    pass_fds=() if keeps is None else (keeps,),
                 )
             except OSError as error:
                 raise _not_started(self.command[0], error) from error

@@ -273,6 +273,7 @@ class _Encoding:
 
     def __init__(self, video: UnfinishedVideo) -> None:
         self.size = (video.height, video.width)
+        self.temporary = video.temporary
         self.is_ending = False
         self._video = video
         self._encoded = 0
@@ -294,12 +295,12 @@ class _Encoding:
                     fps=video.fps,
                 )
                 on_failure.callback(self._hashes.abort)
-            self.process = FfmpegProcess(
+            self._process = FfmpegProcess(
                 [*video.encoder["arguments"][:-1], as_file(video.temporary)],
                 what=f"The video {video.path} could not be encoded.",
                 reads=True,
                 # It shares the lock, which it holds to its own end when we die.
-                keeps=self._lock,
+                keeps=self._lock.fileno(),
             )
             on_failure.callback(self._end_process)
             frame_bytes = 3 * video.height * video.width
@@ -321,13 +322,13 @@ class _Encoding:
         self.thread.close()
         if not self._input_ended:
             return None
-        self.process.wait()
+        self._process.wait()
         file = self._video.check()
         if file.frame_count != self._encoded:
             raise FrameCountError(
                 f"{file.path} was to hold {self._encoded} frames, and decoding gives "
                 f"{file.frame_count}. It was not kept.",
-                command=self.process.command,
+                command=self._process.command,
                 returncode=0,
                 stderr="",
             )
@@ -336,14 +337,14 @@ class _Encoding:
         if self._hashes is not None:
             self._hashes.close()
         self._video.rename(file)
-        self.process.release()
+        self._process.release()
         self._lock.release()
         return file
 
     def abort(self) -> None:
         """End everything and remove the temporary files."""
         # First the process: the thread may be waiting for it to read.
-        self.process.kill()
+        self._process.kill()
         self.thread.abort()
         self._end_process()
         if self._hashes is not None:
@@ -360,18 +361,18 @@ class _Encoding:
             ffmpeg_sha256()
         if self._hashes is not None:
             self._hashes.add(frame)
-        self.process.write(pad_to_even(frame))
+        self._process.write(pad_to_even(frame))
         self._encoded += 1
 
     def _end_input(self) -> None:
-        self.process.end_input()
+        self._process.end_input()
         self._input_ended = True
 
     def _end_process(self) -> None:
-        self.process.kill()
-        self.process.release()
+        self._process.kill()
+        self._process.release()
         # ffmpeg may have put another file in the place of the one that is locked.
-        self._video.temporary.unlink(missing_ok=True)
+        self.temporary.unlink(missing_ok=True)
         self._lock.release()
 
 
