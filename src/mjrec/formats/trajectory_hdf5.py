@@ -71,6 +71,28 @@ _PACKING: Mapping[str, Any] = {"chunks": True, "compression": 1, "shuffle": True
 _FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE))
 
 
+def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
+    """Write all that `reader` has as the HDF5 file `path`, whole or not at all.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone.
+        UnreadableFile: what is read turned out to be damaged.
+    """
+    # In memory, compressed as it will be in the file: the HDF5 library does not survive
+    # a write that fails (it crashes the process when it closes what is left).
+    image = io.BytesIO()
+    with h5py.File(image, "w", libver=_LIBVER) as file:
+        _write(file, reader)
+    try:
+        with replacing(path) as temporary, temporary.open("xb") as output:
+            output.write(image.getbuffer())
+            output.flush()
+            # The log is removed next: what it held must not be in a cache alone.
+            os.fsync(output.fileno())
+    except OSError as error:
+        raise FileNotWritten(path, error.strerror or error) from error
+
+
 class TrajectoryHdf5Reader(TrajectoryReader):
     """Reads the HDF5 file of a finished trajectory.
 
@@ -280,31 +302,13 @@ def _row_type(layout: RowLayout) -> np.dtype[Any]:
     )
 
 
-def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
-    """Write all that `reader` has as the HDF5 file `path`, whole or not at all.
-
-    Raises:
-        FileNotWritten: the disk is full, or the directory is gone.
-        UnreadableFile: what is read turned out to be damaged.
-    """
-    # In memory, compressed as it will be in the file: the HDF5 library does not survive
-    # a write that fails (it crashes the process when it closes what is left).
-    image = io.BytesIO()
-    with h5py.File(image, "w", libver=_LIBVER) as file:
-        _write_attributes(file, reader)
-        _write_steps(file, reader)
-        _write_frames(file, reader)
-        changes = file.create_group("model_changes")
-        for index, change in enumerate(reader.iter_model_changes()):
-            _write_change(changes.create_group(str(index)), change)
-    try:
-        with replacing(path) as temporary, temporary.open("xb") as output:
-            output.write(image.getbuffer())
-            output.flush()
-            # The log is removed next: what it held must not be in a cache alone.
-            os.fsync(output.fileno())
-    except OSError as error:
-        raise FileNotWritten(path, error.strerror or error) from error
+def _write(file: h5py.File, reader: TrajectoryReader) -> None:
+    _write_attributes(file, reader)
+    _write_steps(file, reader)
+    _write_frames(file, reader)
+    changes = file.create_group("model_changes")
+    for index, change in enumerate(reader.iter_model_changes()):
+        _write_change(changes.create_group(str(index)), change)
 
 
 def _write_attributes(file: h5py.File, reader: TrajectoryReader) -> None:
