@@ -69,45 +69,32 @@ def test_a_sound_file_is_read(inspector: Inspector, directory: Path, kind: str) 
 # --- what is no file at all ----------------------------------------------------------
 
 
-def pipe(path: Path, _: Path) -> None:
-    os.mkfifo(path)
-
-
-def folder(path: Path, _: Path) -> None:
-    path.mkdir()
-
-
-def link_to_itself(path: Path, _: Path) -> None:
-    path.symlink_to(path.name)
-
-
-def link_to_a_device(path: Path, _: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def link_elsewhere(path: Path, elsewhere: Path) -> None:
-    path.symlink_to(elsewhere)
-
-
-def link_with_dots(path: Path, elsewhere: Path) -> None:
-    path.symlink_to(Path("..") / elsewhere.parent.name / elsewhere.name)
-
-
-def listening_socket(path: Path, _: Path) -> None:
+def listening_socket(path: Path) -> None:
     # By a relative name, because those of sockets are short.
     with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as listening:
         listening.bind(path.name)
 
 
-PUT = (
-    *(pipe, folder, link_to_itself, link_to_a_device),
-    *(link_elsewhere, link_with_dots, listening_socket),
-)
+def outside_of(path: Path) -> Path:
+    return path.parents[1] / "ours" / path.name
+
+
+PUT: dict[str, Callable[[Path], Any]] = {
+    "pipe": os.mkfifo,
+    "folder": Path.mkdir,
+    "socket": listening_socket,
+    "link to itself": lambda path: path.symlink_to(path.name),
+    "link to a device": lambda path: path.symlink_to("/dev/zero"),
+    "link elsewhere": lambda path: path.symlink_to(
+        path.parents[1] / "ours" / path.name
+    ),
+    "link with dots": lambda path: path.symlink_to(Path("../ours") / path.name),
+}
 FINE = {
     # A file that the user names is the user's, links and all.
-    *(("mjcf", link_elsewhere), ("mjcf", link_with_dots)),
+    *(("mjcf", "link elsewhere"), ("mjcf", "link with dots")),
     # A directory is an answer that lists what is in it.
-    ("h5", folder),
+    ("h5", "folder"),
 }
 
 
@@ -118,16 +105,16 @@ def test_only_regular_files_of_the_directory_are_opened(
     inspector: Inspector,
     directory: Path,
     kind: str,
-    put: Callable[[Path, Path], None],
+    put: str,
 ) -> None:
     """No pipe is waited for, no device opened, no link followed, nothing removed."""
     reader, write = FILES[kind]
     path = write(directory)
-    outside = directory.with_name("ours") / path.name
+    outside = outside_of(path)
     outside.parent.mkdir()
     path.rename(outside)
     os.utime(outside, (0, outside.stat().st_mtime))
-    put(path, outside)
+    PUT[put](path)
     before = sorted(directory.iterdir())
     inspector.refuses(reader, path)
     assert outside.stat().st_atime == 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 import random
 import re
 import shutil
@@ -195,25 +194,6 @@ def test_an_episode_killed_at_its_beginning_is_finished(path: Path) -> None:
     content = read(path)
     assert content.states.shape == (0, 3)
     assert_same(read(finish_trajectory(path)), killed(content))
-
-
-def test_a_torn_log_is_finished(path: Path) -> None:
-    """The whole rows are kept, and of half a row nothing."""
-    write(path, ended=False)
-    size = row_log(path).stat().st_size // 41
-    os.truncate(row_log(path), 38 * size + size // 2)
-    content = read(path)
-    assert len(content.rewards) == 37
-    assert_same(read(finish_trajectory(path)), killed(content))
-
-
-def test_rows_of_an_ended_episode_that_are_lost_are_counted(path: Path) -> None:
-    """As after a crash of the machine; the list says how many there were."""
-    write(path)
-    size = row_log(path).stat().st_size // 41
-    os.truncate(row_log(path), 38 * size + 1)
-    assert read(path).dropped == 3
-    assert read(finish_trajectory(path)).dropped == 3
 
 
 def test_whoever_knows_more_of_an_end_than_the_log_is_believed(path: Path) -> None:
