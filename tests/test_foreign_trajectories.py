@@ -9,7 +9,8 @@ from pathlib import Path
 
 import gymnasium
 import pytest
-from trajectories_by_hand import write_finished, write_log
+from sound_files import finished
+from trajectories_by_hand import write_log
 
 import mjrec
 import mjrec.simulation.foreign_trajectories as foreign_trajectories
@@ -33,8 +34,8 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def test_a_strangers_file_is_vetted_once(tmp_path: Path, started: list[str]) -> None:
     """Until it is another one."""
-    path = write_finished(tmp_path)
-    assert len(mjrec.load_trajectory(path).snapshots) == 1
+    path = finished(tmp_path)
+    assert mjrec.load_trajectory(path).snapshots
     open_for_rendering(path).close()
     assert len(started) == 1
     os.utime(path, (0, 0))
@@ -76,5 +77,5 @@ def test_in_a_sandbox_there_is_no_other(
 ) -> None:
     """Verifying reads in one already."""
     monkeypatch.setenv("MJREC_SANDBOX", "1")
-    mjrec.load_trajectory(write_finished(tmp_path))
+    mjrec.load_trajectory(finished(tmp_path))
     assert started == []
