@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import abc
 import functools
-import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -54,9 +53,14 @@ class Array:
     shape: tuple[int, ...]
 
     @functools.cached_property
+    def numpy(self) -> np.dtype[Any]:
+        """The type of one, a subarray."""
+        return np.dtype((self.dtype, self.shape))
+
+    @property
     def size(self) -> int:
         """The bytes of one."""
-        return np.dtype(self.dtype).itemsize * math.prod(self.shape)
+        return self.numpy.itemsize
 
 
 @dataclass(frozen=True)
@@ -353,25 +357,23 @@ class TrajectoryReader(abc.ABC):
         Raises:
             UnreadableFile: the file was damaged since it was opened.
         """
-        self._check_range(start, stop, self.row_count, "states")
-        return self._states(start, stop)
+        return self._range("states", start, stop, self.row_count)
 
     def actions(self, start: int, stop: int) -> NDArray[Any] | None:
         """Return `(stop - start, *shape)`, of T; None where they are not recorded."""
-        self._check_range(start, stop, self.step_count, "actions")
-        return None if self.header.action is None else self._actions(start, stop)
+        if self.header.action is None:
+            return None
+        return self._range("actions", start, stop, self.step_count)
 
     def observations(self, start: int, stop: int) -> NDArray[Any] | None:
         """Return `(stop - start, *shape)`, of `row_count`; None as of `actions`."""
-        self._check_range(start, stop, self.row_count, "observations")
         if self.header.observation is None:
             return None
-        return self._observations(start, stop)
+        return self._range("observations", start, stop, self.row_count)
 
     def snapshots(self, start: int, stop: int) -> NDArray[np.uint8]:
         """Return `(stop - start, snapshot.size) uint8` packed rows, of F."""
-        self._check_range(start, stop, self.frame_count, "snapshots")
-        return self._snapshots(start, stop)
+        return self._range("snapshots", start, stop, self.frame_count)
 
     def iter_model_changes(self) -> Iterator[ModelChange]:
         """Yield the changes of the model in the order of their steps."""
@@ -403,24 +405,17 @@ class TrajectoryReader(abc.ABC):
             f"{self.frame_count} frames>"
         )
 
-    @abc.abstractmethod
-    def _states(self, start: int, stop: int) -> NDArray[np.float64]: ...
+    def _range(self, name: str, start: int, stop: int, count: int) -> NDArray[Any]:
+        if not 0 <= start <= stop <= count:
+            raise InvalidArgument(
+                f"{self.path.name} has {count} {name}; there are none from {start} to "
+                f"{stop}."
+            )
+        return self._rows(name, start, stop)
 
     @abc.abstractmethod
-    def _actions(self, start: int, stop: int) -> NDArray[Any]: ...
-
-    @abc.abstractmethod
-    def _observations(self, start: int, stop: int) -> NDArray[Any]: ...
-
-    @abc.abstractmethod
-    def _snapshots(self, start: int, stop: int) -> NDArray[np.uint8]: ...
+    def _rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Return some of the states, actions, observations or snapshots."""
 
     @abc.abstractmethod
     def _model_change(self, index: int) -> ModelChange: ...
-
-    def _check_range(self, start: int, stop: int, count: int, what: str) -> None:
-        if not 0 <= start <= stop <= count:
-            raise InvalidArgument(
-                f"{self.path.name} has {count} {what}; there are none from {start} to "
-                f"{stop}."
-            )

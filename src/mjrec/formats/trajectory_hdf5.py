@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import math
 import os
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -127,43 +126,41 @@ class TrajectoryHdf5Reader(TrajectoryReader):
         self.header = header = header_from_json(json_object(facts), json_object(layout))
         self.dropped = _whole_number(attributes, "dropped")
         self.rewards = self._column("rewards", "<f8")
-        steps = len(self.rewards)
+        steps = self.step_count
         self.terminated = self._column("terminated", "|b1", steps)
         self.truncated = self._column("truncated", "|b1", steps)
-        self._state_rows = self._dataset("states", "<f8", (header.state_length,))
-        self.row_count = self._state_rows.shape[0]
-        if self.row_count != steps + 1 and (self.row_count, steps) != (0, 0):
-            raise ValueError(f"it has {self.row_count} states for {steps} steps")
         self.frame_steps = self._column("frame_steps", "<i8")
-        bounds = np.concatenate(([0], self.frame_steps, [max(self.row_count - 1, 0)]))
+        state = Array("<f8", (header.state_length,)).numpy
+        self._datasets = {"states": self._dataset("states", state)}
+        self.row_count = rows = len(self._datasets["states"])
+        if rows != steps + 1 and (rows, steps) != (0, 0):
+            raise ValueError(f"it has {rows} states for {steps} steps")
+        bounds = np.concatenate(([0], self.frame_steps, [max(rows - 1, 0)]))
         # Compared, because differences of such numbers may overflow.
-        is_disordered = (bounds[1:] < bounds[:-1]).any()
-        if is_disordered or (self.frame_count and not self.row_count):
+        if (bounds[1:] < bounds[:-1]).any() or (self.frame_count and not rows):
             raise ValueError("its frames are not of its steps, in order")
-        self._action_rows = self._optional("actions", header.action, steps)
-        self._observation_rows = self._optional(
-            "observations", header.observation, self.row_count
-        )
-        self._snapshot_rows = header.snapshot.size and self._dataset(
-            "snapshots", _row_type(header.snapshot), (), self.frame_count
-        )
+        if header.action is not None:
+            self._datasets["actions"] = self._dataset(
+                "actions", header.action.numpy, steps
+            )
+        if header.observation is not None:
+            self._datasets["observations"] = self._dataset(
+                "observations", header.observation.numpy, rows
+            )
+        if header.snapshot.size:
+            self._datasets["snapshots"] = self._dataset(
+                "snapshots", _row_type(header.snapshot), self.frame_count
+            )
         self._changes = _group(self._file, "model_changes")
         self.change_count = len(self._changes)
 
-    def _states(self, start: int, stop: int) -> NDArray[np.float64]:
-        return self._read(self._state_rows, start, stop)
-
-    def _actions(self, start: int, stop: int) -> NDArray[Any]:
-        return self._read(self._action_rows, start, stop)
-
-    def _observations(self, start: int, stop: int) -> NDArray[Any]:
-        return self._read(self._observation_rows, start, stop)
-
-    def _snapshots(self, start: int, stop: int) -> NDArray[np.uint8]:
+    def _rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
         size = self.header.snapshot.size
+        if name != "snapshots":
+            return self._read(self._datasets[name], start, stop)
         if not size:
             return np.empty((stop - start, 0), np.uint8)
-        rows = self._read(self._snapshot_rows, start, stop)
+        rows = self._read(self._datasets[name], start, stop)
         return rows.view(np.uint8).reshape(stop - start, size)
 
     def _model_change(self, index: int) -> ModelChange:
@@ -179,26 +176,17 @@ class TrajectoryHdf5Reader(TrajectoryReader):
                 fields={name: _whole(dataset) for name, dataset in datasets.items()},
             )
 
-    def _optional(self, name: str, kind: Array | None, count: int) -> Any:
-        return kind and self._dataset(name, kind.dtype, kind.shape, count)
-
     def _column(self, name: str, dtype: str, count: int | None = None) -> NDArray[Any]:
-        dataset = self._dataset(name, dtype, (), count)
-        return self._read(dataset, 0, dataset.shape[0])
+        dataset = self._dataset(name, np.dtype(dtype), count)
+        return self._read(dataset, 0, len(dataset))
 
-    def _dataset(
-        self,
-        name: str,
-        dtype: Any,
-        shape: tuple[int, ...],
-        count: int | None = None,
-    ) -> Any:
-        """Return a dataset with a row of `shape` for each of `count` things."""
+    def _dataset(self, name: str, kind: np.dtype[Any], count: int | None = None) -> Any:
+        """Return a dataset with one of a kind for each of `count` things."""
         dataset = _own_dataset(self._file, name)
         # Memory is made for what the layout says, and HDF5 fills it as the file says.
-        if dataset.dtype != dtype:
+        if dataset.dtype != kind.base:
             raise ValueError(f"its {name} are of dtype {dataset.dtype}")
-        if dataset.shape[:1] + shape != dataset.shape:
+        if dataset.shape[:1] + kind.shape != dataset.shape:
             raise ValueError(f"its {name} have the shape {dataset.shape}")
         if count not in (None, dataset.shape[0]):
             raise ValueError(f"it has {dataset.shape[0]} {name}, not {count}")
@@ -304,8 +292,7 @@ def _row_type(layout: RowLayout) -> np.dtype[Any]:
 
 def _write(file: h5py.File, reader: TrajectoryReader) -> None:
     _write_attributes(file, reader)
-    _write_steps(file, reader)
-    _write_frames(file, reader)
+    _write_rows(file, reader)
     changes = file.create_group("model_changes")
     for index, change in enumerate(reader.iter_model_changes()):
         _write_change(changes.create_group(str(index)), change)
@@ -342,35 +329,34 @@ def _plain_facts(facts: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
                 yield name, value
 
 
-def _write_steps(file: h5py.File, reader: TrajectoryReader) -> None:
+def _write_rows(file: h5py.File, reader: TrajectoryReader) -> None:
     header, steps, rows = reader.header, reader.step_count, reader.row_count
-    states = _store(file, "states", "<f8", (header.state_length,), rows, reader.states)
+    state = Array("<f8", (header.state_length,)).numpy
+    states = _store(file, "states", state, rows, reader.states)
     states.attrs["components"] = [c.name for c in header.state]
     states.attrs["offsets"] = np.array([c.offset for c in header.state], np.int64)
     states.attrs["lengths"] = np.array([c.length for c in header.state], np.int64)
+    columns = {
+        name: getattr(reader, name)
+        for name in ("rewards", "terminated", "truncated", "frame_steps")
+    }
     for c in header.state:
         if c.name == "time" and c.length == 1:
-            time = states[:, c.offset] if rows else np.empty(0)
-            _store(file, "time", "<f8", (), rows, _slices_of(time))
-    for name in ("rewards", "terminated", "truncated", "frame_steps"):
-        values = getattr(reader, name)
-        _store(file, name, values.dtype, (), len(values), _slices_of(values))
-    if (kind := header.action) is not None:
-        _store(file, "actions", kind.dtype, kind.shape, steps, reader.actions)
-    if (kind := header.observation) is not None:
-        _store(file, "observations", kind.dtype, kind.shape, rows, reader.observations)
-
-
-def _write_frames(file: h5py.File, reader: TrajectoryReader) -> None:
-    size = reader.header.snapshot.size
-    if not size:
-        return
-    kind = _row_type(reader.header.snapshot)
-    _store(
-        *(file, "snapshots", kind, (), reader.frame_count),
-        lambda start, stop: reader.snapshots(start, stop).view(kind).reshape(-1),
-        chunk_bytes=min(_SNAPSHOT_CHUNK_BYTES, _SNAPSHOT_CHUNK_ROWS * size),
-    )
+            columns["time"] = states[:, c.offset] if rows else np.empty(0)
+    for name, values in columns.items():
+        _store(file, name, values.dtype, len(values), _slices_of(values))
+    if header.action is not None:
+        _store(file, "actions", header.action.numpy, steps, reader.actions)
+    if header.observation is not None:
+        kind = header.observation.numpy
+        _store(file, "observations", kind, rows, reader.observations)
+    if size := header.snapshot.size:
+        kind = _row_type(header.snapshot)
+        _store(
+            *(file, "snapshots", kind, reader.frame_count),
+            lambda start, stop: reader.snapshots(start, stop).view(kind).reshape(-1),
+            chunk_bytes=min(_SNAPSHOT_CHUNK_BYTES, _SNAPSHOT_CHUNK_ROWS * size),
+        )
 
 
 def _write_change(group: h5py.Group, change: ModelChange) -> None:
@@ -383,23 +369,22 @@ def _write_change(group: h5py.Group, change: ModelChange) -> None:
 def _store(
     file: h5py.File,
     name: str,
-    dtype: Any,
-    shape: tuple[int, ...],
+    kind: np.dtype[Any],
     count: int,
     read: Callable[[int, int], NDArray[Any] | None],
     *,
     chunk_bytes: int = _CHUNK_BYTES,
 ) -> Any:
-    """Write `count` arrays of a shape, which `read(start, stop)` gives."""
-    row = np.dtype(dtype).itemsize * math.prod(shape)
-    if not count * row:
+    """Write `count` of a kind, which `read(start, stop)` gives."""
+    shape, size = (count, *kind.shape), kind.itemsize
+    if not count * size:
         # Nothing to be cut into chunks.
-        return file.create_dataset(name, (count, *shape), dtype)
-    chunk = max(1, min(count, chunk_bytes // row))
-    packing = {**_PACKING, "chunks": (chunk, *shape)}
-    dataset = file.create_dataset(name, (count, *shape), dtype, **packing)
+        return file.create_dataset(name, shape, kind.base)
+    chunk = max(1, min(count, chunk_bytes // size))
+    packing = {**_PACKING, "chunks": (chunk, *kind.shape)}
+    dataset = file.create_dataset(name, shape, kind.base, **packing)
     # Whole chunks.
-    step = max(1, _BUFFER_BYTES // row // chunk) * chunk
+    step = max(1, _BUFFER_BYTES // size // chunk) * chunk
     for start in range(0, count, step):
         stop = min(start + step, count)
         dataset[start:stop] = read(start, stop)
