@@ -57,6 +57,7 @@ _TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 # Says to what runs in a sandbox, and to what that starts, that it does.
 _INSIDE_VARIABLE = "MJREC_SANDBOX"
 
+_NOTHING: Mapping[str, str] = {}
 _STANDARD_INPUT = 0
 _SECONDS_TO_DIE = 5.0
 _LONGEST_LINE = 1 << 24
@@ -73,6 +74,7 @@ class Sandbox:
         place: an empty folder for what it leaves behind: its working directory, and
             where its temporary files are.
         limits: by their names in `resource`.
+        more_environ: environment variables besides this process's.
 
     Raises:
         Error: it cannot be started.
@@ -85,11 +87,10 @@ class Sandbox:
         *,
         place: Path,
         limits: Mapping[str, int] = LIMITS,
+        more_environ: Mapping[str, str] = _NOTHING,
     ) -> None:
         environ = {k: v for k, v in os.environ.items() if k != _TRUST_VARIABLE}
-        environ |= {"TMPDIR": str(place), _INSIDE_VARIABLE: "1"}
-        # Threads that nothing uses would take of the memory.
-        environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        environ |= {**more_environ, "TMPDIR": str(place), _INSIDE_VARIABLE: "1"}
         self._stderr = (place / "words.txt").open("w+b")
         try:
             self._process = subprocess.Popen(

@@ -63,18 +63,26 @@ def _vet(path: Path) -> None:
     memory = _MEMORY + _MOST_EXPANSION * size
     seconds = int(_CPU_SECONDS + _CPU_SECONDS_PER_MB * size / 1e6)
     limits = {**LIMITS, "RLIMIT_DATA": memory, "RLIMIT_CPU": seconds}
-    with tempfile.TemporaryDirectory(prefix="mjrec-reading-") as place:
-        request = {"path": str(path.absolute())}
-        with Sandbox(_MODULE, request, place=Path(place), limits=limits) as sandbox:
-            said = next(sandbox.said(_PATIENCE * seconds), None) or {}
-            if said.get("reason"):
-                raise UnreadableFile(path, str(said["reason"]))
-            if not said.get("is_harmless"):
-                raise UnreadableFile(
-                    path,
-                    f"the process that read it {sandbox.what_became_of_it()} (it may "
-                    f"use {memory / 2**30:.1f} GiB of memory and {seconds} seconds)",
-                )
+    with (
+        tempfile.TemporaryDirectory(prefix="mjrec-reading-") as place,
+        Sandbox(
+            _MODULE,
+            {"path": str(path.absolute())},
+            place=Path(place),
+            limits=limits,
+            # Threads that nothing uses would take of the memory.
+            more_environ={"OPENBLAS_NUM_THREADS": "1"},
+        ) as sandbox,
+    ):
+        said = next(sandbox.said(_PATIENCE * seconds), None) or {}
+        if said.get("reason"):
+            raise UnreadableFile(path, str(said["reason"]))
+        if not said.get("is_harmless"):
+            raise UnreadableFile(
+                path,
+                f"the process that read it {sandbox.what_became_of_it()} (it may "
+                f"use {memory / 2**30:.1f} GiB of memory and {seconds} seconds)",
+            )
 
 
 def _identity(path: Path) -> tuple[int, ...]:
