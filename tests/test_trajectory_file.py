@@ -35,7 +35,6 @@ from mjrec.formats.trajectory import (
     added_up,
 )
 from mjrec.formats.trajectory_file import (
-    TrajectoryReader,
     find_trajectory,
     finish_trajectory,
     open_trajectory,
@@ -326,23 +325,6 @@ def test_what_is_finished_meanwhile_is_read(
     finish_late(monkeypatch)
     assert_same(use(path), content)
     assert list(path.parent.iterdir()) == [path]
-
-
-def test_two_may_be_at_the_same_log(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whoever has opened it makes the same file, though the other one is faster."""
-    write(path)
-    content = read(path)
-    real = trajectory_file.write_hdf5
-
-    def slow(reader: TrajectoryReader, name: Path) -> None:
-        monkeypatch.setattr(trajectory_file, "write_hdf5", real)
-        finish_trajectory(name)
-        real(reader, name)
-
-    monkeypatch.setattr(trajectory_file, "write_hdf5", slow)
-    assert_same(read(finish_trajectory(path)), content)
 
 
 def test_a_reader_keeps_what_somebody_finishes(path: Path) -> None:
