@@ -13,8 +13,15 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument
 from ..json_text import loads
-from .json_fields import field, list_of, mapping
-from .trajectory import Array, ModelChange, array_from_json, array_to_json, field_name
+from .json_fields import list_of
+from .trajectory import (
+    Array,
+    ModelChange,
+    array_from_json,
+    array_to_json,
+    field_name,
+    named_array,
+)
 
 # Its step, and the length of its table.
 _PREFIX = struct.Struct("<qQ")
@@ -62,7 +69,7 @@ def unpack_change(packed: bytes) -> ModelChange:
         raise ValueError("a change of the model is of no step")
     offset = _PREFIX.size + table_size
     try:
-        table = list_of(_named_array)(loads(packed[_PREFIX.size : offset]))
+        table = list_of(named_array)(loads(packed[_PREFIX.size : offset]))
     except (RecursionError, ValueError) as error:
         raise ValueError("the table of a change of the model is damaged") from error
     if offset + sum(kind.size for _, kind in table) != len(packed):
@@ -88,8 +95,3 @@ def _kind_of(name: str, array: NDArray[Any]) -> Array:
         raise InvalidArgument(
             f"The model field {name!r} cannot be recorded: {error}."
         ) from None
-
-
-def _named_array(value: Any) -> tuple[str, Array]:
-    values = mapping(value)
-    return field(values, "name", field_name), array_from_json(values)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import abc
 import functools
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -202,16 +203,16 @@ def layout_to_json(header: TrajectoryHeader) -> dict[str, Any]:
         ValueError: no file could hold such rows.
     """
     layout = {
-        "state": [[c.name, c.offset, c.length] for c in header.state],
+        "state": [[c.name, c.length] for c in header.state],
         "snapshot": [
-            {"name": f.name, **array_to_json(f.array), "offset": f.offset}
-            for f in header.snapshot.fields
+            {"name": f.name, **array_to_json(f.array)} for f in header.snapshot.fields
         ],
         "action": header.action and array_to_json(header.action),
         "observation": header.observation and array_to_json(header.observation),
     }
-    # What is written is what a reader will accept.
-    header_from_json({}, layout)
+    # What is written is what a reader will make of it.
+    if header_from_json(header.facts, layout) != header:
+        raise ValueError("the parts of its rows do not lie one behind the other")
     return layout
 
 
@@ -221,16 +222,21 @@ def header_from_json(
     """Return the header that `layout_to_json` was given.
 
     Raises:
-        ValueError: `layout` is of another shape, or its parts do not fit.
+        ValueError: `layout` is of another shape, or there can be no such rows.
     """
     state = field(layout, "state", list_of(_component))
-    _check_parts([(c.name, c.offset, c.length) for c in state])
-    fields = field(layout, "snapshot", list_of(_field))
-    _check_parts([(f.name, f.offset, padded(f.array.size)) for f in fields])
+    offsets = itertools.accumulate((length for _, length in state), initial=0)
+    snapshot = field(layout, "snapshot", list_of(named_array))
+    for parts in (state, snapshot):
+        if len(dict(parts)) != len(parts):
+            raise ValueError("two parts of a row have the same name")
     return TrajectoryHeader(
         facts=facts,
-        state=state,
-        snapshot=RowLayout(fields),
+        state=tuple(
+            StateComponent(name, offset, length)
+            for (name, length), offset in zip(state, offsets, strict=False)
+        ),
+        snapshot=RowLayout.packed(snapshot),
         action=field(layout, "action", optional(array_from_json)),
         observation=field(layout, "observation", optional(array_from_json)),
     )
@@ -265,31 +271,17 @@ def field_name(value: Any) -> str:
     return name
 
 
-def _component(value: Any) -> StateComponent:
-    parts = list_of(lambda item: item)(value)
-    if len(parts) != 3:
-        raise ValueError("a component is its name, offset and length")
-    return StateComponent(field_name(parts[0]), _count(parts[1]), _count(parts[2]))
-
-
-def _field(value: Any) -> Field:
+def named_array(value: Any) -> tuple[str, Array]:
+    """Return the name and the kind of an array that has both."""
     values = mapping(value)
-    return Field(
-        field(values, "name", field_name),
-        array_from_json(values),
-        field(values, "offset", _count),
-    )
+    return field(values, "name", field_name), array_from_json(values)
 
 
-def _check_parts(parts: list[tuple[str, int, int]]) -> None:
-    """Check that the parts of a row have names and lie one behind the other."""
-    if len({name for name, _, _ in parts}) != len(parts):
-        raise ValueError("two parts of a row have the same name")
-    end = 0
-    for name, offset, size in parts:
-        if offset != end:
-            raise ValueError(f"{name} is said to begin at {offset}, not at {end}")
-        end += size
+def _component(value: Any) -> tuple[str, int]:
+    parts = list_of(lambda item: item)(value)
+    if len(parts) != 2:
+        raise ValueError("a component is its name and its length")
+    return field_name(parts[0]), _count(parts[1])
 
 
 def _count(value: Any) -> int:
