@@ -652,8 +652,8 @@ def test_close_on_the_encoders_thread_leaves_the_rest_to_another(
         video.close()
         closes.set()
 
-    monkeypatch.setattr(FfmpegProcess, "write", write_and_close)
     video = VideoWriter(tmp_path / "a.mp4", fps=40)
+    monkeypatch.setattr(FfmpegProcess, "write", write_and_close)
     video.write(numbered(1))
     assert closes.wait(30)
     assert not video.closed
