@@ -166,7 +166,7 @@ def _monitors(count: int, episodes: int) -> Iterator[_Written]:
 def _write_monitor(folder: Path, written: _Written, pattern: Manifest) -> None:
     entries = [_entry(number) for number in written.numbers]
     writer = JournalWriter(
-        folder / journal_name(written.infix), env_info=pattern.env_info
+        folder / journal_name(written.infix), run={"env_info": pattern.env_info}
     )
     for entry in entries:
         writer.append(entry)

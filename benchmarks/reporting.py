@@ -125,7 +125,7 @@ def write_journal(directory: Path, episodes: int) -> None:
     directory.mkdir()
     info = {"gym_version": "mjrec-1", "env_id": "HalfCheetah-v5"}
     path = directory / "openaigym.episodes.0.1.jsonl"
-    writer = JournalWriter(path, env_info=info)
+    writer = JournalWriter(path, run={"env_info": info})
     for number in range(episodes):
         writer.append(
             JournalEntry(

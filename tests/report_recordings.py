@@ -48,7 +48,7 @@ def write_journal(
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"openaigym.episodes.{infix}.jsonl"
     info = {"gym_version": "mjrec-1", "env_id": env_id}
-    writer = JournalWriter(path, env_info=info)
+    writer = JournalWriter(path, run={"env_info": info})
     for each in entries:
         writer.append(each)
     writer.close()

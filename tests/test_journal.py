@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import random
 import re
@@ -14,6 +13,7 @@ import sys
 import threading
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import pytest
 from full_disk import file_size_limit
@@ -26,6 +26,7 @@ from mjrec.formats.journal import (
     JournalWriter,
     count_lines,
     read_journal,
+    run_facts,
 )
 
 ENTRY = JournalEntry(
@@ -117,18 +118,49 @@ def test_options_of_any_type_do_not_stop_a_run(path: Path) -> None:
 
 
 def test_the_first_line_says_what_is_recorded(path: Path) -> None:
-    """Once a journal, also where one is written on, and for readers of any line."""
-    for entry in (ENTRY, NEXT):
-        writer = JournalWriter(path, env_info=ENV_INFO)
-        writer.append(entry)
-        writer.append(dataclasses.replace(entry, episode_id=entry.episode_id + 10))
-        writer.close()
-    lines = path.read_text().splitlines()
-    assert [("env_info" in json.loads(line)) for line in lines] == [True, False] * 2
-    path.write_text("\n".join(lines[1:]))
-    reader = JournalReader(path)
-    assert [entry.episode_id for entry in reader] == [13, 4, 14]
-    assert reader.env_info == ENV_INFO
+    """Once a journal, also where one is written on; readers need no episode for it."""
+    writer = JournalWriter(path, run={"env_info": ENV_INFO})
+    writer.append(ENTRY)
+    writer.close()
+    assert run_facts(path) == {"env_info": ENV_INFO}
+    writer = JournalWriter(path, run={"env_info": {}})
+    writer.append(NEXT)
+    writer.close()
+    assert list(read_journal(path)) == [ENTRY, NEXT]
+    assert path.read_text().count('"run"') == 1
+
+
+def test_events_are_told_and_are_no_damage(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Between episodes, in their order; what is no event is left out and counted."""
+    writer = JournalWriter(path, run={})
+    writer.note("cut", {"episode_id": 2})
+    writer.append(ENTRY)
+    writer.note("fault", {"what": "video"})
+    writer.close()
+    with path.open("a") as file:
+        file.write('{"party": {}}\n')
+    told: list[Any] = []
+    reader = JournalReader(path, on_event=lambda *event: told.append(event))
+    assert list(reader) == [ENTRY]
+    assert told == [
+        ("run", {}),
+        ("cut", {"episode_id": 2}),
+        ("fault", {"what": "video"}),
+    ]
+    assert reader.dropped == 1
+
+
+def test_writing_on_after_a_torn_line(path: Path) -> None:
+    """The torn one costs nothing but itself."""
+    write(path, ENTRY, NEXT)
+    path.write_bytes(path.read_bytes()[:-20])
+    later = dataclasses.replace(NEXT, episode_id=NEXT.episode_id + 1)
+    writer = JournalWriter(path)
+    writer.append(later)
+    writer.close()
+    assert list(read_journal(path)) == [ENTRY, later]
 
 
 def test_a_last_line_cut_anywhere_is_left_out(
@@ -333,7 +365,7 @@ def test_an_endless_line_does_not_fill_the_memory(
     assert list(read_journal(path)) == [ENTRY]
     assert "1 line and all that follows left out: line 2" in caplog.text
     assert "too long" in caplog.text
-    assert count_lines(path) == 2
+    assert count_lines(path) == 1
 
 
 def test_a_journal_that_was_removed_is_noticed(path: Path) -> None:

@@ -28,7 +28,7 @@ ROWS = (
     {"simulation"},
     {"recorder"},
     {"rendering"},
-    {"recovery", "trackers"},
+    {"trackers"},
     {"environments"},
     {"monitors"},
     {"sessions", "machine_report"},

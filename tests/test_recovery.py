@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from recordings import (
+    events_of,
     frames_in,
     in_flight,
     journal_of,
@@ -189,7 +190,7 @@ def test_hashes_of_frames_that_never_reached_the_encoder_are_left_out(
 def test_what_was_recovered_stands_in_the_manifest(
     killed: Callable[[str], Path],
 ) -> None:
-    """With what can be known of the run; its schedule's name cannot."""
+    """With all that is known of the run."""
     directory = killed("env = monitor()\nrun(env)\nrun(env)\nrun(env, 7)\ndie(env)")
     recovery = mjrec.recover(directory)
     assert recovery.failures == ()
@@ -204,9 +205,10 @@ def test_what_was_recovered_stands_in_the_manifest(
     )
     details = manifest["mjrec"]
     assert details.pop("versions")["mjrec"] == mjrec.__version__
+    details.pop("surroundings")
     assert details == {
         "format_version": 1,
-        "schedule": {"name": None, "recorded": [0, 1, 2]},
+        "schedule": {"name": "monitor.<locals>.<lambda>", "recorded": [0, 1, 2]},
         "first_episode_id": 0,
         "next_episode_id": 3,
         "pending": [],
@@ -223,7 +225,7 @@ def test_deferred_episodes_become_trajectories_and_stay_pending(
     """The one in flight too, marked as killed; rendered, it shows what was recorded."""
     directory = killed(
         "env = cheetah(workers=0)\nrun(env)\nrun(env, 6)\n"
-        "env._recorder._states.finish()\ndie()"
+        "env._recorder._subject.states.finish()\ndie()"
     )
     before = results_of(directory)
     mjrec.recover(directory)
@@ -677,11 +679,11 @@ def test_a_damaged_manifest_is_made_again(killed: Callable[[str], Path]) -> None
 def test_provenance_of_a_manifest_is_kept(killed: Callable[[str], Path]) -> None:
     """Packages, machine and policy stay known though the monitor was killed later."""
     directory = killed(
-        "env = monitor(write_upon_reset=True)\nrun(env)\n"
-        "env._recorder._manifest._surroundings.found(wait=True)\n"
+        "from mjrec.surroundings import look_around\n"
+        "env = monitor()\nrun(env)\nlook_around().found(wait=True)\n"
         "run(env)\nrun(env)\ndie(env)"
     )
-    before = manifest_of(directory)["mjrec"]["surroundings"]
-    assert before["packages"]
     assert mjrec.recover(directory)
-    assert manifest_of(directory)["mjrec"]["surroundings"] == before
+    [around] = events_of(directory, "surroundings")
+    assert around["packages"]
+    assert manifest_of(directory)["mjrec"]["surroundings"] == around

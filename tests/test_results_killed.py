@@ -270,7 +270,7 @@ def test_without_a_manifest_something_else_says_what_was_recorded(
 ) -> None:
     """The journal, what the lock of the dead holds, states, a video's metadata."""
     env_info = ENV_INFO if witness == "journal" else None
-    write_journal(tmp_path, "0.7", 1, env_info=env_info)
+    write_journal(tmp_path, "0.7", 1, run={"env_info": env_info})
     if witness == "lock":
         lock = tmp_path / ".openaigym.0.7.lock"
         lock.write_text(json.dumps({"pid": 1, "env_info": ENV_INFO}))
@@ -314,7 +314,7 @@ def test_a_journal_stands_in_for_damaged_files(
 ) -> None:
     """With a warning that names the file; without a journal it is an error."""
     write_saved(tmp_path, "0.7", 1, 2)
-    journal = write_journal(tmp_path, "0.7", 1, 2, env_info=ENV_INFO)
+    journal = write_journal(tmp_path, "0.7", 1, 2, run={"env_info": ENV_INFO})
     damaged = only(tmp_path, pattern)
     if content is None:
         damaged.unlink()

@@ -152,7 +152,7 @@ def test_trajectories_that_are_final_already_are_settled_too(
 
 
 @pytest.mark.parametrize(
-    "step", ["add_facts", "finish_log", "write_manifest", "update_manifest"]
+    "step", ["add_facts", "finish_log", "_journal_choice", "write_listing"]
 )
 @pytest.mark.parametrize("times", [0, 1])
 def test_it_goes_on_where_it_was_killed(

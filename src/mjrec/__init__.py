@@ -67,12 +67,12 @@ if TYPE_CHECKING:
     from .monitors.vector_monitor import VectorMonitor as VectorMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
-    from .recovery import Recovery as Recovery
-    from .recovery import recover as recover
     from .rendering.directory_videos import RenderedVideos as RenderedVideos
     from .rendering.directory_videos import render_videos as render_videos
     from .rendering.pictures import render as render
     from .rendering.pictures import render_states as render_states
+    from .rendering.recovery import recover as recover
+    from .rendering.recovery_report import Recovery as Recovery
     from .reporting.film_strips import film_strip as film_strip
     from .reporting.report_folder import write_report as write_report
     from .results import Episode as Episode
@@ -99,7 +99,7 @@ _LAZY = {
     "LocalEngine": "engines.local",
     "Monitor": "monitors",
     "RayEngine": "engines.ray",
-    "Recovery": "recovery",
+    "Recovery": "rendering.recovery_report",
     "RenderedVideos": "rendering.directory_videos",
     "SlurmEngine": "engines.slurm",
     "StatsRecorder": "recorder.stats_recorder",
@@ -123,7 +123,7 @@ _LAZY = {
     "load_trajectory": "simulation.trajectories",
     "merge_stats_files": "results",
     "pack": "evidence.packing",
-    "recover": "recovery",
+    "recover": "rendering.recovery",
     "render": "rendering.pictures",
     "render_states": "rendering.pictures",
     "render_videos": "rendering.directory_videos",

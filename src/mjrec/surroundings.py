@@ -89,7 +89,7 @@ class Surroundings:
         """
         if wait:
             self._thread.join(_PATIENCE)
-        return self._found
+        return self._found if wait or not self._thread.is_alive() else None
 
     def _look(self) -> None:
         try:

@@ -342,7 +342,7 @@ class _Runner:
             of.not_drawn[drawn.name] = reason
         if outcome.failure is not None:
             # Its worker has died, and could not.
-            note_failure(folder, key, {drawn.name: outcome.failure})
+            note_failure(folder, drawn.name, outcome.failure)
 
     def _progress(self) -> EvaluationProgress:
         plan = self._plan

@@ -15,33 +15,31 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import DirectoryNotWritable, Error
+from ..errors import Error, FileNotWritten
 from ..formats.in_flight import add_facts, is_in_flight
-from ..formats.locks import is_locked, wait_for_lock
-from ..formats.manifest import Manifest, read_manifest, write_manifest
+from ..formats.journal import JournalWriter
+from ..formats.locks import is_locked
+from ..formats.manifest import Manifest, read_manifest
 from ..formats.monitor_directory import (
     Infix,
-    episode_of,
+    journal_name,
     lock_name,
-    manifest_lock_name,
     manifest_name,
-    trajectory_prefix,
     video_prefix,
 )
-from ..formats.pending_videos import pending_video
 from ..formats.spans import FINISHED
 from ..formats.trajectory_file import amend_trajectory, find_trajectory
 from ..formats.video_metadata import is_done
 from ..rendering.log_finishing import finish_log
 from ..rendering.pending import EpisodeKey, claim, recorded_episodes
 from ..rendering.recorded_facts import open_for_rendering
-from ..rendering.rendered_manifests import update_manifest
+from ..results.listing import listing_lock, write_listing
+from ..results.run import Run
 
 # Under `scope`, in a manifest: the choice was made over all monitors of one.
 EVALUATION = "evaluation"
@@ -123,9 +121,8 @@ def settle_monitor(
         with _claimed(folder, key):
             if _settle_episode(folder, key, verdicts):
                 promised.append(key.episode_id)
-    _settle_manifest(verdicts, promised)
-    # Videos that were there before are no longer pending.
-    update_manifest(folder, infix)
+    _journal_choice(folder, infix, rule, promised)
+    write_listing(folder, infix)
 
 
 def finish_logs(folder: Path, monitor: str) -> None:
@@ -164,14 +161,6 @@ class _Verdicts:
             "scope": EVALUATION,
         }
         return {"candidate": False, "video": {**promise, "selection": selection}}
-
-    def pending(self, episode_id: int) -> dict[str, Any]:
-        """Return how a manifest names the video of an episode."""
-        return pending_video(
-            episode_id,
-            trajectory=trajectory_prefix(self.infix, episode_id),
-            video=f"{video_prefix(self.infix, episode_id)}.mp4",
-        )
 
     def has_video(self, episode_id: int) -> bool:
         """Tell whether there is a video of an episode already."""
@@ -223,35 +212,26 @@ def _settle_episode(folder: Path, key: EpisodeKey, verdicts: _Verdicts) -> bool:
     return bool(facts.get("video"))
 
 
-def _settle_manifest(verdicts: _Verdicts, promised: Sequence[int]) -> None:
-    folder, infix = verdicts.folder, verdicts.infix
-    try:
-        lock = wait_for_lock(folder / manifest_lock_name(infix), f"{os.getpid()}\n")
-    except OSError as error:
-        raise DirectoryNotWritable(folder, error.strerror) from error
-    try:
-        path = folder / manifest_name(infix)
-        write_manifest(path, _settled(read_manifest(path), verdicts, promised))
-    finally:
-        lock.release()
-
-
-def _settled(
-    manifest: Manifest, verdicts: _Verdicts, promised: Sequence[int]
-) -> Manifest:
-    details = dict(manifest.mjrec or {})
-    keep = {**details.get("keep", {}), "rule": verdicts.rule, "decided": True}
+def _journal_choice(
+    folder: Path, infix: Infix, rule: str, promised: Sequence[int]
+) -> None:
+    path = folder / journal_name(infix)
+    # How many episodes were finished, and the like, the monitor has said.
+    begun = Run.read(path).keep or {}
+    keep = {
+        **begun,
+        "rule": rule,
+        "decided": True,
+        "scope": EVALUATION,
+        "chosen": list(promised),
+        "recorded": list(promised),
+    }
     keep.pop("left_open", None)
-    broken = details.get("broken") or ()
-    names = [*(video for video, _ in manifest.videos), *broken]
-    listed = set(map(episode_of, names))
-    details.update(
-        schedule={"name": f"keep:{verdicts.rule}", "recorded": list(promised)},
-        keep={**keep, "scope": EVALUATION, "chosen": list(promised)},
-        # Also those that are there, but not listed: `update_manifest` lists them.
-        pending=[verdicts.pending(n) for n in promised if n not in listed],
-    )
-    return dataclasses.replace(manifest, mjrec=details)
+    with listing_lock(folder, infix), contextlib.closing(JournalWriter(path)) as writer:
+        try:
+            writer.note("keep", keep)
+        except OSError as error:
+            raise FileNotWritten(path, error.strerror or error) from error
 
 
 def _is_unsettled(folder: Path, infix: Infix) -> bool:

@@ -129,7 +129,7 @@ class EvaluationWorker:
     # What is imported below loads HDF5, which stepping has no use for.
 
     def _recover(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        from ..recovery import recover
+        from ..rendering.recovery import recover
         from .settling import unsettled_monitors
 
         folder = self._folder(arguments)

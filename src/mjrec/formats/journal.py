@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The journal: one line of JSON for each completed episode, as it completes.
+"""The journal: what happened in a run, one line of JSON for each event.
 
 `openaigym.episodes.<infix>.jsonl` grows while the monitor runs, so that a killed
-process loses none of the episodes that it completed. A line::
+process loses nothing that was over. Statistics and manifest follow from it. A completed
+episode is a line::
 
     {"episode_id": 27, "length": 200, "reward": 12.5, "type": "t",
      "start_time": 1790000000.0, "end_time": 1790000004.0,
      "seed": 7, "options": null, "terminated": false, "truncated": true,
-     "success": null}
+     "success": null, "chosen": true, "recording": "deferred"}
 
-The first line says besides what is recorded, as a manifest does::
-
-     "env_info": {"gym_version": "mjrec-1", "env_id": "Hopper-v5"}
+`chosen` is there where the schedule chose the episode, `recording` (`"live"` or
+`"deferred"`) where it has a video of its own. Every other line is an event, an object
+of one key: its kind, one of `EVENTS`. The first line is the `run`'s.
 
 Times are seconds since the epoch. Keys that this version does not know are ignored.
 
 A killed machine can leave half a line at the end, and a failing disk anything
-anywhere. A reader leaves out what is no episode, keeps the rest, and says so.
+anywhere. A reader leaves out what is no event, keeps the rest, and says so.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import io
 import logging
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -55,11 +56,21 @@ _MOST_DAMAGED_LINES = 1000
 _MOST_DAMAGED_BYTES = 1 << 26
 MOST_EPISODES = 10**15
 
+# In their order: what the run is; its machine, packages and code; an episode that is
+# no part of the statistics; a clip that is over; an episode whose video falls out while
+# its trajectory stays; what could not be recorded; which videos were kept; the end; and
+# that another process has put the directory in order.
+EVENTS = (
+    *("run", "surroundings", "cut", "clip", "dropped"),
+    *("fault", "keep", "closed", "recovered"),
+)
+
 UNKNOWN = "unknown"
 
 # The seed and the options are for people to read; more of them is cut off.
 _LONGEST_REPR = 1000
 
+_BEGINNING = b'{"episode_id": '
 _BEGIN = re.compile(rb'\{"episode_id": (\d{1,15}),')
 
 
@@ -80,6 +91,8 @@ class JournalEntry:
         truncated: a limit from outside the task ended it.
         success: what the environment said of it; None where it said nothing, `UNKNOWN`
             in journals of before it was written down.
+        chosen: the schedule chose it.
+        recording: `"live"` or `"deferred"`; None where it has no video of its own.
     """
 
     episode_id: int
@@ -93,33 +106,31 @@ class JournalEntry:
     terminated: bool
     truncated: bool
     success: bool | str | None = UNKNOWN
+    chosen: bool = False
+    recording: str | None = None
 
 
 class JournalWriter:
-    """Appends entries to a journal.
+    """Appends episodes and other events to a journal.
 
-    The file is made by the first `append`: a monitor that completes no episode
-    leaves no journal. Each entry is one `write` of one whole line, so that a reader
-    at any moment, and a process killed at any moment, has whole lines.
+    The file is made by the first of them. Each is one `write` of whole lines, so that
+    a reader at any moment, and a process killed at any moment, has whole lines.
 
     Args:
         path: the file.
-        env_info: what is recorded, `gym_version` and `env_id`, for readers of a
-            journal whose monitor left no manifest.
+        run: what the first line of a new file says.
     """
 
-    def __init__(
-        self, path: Path, *, env_info: Mapping[str, Any] | None = None
-    ) -> None:
+    def __init__(self, path: Path, *, run: Mapping[str, Any] | None = None) -> None:
         self._path = path
-        self._env_info = env_info
+        self._run = run
         self._file: io.FileIO | None = None
         # Of the whole lines; beyond it is what a failed write has left.
         self._size = 0
         self._closed = False
 
     def append(self, entry: JournalEntry) -> None:
-        """Write `entry` down.
+        """Write down a completed episode.
 
         A seed or options that would make a line of more than 16 MiB are written as
         `{"repr": ...}` and cut off.
@@ -127,21 +138,28 @@ class JournalWriter:
         Raises:
             ClosedError: after `close`.
             OSError: it cannot be written (a full disk); the journal is then as it
-                was before. Or somebody has removed it.
+                was before. Or it was removed.
         """
-        if self._closed:
-            raise ClosedError(f"The journal {self._path} is closed.")
-        if self._file is None:
-            self._file = io.FileIO(self._path, "a")
-            self._size = os.fstat(self._file.fileno()).st_size
         # Not `asdict`, which would copy the options deeply; they may not allow it.
         values = {**vars(entry)}
         if entry.success == UNKNOWN:
             del values["success"]
-        if self._env_info is not None:
-            values["env_info"] = dict(self._env_info)
-        self._write(self._file, _line(values))
-        self._env_info = None
+        for key in ("chosen", "recording"):
+            if not values[key]:
+                del values[key]
+        self._append(_line(values))
+
+    def note(self, kind: str, facts: Any) -> None:
+        """Write down another event.
+
+        Args:
+            kind: one of `EVENTS`.
+            facts: what JSON can hold.
+
+        Raises:
+            ClosedError, OSError: as `append`.
+        """
+        self._append(f"{dumps({kind: facts})}\n".encode())
 
     def close(self) -> None:
         """Close the file; further calls do nothing."""
@@ -149,6 +167,19 @@ class JournalWriter:
         file, self._file = self._file, None
         if file is not None:
             file.close()
+
+    def _append(self, line: bytes) -> None:
+        if self._closed:
+            raise ClosedError(f"The journal {self._path} is closed.")
+        if self._file is None:
+            self._file = io.FileIO(self._path, "a+")
+            self._size = self._file.seek(0, os.SEEK_END)
+            if self._size and os.pread(self._file.fileno(), 1, self._size - 1) != b"\n":
+                # Its writer was killed in the middle of a line.
+                line = b"\n" + line
+        if self._size == 0 and self._run is not None:
+            line = f"{dumps({'run': self._run})}\n".encode() + line
+        self._write(self._file, line)
 
     def _write(self, file: io.FileIO, line: bytes) -> None:
         status = os.fstat(file.fileno())
@@ -188,17 +219,20 @@ class JournalReader:
 
     Args:
         path: the file.
+        on_event: called with the kind and the facts of every other event.
 
     Attributes:
         count: how many entries there were so far.
         last_episode_id: the highest number so far, also of damaged lines that still
             show theirs; -1 before.
-        env_info: what is recorded, as far as the lines so far say it.
         dropped: how many lines were left out so far.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(
+        self, path: Path, *, on_event: Callable[[str, Any], object] = lambda *_: None
+    ) -> None:
         self._path = path
+        self._on_event = on_event
         self._numbers = _Numbers()
         self._damaged_lines = 0
         self._damaged_bytes = 0
@@ -206,7 +240,6 @@ class JournalReader:
         self._gave_up = False
         self.count = 0
         self.last_episode_id = -1
-        self.env_info: Mapping[str, Any] | None = None
         self.dropped = 0
 
     def __iter__(self) -> Iterator[JournalEntry]:
@@ -244,6 +277,10 @@ class JournalReader:
                 self._gave_up = True
                 raise ValueError("it is too long to be an episode's")
             values = json_object(line)
+            kind = next(iter(values)) if len(values) == 1 else None
+            if kind in EVENTS:
+                self._on_event(kind, values[kind])
+                return None
             entry = entry_of(values)
         except ValueError as error:
             torn = not line.endswith(b"\n") and not self._gave_up
@@ -256,8 +293,6 @@ class JournalReader:
             return None
         self.count += 1
         self.last_episode_id = max(self.last_episode_id, entry.episode_id)
-        if self.env_info is None:
-            self.env_info = _env_info(values)
         return entry
 
     def _note(self, index: int, line: bytes, reason: str) -> None:
@@ -310,8 +345,22 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
         reader.report()
 
 
+def run_facts(path: Path) -> Mapping[str, Any] | None:
+    """Return what the first line of a journal says of its run; None where nothing.
+
+    Raises:
+        UnreadableFile: there is no such file, or it cannot be read.
+    """
+    with _opened(path) as file:
+        line = next(_lines(path, file), b"")
+    try:
+        return field(json_object(line), "run", optional(mapping), default=None)
+    except ValueError:
+        return None
+
+
 def count_lines(path: Path) -> int:
-    """Return how many lines a journal has: at least as many as it has episodes.
+    """Return how many lines of a journal begin as an episode's: at least all of those.
 
     It takes a fraction of the time of reading them.
 
@@ -321,7 +370,7 @@ def count_lines(path: Path) -> int:
     with _opened(path) as file:
         count = 0
         for line in _lines(path, file):
-            count += 1
+            count += line.startswith(_BEGINNING)
             if len(line) >= _LONGEST_LINE:
                 break
         return count
@@ -360,6 +409,8 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
         terminated=field(values, "terminated", boolean),
         truncated=field(values, "truncated", boolean),
         success=_success(values),
+        chosen=field(values, "chosen", boolean, default=False),
+        recording=field(values, "recording", optional(text), default=None),
     )
 
 
@@ -375,11 +426,3 @@ def _count(value: Any) -> int:
         # Not its digits, of which there may be thousands.
         raise ValueError("it is negative, or larger than any count can be")
     return count
-
-
-def _env_info(values: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    try:
-        return field(values, "env_info", optional(mapping), default=None)
-    except ValueError:
-        # Its episode is as good as any.
-        return None

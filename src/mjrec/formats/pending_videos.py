@@ -1,50 +1,59 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a manifest names a video that is still to be rendered."""
+"""Why a video is still pending: `<video>.failed.json`, beside where it will be.
+
+::
+
+    {"reason": "no OpenGL backend works here: ..."}
+
+It is written when rendering has failed, and removed once the video is there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import contextlib
+from pathlib import Path
+
+from .. import json_text
+from ..atomic_files import write_text
+from ..errors import Error
+from .json_fields import read_object
+
+FAILED = ".failed.json"
 
 # What ffmpeg or a driver says can be long; what matters is where it begins and ends.
 _LONGEST_REASON = 1000
 _CUT = " [...] "
 
 
-def pending_video(episode_id: int, *, trajectory: str, video: str) -> dict[str, Any]:
-    """Return the entry of a video.
+def failure_path(video: Path) -> Path:
+    """Return the name of the file that says why a video could not be rendered.
 
     Args:
-        episode_id: the episode's number.
-        trajectory: the base name of its trajectory without extension.
-        video: the base name that the video will have.
+        video: or a part of a clip, whose video may not be known.
     """
-    return {"episode_id": episode_id, "trajectory": trajectory, "video": video}
+    return video.with_suffix(FAILED)
 
 
-def pending_clip(episode_id: int, *, first_part: str, video: str) -> dict[str, Any]:
-    """Return the entry of a video that is counted in steps.
-
-    Args:
-        episode_id: the number of the episode in which it began.
-        first_part: what its first part is called.
-        video: the base name that the video will have.
-    """
-    return {"episode_id": episode_id, "clip": first_part, "video": video}
+def note_failure(video: Path, reason: str) -> None:
+    """Write down why a video could not be rendered, as far as that can be written."""
+    with contextlib.suppress(Error, OSError):
+        text = json_text.dumps({"reason": _shortened(reason)})
+        write_text(failure_path(video), text)
 
 
-def with_reason(
-    entry: Mapping[str, Any], reasons: Mapping[str, str]
-) -> Mapping[str, Any]:
-    """Return an entry that says why rendering it has failed, if that is known.
+def forget_failure(video: Path) -> None:
+    """Remove what was said of a video that is there now."""
+    with contextlib.suppress(OSError):
+        failure_path(video).unlink(missing_ok=True)
 
-    Args:
-        entry: as `pending_video` or `pending_clip` returns it.
-        reasons: by the base names of videos, or of trajectories.
-    """
-    recording = str(entry.get("clip") or f"{entry.get('trajectory')}.h5")
-    reason = reasons.get(str(entry.get("video")), reasons.get(recording))
-    return entry if reason is None else {**entry, "reason": _shortened(reason)}
+
+def reason_of(video: Path) -> str | None:
+    """Return why a video could not be rendered; None where nobody has failed."""
+    try:
+        reason = read_object(failure_path(video)).get("reason")
+    except (OSError, ValueError):
+        return None
+    return reason if isinstance(reason, str) else None
 
 
 def _shortened(reason: str) -> str:

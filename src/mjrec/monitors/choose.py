@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
 from ..recorder.tracking import FinishedEpisode, Tracker
-from ..recovery import recover
+from ..rendering.recovery import recover
 
 if TYPE_CHECKING:
     from .dm_env_monitor import DmEnvMonitor

@@ -13,9 +13,9 @@ from typing import Any, ClassVar, TypeVar
 from ..environments.scenes import Scenes
 from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
-from ..recorder.ended_trajectories import Rendering
 from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
+from ..recorder.finisher import Finisher
 from ..recorder.options import DEFERRED, RecorderOptions
 from ..recorder.recorder import Recorder
 from ..recorder.stats_recorder import StatsRecorder
@@ -167,7 +167,7 @@ class MonitorControls(MonitorLifetime):
         close_environment: Callable[[Any], None],
         clip_scenes: Scenes | None,
         env_index: int | None = None,
-        rendering: Callable[[Path], Rendering] | None = None,
+        rendering: Callable[[Path], Finisher] | None = None,
     ) -> None:
         """Open the directory; from here on the environment is this monitor's.
 
@@ -203,7 +203,7 @@ class MonitorControls(MonitorLifetime):
         subject: Subject,
         *,
         options: RecorderOptions,
-        rendering: Callable[[Path], Rendering] | None,
+        rendering: Callable[[Path], Finisher] | None,
         close_environment: Callable[[], None],
     ) -> None:
         self._options = options
@@ -211,8 +211,7 @@ class MonitorControls(MonitorLifetime):
             directory,
             subject=subject,
             options=options,
-            rendering=rendering if subject.rendering.mode == DEFERRED else None,
-            finish_log=_finish_log,
+            finisher=rendering if subject.rendering.mode == DEFERRED else None,
         )
         self._guard = ExitGuard(
             self,
@@ -236,7 +235,7 @@ class MonitorControls(MonitorLifetime):
             self._guard.run_first_at_exit()
 
 
-def _rendering(options: RecorderOptions) -> Callable[[Path], Rendering] | None:
+def _rendering(options: RecorderOptions) -> Callable[[Path], Finisher] | None:
     if options.workers == 0:
         return None
     return functools.partial(
@@ -248,13 +247,6 @@ def _note_last_error(recorder: Recorder) -> None:
     error = last_error()
     if error is not None:
         recorder.note_error(error)
-
-
-def _finish_log(log: Path) -> None:
-    # Not at the top: it loads h5py, which the simulation has no use for.
-    from ..rendering.log_finishing import finish_log
-
-    finish_log(log)
 
 
 def _close(

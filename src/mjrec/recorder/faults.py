@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -29,11 +30,13 @@ class Faults:
 
     Args:
         on_error: "raise" or "warn".
+        write: writes a new one into the journal.
     """
 
-    def __init__(self, on_error: str) -> None:
+    def __init__(self, on_error: str, write: Callable[[Any], object]) -> None:
         self._warns = on_error == WARN
-        self._faults: list[_Fault] = []
+        self._write = write
+        self._faults: set[_Fault] = set()
 
     def tolerates(
         self, what: What, error: BaseException, *, episode_id: int | None
@@ -53,16 +56,10 @@ class Faults:
         return True
 
     def note(self, what: What, reason: str, *, episode_id: int | None) -> bool:
-        """Note a fault for the manifest; return whether it is a new one."""
+        """Write a fault down; return whether it is a new one."""
         fault = _Fault(episode_id, what, reason)
-        is_new = fault not in self._faults
-        if is_new:
-            self._faults.append(fault)
-        return is_new
-
-    def listed(self) -> list[dict[str, Any]]:
-        """Return them as the manifest lists them."""
-        return [
-            {"episode_id": f.episode_id, "what": f.what, "reason": f.reason}
-            for f in self._faults
-        ]
+        if fault in self._faults:
+            return False
+        self._faults.add(fault)
+        self._write(vars(fault))
+        return True

@@ -22,8 +22,7 @@ from ..formats.in_flight import add_facts, drop_recording
 from ..formats.json_fields import read_object, unreadable
 from ..formats.second_names import give_second_names
 from .deferred_video import DeferredVideo
-from .ended_trajectories import EndedTrajectories
-from .episode_videos import EpisodeVideos
+from .monitored_run import MonitoredRun
 from .selection import Selection, Standing
 from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
@@ -58,17 +57,13 @@ class KeptVideos:
     Each step may be interrupted (Ctrl-C) and is taken up again by the next `settle`.
 
     Args:
+        run: of which they are.
         selection: chooses.
-        videos: learns of the videos that are chosen.
-        ended: takes over trajectories about which nothing is left to decide.
     """
 
-    def __init__(
-        self, selection: Selection, *, videos: EpisodeVideos, ended: EndedTrajectories
-    ) -> None:
+    def __init__(self, run: MonitoredRun, selection: Selection) -> None:
+        self._run = run
         self._selection = selection
-        self._videos = videos
-        self._ended = ended
         # Number of the last episode that was judged, and how it stands.
         self._judged = (-1, Standing.DROPPED)
         self._held: dict[int, _Held] = {}
@@ -79,22 +74,14 @@ class KeptVideos:
         self._left: list[int] = []
 
     @property
-    def recorded(self) -> list[int]:
-        """The numbers of the episodes that get a video, as far as that is known."""
-        return self._left or self._selection.chosen
-
-    @property
     def is_left_open(self) -> bool:
         """Whether somebody else decides, when the monitor is gone."""
         return self._selection.is_left_open
 
-    def facts(self) -> dict[str, Any]:
-        """Return what is said of a video by which it may be known as hand-picked."""
-        return {"rule": self._selection.name, "decided": False}
-
     def chosen_facts(self) -> dict[str, Any]:
-        """Return the same of a video that is chosen."""
-        return {**self.facts(), "decided": True, "finished": self._selection.finished}
+        """Return what is said of a video that is chosen, by which it is known."""
+        finished = self._selection.finished
+        return {**self._run.selection, "decided": True, "finished": finished}
 
     def judge(self, episode_id: int, episode: FinishedEpisode | None) -> Standing:
         """Tell how an episode stands that has just ended.
@@ -203,7 +190,7 @@ class KeptVideos:
         self._hand_on(order)
 
     def details(self) -> dict[str, Any]:
-        """Return what the manifest says of the choice."""
+        """Return what the journal says of the choice, once it is made."""
         failure = {} if self._failure is None else {"failure": self._failure}
         return {
             "rule": self._selection.name,
@@ -211,6 +198,7 @@ class KeptVideos:
             "chosen": self._selection.chosen,
             "finished": self._selection.finished,
             "most_bytes_held": self._most_bytes_held,
+            "recorded": self._left or self._selection.chosen,
             **({"left_open": True} if self.is_left_open else {}),
             **failure,
         }
@@ -239,9 +227,9 @@ class KeptVideos:
                 continue
             try:
                 if standing is Standing.CHOSEN:
-                    self._choose(episode_id, held)
+                    self._choose(held)
                 else:
-                    self._drop(held)
+                    self._drop(episode_id, held)
             except Error as error:
                 failed.append(error)
             self._bytes_held -= held.size
@@ -249,27 +237,27 @@ class KeptVideos:
         if failed:
             raise failed[0]
 
-    def _choose(self, episode_id: int, held: _Held) -> None:
+    def _choose(self, held: _Held) -> None:
         try:
             for recorder in held.live:
                 _say_in_metadata(recorder, self.chosen_facts())
             if held.trajectory is not None:
                 verdict = self.verdict(Standing.CHOSEN, held.promise)
                 add_facts(held.trajectory, verdict)
-                self._ended.add(held.trajectory)
+                self._run.finisher.submit(held.trajectory)
         finally:
-            self._list(episode_id, held)
+            self._expect(held)
 
-    def _list(self, episode_id: int, held: _Held) -> None:
+    def _expect(self, held: _Held) -> None:
         for recorder in held.live:
-            self._videos.add_live(recorder)
-        for recorder in held.live:
+            if recorder.path is not None and "first_video" not in recorder.metadata:
+                self._run.videos.expect(Path(recorder.path))
             if recorder.finished and "also_named" in recorder.metadata:
                 give_second_names(Path(str(recorder.path)))
         if held.deferred is not None and held.trajectory is not None:
-            self._videos.add_deferred(episode_id, held.trajectory, held.deferred)
+            self._run.videos.expect(Path(held.deferred.path))
 
-    def _drop(self, held: _Held) -> None:
+    def _drop(self, episode_id: int, held: _Held) -> None:
         # The last one that was finished is the sign that all are there.
         for recorder in reversed(held.live):
             _remove(_files_of(recorder))
@@ -278,14 +266,15 @@ class KeptVideos:
         if held.stays:
             verdict = self.verdict(Standing.DROPPED, held.promise)
             add_facts(held.trajectory, verdict)
-            self._ended.add(held.trajectory)
+            self._run.finisher.submit(held.trajectory)
+            self._run.journal.note("dropped", episode_id)
         else:
             drop_recording(held.trajectory)
 
     def _leave_all(self) -> None:
         for episode_id in list(self._held):
             self._left.append(episode_id)
-            self._list(episode_id, self._held.pop(episode_id))
+            self._expect(self._held.pop(episode_id))
 
 
 def _files_of(recorder: VideoRecorder) -> Iterator[Path]:

@@ -197,17 +197,17 @@ class StatsRecorder:
 
     def flush(self) -> None:
         """Write the statistics file; nothing once closed."""
-        if self.closed:
-            return
-        write_stats_file(
-            Path(self.path),
-            StatsFile(
-                initial_reset_timestamp=self.initial_reset_timestamp,
-                timestamps=tuple(self.timestamps),
-                episode_lengths=tuple(self.episode_lengths),
-                episode_rewards=tuple(self.episode_rewards),
-                episode_types=tuple(self.episode_types),
-            ),
+        if not self.closed:
+            write_stats_file(Path(self.path), self.stats())
+
+    def stats(self) -> StatsFile:
+        """Return what the file holds, as of now."""
+        return StatsFile(
+            initial_reset_timestamp=self.initial_reset_timestamp,
+            timestamps=tuple(self.timestamps),
+            episode_lengths=tuple(self.episode_lengths),
+            episode_rewards=tuple(self.episode_rewards),
+            episode_types=tuple(self.episode_types),
         )
 
     @property

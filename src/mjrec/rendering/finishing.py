@@ -11,17 +11,26 @@ import contextlib
 import functools
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from ..errors import BlankVideo, DirectoryNotWritable, Error, GLError
+from ..errors import (
+    BlankVideo,
+    DirectoryNotWritable,
+    Error,
+    FileNotWritten,
+    GLError,
+)
 from ..formats.in_flight import drop_recording, list_paths, remove_if_done
+from ..formats.pending_videos import forget_failure
+from ..formats.pending_videos import note_failure as note_failure_of
 from ..formats.second_names import give_all_second_names
 from ..formats.trajectory_file import finish_trajectory
 from ..formats.unfinished_video import VideoFile
+from ..results.listing import write_listings
 from .clip_videos import render_clip
 from .outcomes import Outcome
 from .pending import (
@@ -34,8 +43,7 @@ from .pending import (
 )
 from .pool import WorkerPool
 from .progress import Progress
-from .recorded_clips import PendingClip
-from .rendered_manifests import reconcile, update_manifest
+from .recorded_clips import ClipKey, PendingClip
 from .shared_pool import SharedPool
 from .videos import render_video
 
@@ -83,10 +91,17 @@ def finish_pending(
     ) as finisher:
         for key in keys:
             finisher.add(key)
+        has_failed = False
         while finisher:
             _, outcome = finisher.finish_next()
+            has_failed = has_failed or outcome.failure is not None
             yield outcome
-    bring_up_to_date(directory)
+    try:
+        bring_up_to_date(directory)
+    except FileNotWritten:
+        # On a full disk, what failed has said so; the manifest comes with the next try.
+        if not has_failed:
+            raise
 
 
 def bring_up_to_date(directory: Path) -> None:
@@ -103,22 +118,19 @@ def bring_up_to_date(directory: Path) -> None:
         # Those of whoever died between finishing the last recording and removing them.
         with contextlib.suppress(DirectoryNotWritable):
             remove_if_done(spans)
-    reconcile(directory)
+    write_listings(directory)
 
 
-def note_failure(
-    directory: Path, key: RecordingKey, reasons: Mapping[str, str]
-) -> None:
-    """Let the manifest say why videos of a recording are still pending.
+def note_failure(directory: Path, name: str, reason: str) -> None:
+    """Let the manifest say why a video is still pending.
 
     Args:
         directory: the monitor directory.
-        key: which recording.
-        reasons: by the videos' names.
+        name: of the video, or of a clip's first part; nothing is said of other files.
+        reason: why.
     """
-    # Whatever stands in the way of that is told by `reconcile`.
-    with contextlib.suppress(Error, OSError):
-        update_manifest(directory, key.infix, reasons=reasons)
+    if name.endswith(".mp4") or ClipKey.of(name) is not None:
+        note_failure_of(directory / name, reason)
 
 
 class EpisodeFinisher:
@@ -246,7 +258,7 @@ class EpisodeFinisher:
         except Exception as error:
             logger.exception("%s cannot be finished.", key.recording_name)
             reason = f"{type(error).__name__}: {error}"
-        note_failure(self._directory, key, {nothing.name: reason})
+        note_failure(self._directory, nothing.name, reason)
         return replace(nothing, failure=reason)
 
     def _finish_clip(self, clip: PendingClip) -> Outcome:
@@ -260,7 +272,6 @@ class EpisodeFinisher:
         # The first one last: it says which video they are of.
         for part in reversed(clip.parts):
             drop_recording(part)
-        update_manifest(self._directory, clip.key.infix)
         return outcome
 
     def _finish_episode(self, episode: PendingEpisode) -> Outcome:
@@ -277,7 +288,6 @@ class EpisodeFinisher:
         if not episode.is_kept:
             path.unlink(missing_ok=True)
             drop_recording(path)
-        update_manifest(self._directory, episode.key.infix)
         return outcome
 
     def _finish_videos(
@@ -288,6 +298,7 @@ class EpisodeFinisher:
         for video in (pending.video, *pending.further_videos):
             remove_unfinished(video)
         outcome = self._rendered(outcome, render)
+        forget_failure(pending.video)
         if not outcome.is_video:
             return outcome
         names = tuple(video.name for video in pending.further_videos)

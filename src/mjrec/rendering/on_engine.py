@@ -91,10 +91,10 @@ def finish_on_engine(
         job: Outcome(name=key.told_name, directory=directory)
         for job, key in by_key.items()
     }
-    for job, outcome in _done(engine, [directory], jobs, nothing, on_progress):
+    for _, outcome in _done(engine, [directory], jobs, nothing, on_progress):
         if outcome.failure is not None and not outcome.is_video:
             # Where the worker has died, it could not.
-            note_failure(directory, by_key[job], {outcome.name: outcome.failure})
+            note_failure(directory, outcome.name, outcome.failure)
         yield replace(outcome, directory=directory)
     bring_up_to_date(directory)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..errors import UnreadableFile
 from ..formats.in_flight import find_recording
-from ..formats.journal import JournalReader
+from ..formats.journal import run_facts
 from ..formats.json_fields import json_object, read_object
 from ..formats.manifest import Manifest
 from .monitor_files import MonitorFiles
@@ -64,19 +64,26 @@ def _witnesses(
 
 
 def _in_journal(path: Path) -> object:
-    reader = JournalReader(path)
-    # Only the first line has it.
-    next(iter(reader), None)
-    return reader.env_info
+    return (run_facts(path) or {}).get("env_info")
 
 
 def _in_lock(path: Path) -> object:
+    return locked_run(path).get("env_info")
+
+
+def locked_run(path: Path) -> Mapping[str, Any]:
+    """Return what the lock of a monitor says of its run.
+
+    Raises:
+        OSError, ValueError: it cannot be read.
+    """
     # Empty for a moment after it was made. A link is nobody's lock.
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
-        return json_object(os.read(descriptor, _LONGEST_LOCK)).get("env_info")
+        run = json_object(os.read(descriptor, _LONGEST_LOCK)).get("run")
     finally:
         os.close(descriptor)
+    return run if isinstance(run, Mapping) else {}
 
 
 def _in_log(path: Path) -> object:

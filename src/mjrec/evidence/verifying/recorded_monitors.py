@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import UnreadableFile
-from ...formats.journal import JournalEntry, JournalReader
+from ...formats.journal import JournalEntry, JournalReader, run_facts
 from ...formats.json_fields import read_object
 from ...formats.manifest import Manifest, read_manifest
 from ...formats.monitor_directory import episode_of
@@ -136,7 +136,9 @@ def _entries(journal: Path) -> tuple[tuple[JournalEntry, ...], int, Any]:
         entries.append(entry)
         if len(entries) > _MOST_EPISODES:
             raise UnreadableFile(journal, f"it has more than {_MOST_EPISODES} episodes")
-    return tuple(entries), reader.dropped, (reader.env_info or {}).get("env_id")
+    env_info = (run_facts(journal) or {}).get("env_info")
+    env_id = env_info.get("env_id") if isinstance(env_info, Mapping) else None
+    return tuple(entries), reader.dropped, env_id
 
 
 def _videos(directory: Path, infix: str) -> Iterator[RecordedVideo]:

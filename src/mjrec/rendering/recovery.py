@@ -11,8 +11,8 @@ from pathlib import Path
 from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.second_names import give_all_second_names
+from .recovery_report import Recovery
 from .remains import Remains, has_work, is_open, model_leftovers, remains_of
-from .report import Recovery
 
 # One recovery of a directory at a time.
 _LOCK = ".openaigym.recover.lock"
@@ -56,7 +56,7 @@ def recover(
         return Recovery(path, open_monitors=open_monitors)
     # Not at the top: it loads HDF5, which a simulation that goes on where a closed
     # monitor left off has no use for.
-    from .mending import Mending
+    from .dead_monitor import DeadMonitors
 
     if not os.access(path, os.W_OK | os.X_OK):
         raise DirectoryNotWritable(path, "permission denied")
@@ -67,14 +67,15 @@ def recover(
     try:
         # Once more, because another process may have done it meanwhile.
         dead, open_monitors = _sorted_out(path)
-        mending = Mending(path, seconds=seconds)
+        dead_monitors = DeadMonitors(path, seconds=seconds)
         for remains in dead:
-            mending.mend(remains.infix)
-        mending.sweep_models()
+            dead_monitors.put_in_order(remains.infix)
+        dead_monitors.sweep_models()
         give_all_second_names(path)
     finally:
         lock.release()
-    return Recovery(path, tuple(mending.files), tuple(mending.failures), open_monitors)
+    files, failures = tuple(dead_monitors.files), tuple(dead_monitors.failures)
+    return Recovery(path, files, failures, open_monitors)
 
 
 def _check_timeout(timeout: object) -> float:

@@ -19,9 +19,8 @@ from ..formats.video_metadata import (
     timing_facts,
     write_metadata,
 )
-from .cut_off import facts_of, how_it_ended, sums_of
 from .known_episodes import KnownEpisodes
-from .report import RecoveredFile
+from .recovery_report import RecoveredFile
 
 _TOLD_BY_TRAJECTORY = ("type", "env_id", "seed", "options", "versions")
 
@@ -47,15 +46,15 @@ def finish_text(part: Path, known: KnownEpisodes) -> RecoveredFile | None:
         part.unlink(missing_ok=True)
         return None
     rate, frames = unfinished_recording(part)
-    ending = how_it_ended(number, known)
-    sums = sums_of(number, known)
+    ending = known.ending(number)
+    sums = known.sums(number)
     if ending is None or sums.get("length") != len(frames) - 1:
         ending = {"complete": False, "reason": "killed"}
     writer = AsciicastWriter(path, rate=rate)
     for frame in frames:
         writer.write(frame)
     writer.close()
-    facts: dict[str, Any] = dict(facts_of(number, known))
+    facts: dict[str, Any] = dict(known.facts(number))
     write_metadata(
         path,
         {

@@ -9,11 +9,11 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class RecoveredFile:
-    """A file, and what became of it.
+    """A file, and its state after a recovery.
 
     Attributes:
         name: its base name, in the end.
-        what: became of it, in words.
+        what: what was done, in words.
     """
 
     name: str

@@ -28,9 +28,8 @@ from ..formats.video_metadata import (
     timing_facts,
     write_metadata,
 )
-from .cut_off import how_it_ended, sums_of
 from .known_episodes import KnownEpisodes
-from .report import RecoveredFile
+from .recovery_report import RecoveredFile
 
 _MOMENT = 0.05
 
@@ -154,11 +153,11 @@ def _give_up(
 
 def _metadata_without_video(note: VideoNote, known: KnownEpisodes) -> Mapping[str, Any]:
     number = episode_of(note.video.path.name)
-    ending = how_it_ended(number, known) or {"complete": False, "reason": "killed"}
+    ending = known.ending(number) or {"complete": False, "reason": "killed"}
     return {
         **note.metadata,
         **ending,
-        **sums_of(number, known),
+        **known.sums(number),
         "empty": True,
         "recovered": True,
     }
@@ -169,8 +168,8 @@ def _metadata(
 ) -> Mapping[str, Any]:
     number = episode_of(note.video.path.name)
     timestep, stride = note.timing["timestep"], note.timing["stride"]
-    sums = sums_of(number, known)
-    ending = how_it_ended(number, known)
+    sums = known.sums(number)
+    ending = known.ending(number)
     length: Any = sums.get("length")
     steps: Iterable[int]
     if ending is not None and _is_whole(note, file, length):

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run, as its journal tells it.
+
+The monitor adds each event to its `Run` when it writes it down; every other process
+reads the same events from the journal. So a manifest made while the run goes on and
+one made years later follow from the same facts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..formats.journal import MOST_EPISODES, JournalEntry, JournalReader
+from ..formats.json_fields import base_name
+
+
+@dataclass
+class Run:
+    """What is known of a run.
+
+    Attributes:
+        facts: what the journal's first line says: `env_info`, `schedule` (its name),
+            `keep` (`rule`, `left_open`), `first_episode_id`, `versions`.
+        surroundings: what was around it; None where that is not known.
+        last_episode_id: the highest number of an episode that has begun; -1 before.
+        chosen: the episodes that the schedule chose.
+        deferred: those whose video is to be rendered from their states.
+        clips: the clips that are to be rendered, as a manifest lists them.
+        faults: what could not be recorded, likewise.
+        keep: the latest word on which videos are kept; None before there is one.
+        dropped: episodes whose video fell out, though their trajectory stays.
+        recovered: another process has put it in order.
+    """
+
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    surroundings: Mapping[str, Any] | None = None
+    last_episode_id: int = -1
+    chosen: set[int] = field(default_factory=set)
+    deferred: set[int] = field(default_factory=set)
+    clips: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    faults: list[Mapping[str, Any]] = field(default_factory=list)
+    keep: Mapping[str, Any] | None = None
+    dropped: set[int] = field(default_factory=set)
+    recovered: bool = False
+
+    @classmethod
+    def read(cls, journal: Path) -> Run:
+        """Return the run of a journal.
+
+        Raises:
+            UnreadableFile: there is no such file, or it cannot be read.
+        """
+        run = cls()
+        reader = JournalReader(journal, on_event=run.note)
+        for entry in reader:
+            run.add(entry)
+        run.last_episode_id = max(run.last_episode_id, reader.last_episode_id)
+        return run
+
+    def begin(self, number: int, *, chosen: bool) -> None:
+        """Take note of an episode that has begun; the journal hears of its end."""
+        self._add(number, chosen, None)
+
+    def add(self, entry: JournalEntry) -> None:
+        """Take note of a completed episode."""
+        self._add(entry.episode_id, entry.chosen, entry.recording)
+
+    def note(self, kind: str, facts: Any) -> None:
+        """Take note of another event; one that makes no sense says nothing."""
+        match kind, facts:
+            case "run", dict():
+                self.facts = facts
+            case "surroundings", dict():
+                self.surroundings = facts
+            case "cut", {"episode_id": int(number)}:
+                self._add(number, facts.get("chosen"), facts.get("recording"))
+            case "clip", {"episode_id": int(number), "video": str(video)}:
+                self._add(number, ".step" not in video, None)
+                self._add(facts.get("last_episode_id", -1), False, None)
+                if _is_base_name(video):
+                    self.clips[video] = facts
+            case "dropped", int(number):
+                self.dropped.add(number)
+            case "fault", dict():
+                self.faults.append(facts)
+            case "keep", dict():
+                self.keep = facts
+            case "closed", {"next_episode_id": int(following)}:
+                self._add(following - 1, False, None)
+            case "recovered", _:
+                self.recovered = True
+            case _:
+                pass
+
+    def _add(self, number: int, chosen: object, recording: object) -> None:
+        if type(number) is not int or not 0 <= number < MOST_EPISODES:
+            return
+        self.last_episode_id = max(self.last_episode_id, number)
+        if chosen:
+            self.chosen.add(number)
+        if recording == "deferred":
+            self.deferred.add(number)
+
+
+def _is_base_name(name: str) -> bool:
+    try:
+        base_name(name)
+    except ValueError:
+        return False
+    return True
