@@ -209,19 +209,8 @@ class _Forged(TrajectoryReader):
 
     def close(self) -> None: ...
 
-    def _states(self, start: int, stop: int) -> Any:
-        return self._content.states[start:stop]
-
-    def _actions(self, start: int, stop: int) -> Any:
-        assert self._content.actions is not None
-        return self._content.actions[start:stop]
-
-    def _observations(self, start: int, stop: int) -> Any:
-        assert self._content.observations is not None
-        return self._content.observations[start:stop]
-
-    def _snapshots(self, start: int, stop: int) -> Any:
-        return self._content.snapshots[start:stop]
+    def _rows(self, name: str, start: int, stop: int) -> Any:
+        return getattr(self._content, name)[start:stop]
 
     def _model_change(self, index: int) -> Any:
         return self._content.model_changes[index]
