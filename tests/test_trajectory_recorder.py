@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from trajectories_by_hand import INFIX, new_logs
+from trajectory_contents import TrajectoryContent, content_of
 
 from mjrec.errors import FileNotWritten, PicturesDiffer
 from mjrec.formats.in_flight import recordings_in_flight
@@ -19,7 +20,6 @@ from mjrec.formats.trajectory import (
     Array,
     RowLayout,
     StateComponent,
-    TrajectoryContent,
 )
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
@@ -119,7 +119,7 @@ NAME = f"{trajectory_prefix(INFIX, 3)}.h5"
 def content(path: Path) -> TrajectoryContent:
     """Return what a log has of a trajectory."""
     with open_trajectory(path) as reader:
-        return reader.content()
+        return content_of(reader)
 
 
 def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:

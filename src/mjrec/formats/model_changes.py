@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument
-from .trajectory import ModelChange
-from .trajectory_layout import field_name
+from .trajectory import ModelChange, field_name
 
 _STEP = struct.Struct("<q")
 _LONGEST_HEADER = 1 << 16

@@ -169,7 +169,7 @@ def trajectory_drawing(
         GLError: nothing can be drawn here.
     """
     with contextlib.ExitStack() as opened:
-        reader = opened.enter_context(open_for_rendering(path))
+        reader = opened.enter_context(open_for_rendering(path, is_vetted=True))
         check_has_frames(reader)
         facts = reader.header.facts
         scene = RecordedScene(reader)

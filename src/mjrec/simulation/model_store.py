@@ -41,6 +41,7 @@ from .authored_model import (
 )
 from .model_trust import (
     TRUST_VARIABLE,
+    directory_digest,
     is_stored,
     is_trusted,
     note_models,
@@ -116,7 +117,7 @@ class ModelStore:
         names = {name for name in (facts["mjb"], facts["xml"]) if name is not None}
         if not names <= self._known:
             self._known |= names
-            note_models([digest])
+            note_models([digest, directory_digest(self._directory)])
             self._queue(_Job(stem, compiled, authored))
         return facts
 

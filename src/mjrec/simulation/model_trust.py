@@ -6,7 +6,8 @@ do anything to the process that loads it. The hashes in a directory prove nothin
 its maker wrote them too. So the models that this user stores are listed where only
 this user can write::
 
-    $XDG_STATE_HOME/mjrec/models       their sha256, one a line
+    $XDG_STATE_HOME/mjrec/models       their sha256, one a line, and those of the
+                                       paths of directories that they were stored in
     ~/.local/state/mjrec/models        by default
     <temporary directory>/mjrec-<uid>/models       where that cannot be written
 
@@ -28,6 +29,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import hashlib
 import logging
 import os
 import pwd
@@ -109,6 +111,23 @@ def is_stored(digest: object) -> bool:
     if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
         return False
     return any(f"\n{digest}\n" in f"\n{content}" for content in _lists())
+
+
+def directory_digest(directory: Path) -> str:
+    """Return what `note_models` notes of a directory that this user records into.
+
+    By its place: what was moved or copied is a stranger's, which costs a moment and
+    nothing else.
+    """
+    place = os.path.realpath(directory)
+    return hashlib.sha256(
+        f"directory {place}".encode(errors="surrogateescape")
+    ).hexdigest()
+
+
+def is_own_directory(directory: Path) -> bool:
+    """Tell whether this user has recorded into a directory."""
+    return is_stored(directory_digest(directory))
 
 
 def stored_models(directories: Iterable[Path]) -> list[str]:

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
-from ..formats.trajectory import ModelChange
-from ..formats.trajectory_reader import TrajectoryReader
+from ..formats.trajectory import ModelChange, TrajectoryReader
 from .authored_model import with_embedded_files
 from .cameras import check_camera, raw_model
 from .canvas import is_kept_by_context

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ...environments.made_again import EnvironmentAgain
 from ...errors import InvalidArgument
-from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.trajectory import TrajectoryReader
 from ...recorder.step_arrays import StepArray, step_array
 from ...simulation.fields import differing_from
 from ...simulation.replay import LiveStates

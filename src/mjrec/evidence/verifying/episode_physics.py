@@ -18,7 +18,7 @@ from ...environments.made_again import (
     recorded_environment,
 )
 from ...errors import InvalidArgument, UnreadableFile
-from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.trajectory import TrajectoryReader
 from ...recorder.versions import versions
 from ...simulation.fields import changed_model, differing_from, keeps_paths
 from ...simulation.model_store import model_digest

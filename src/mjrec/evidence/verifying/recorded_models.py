@@ -18,7 +18,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ...errors import Error, UnreadableFile
-from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.trajectory import TrajectoryReader
 from ...simulation.fields import changed_model, differing_fields
 from ...simulation.model_store import load_model, saved_model
 

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.trajectory import TrajectoryReader
 from ...simulation.replay import (
     SnapshotSteps,
     column_names,
