@@ -90,8 +90,7 @@ def test_live_recording_takes_the_same_frames(tmp_path: Path) -> None:
             video = env.video_recorder
             # Under the attribute that gym had.
             assert (video.enabled, video.functional, video.empty) == (True, True, False)
-            assert video.frame_count == 3
-        assert video.finished
+        assert (video.frame_count, video.finished) == (3, True)
         assert Path(str(video.path)).exists()
         about[render] = metadata_of(tmp_path / render, 0)
     live, later = about["live"], about["deferred"]
@@ -289,18 +288,19 @@ def test_off_writes_trajectories_and_no_videos(pendulum: Any, tmp_path: Path) ->
     assert not list(tmp_path.glob("*video*"))
 
 
-@pytest.mark.parametrize("value", ["later", 3, ""])
-def test_no_such_way_to_render(value: Any, pendulum: Any, tmp_path: Path) -> None:
-    """The message lists them."""
-    with pytest.raises(mjrec.InvalidArgument, match="deferred"):
-        mjrec.Monitor(pendulum, tmp_path, render=value)
-
-
-@pytest.mark.parametrize("value", [-1, 1.5, True, "2"])
-def test_workers_are_a_number(value: Any, pendulum: Any, tmp_path: Path) -> None:
-    """Of processes."""
-    with pytest.raises(mjrec.InvalidArgument, match="workers"):
-        mjrec.Monitor(pendulum, tmp_path, workers=value)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        *(({"render": value}, "deferred") for value in ("later", 3, "")),
+        *(({"workers": value}, "workers") for value in (-1, 1.5, True, "2")),
+    ],
+)
+def test_what_cannot_be_is_an_error(
+    options: dict[str, Any], message: str, pendulum: Any, tmp_path: Path
+) -> None:
+    """The message says what can."""
+    with pytest.raises(mjrec.InvalidArgument, match=message):
+        mjrec.Monitor(pendulum, tmp_path, **options)
 
 
 class Touching(MujocoEnv):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -148,7 +147,6 @@ class Finisher:
         directory: whose CPUs are shared.
         workers: how many processes draw; None is one for each free CPU.
         on_progress: see below.
-        wait: called with seconds to wait while no CPU is free.
 
     Attributes:
         progress: how far it is.
@@ -161,11 +159,10 @@ class Finisher:
         *,
         workers: int | None,
         on_progress: _OnProgress = lambda _: None,
-        wait: Callable[[float], object] = time.sleep,
     ) -> None:
         self.progress = Progress()
         self.on_progress = on_progress
-        self._pool = SharedPool(directory, workers=workers, wait=wait)
+        self._pool = SharedPool(directory, workers=workers)
         self._waiting: dict[str, tuple[VideoJob, _Work]] = {}
         self._gl_failure: GLError | None = None
 

@@ -119,7 +119,7 @@ class VideoJob:
         """What became of it as long as nothing did."""
         if self.video is not None:
             return Outcome(name=self.video.name, directory=self.video.parent)
-        return Outcome(name=self.recording, directory=self.directory)
+        return Outcome(name=self.key.told_name, directory=self.directory)
 
     def as_json(self) -> dict[str, Any]:
         """Return what JSON can hold, for `from_json` in another process."""
