@@ -152,7 +152,7 @@ def test_every_variant_has_a_name_of_its_own() -> None:
         Variant(max_fps=10),
         Variant(fps=10),
     ]
-    path = Path("openaigym.trajectory.0.7.episode000000.h5")
+    path = "openaigym.trajectory.0.7.episode000000.h5"
     names = {variant.name_for(path) for variant in variants}
     assert len(names) == len(variants)
     assert f"{VIDEO}.camera-draft.mp4" in names

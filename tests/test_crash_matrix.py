@@ -23,7 +23,6 @@ from recordings import frames_of
 
 import mjrec
 from mjrec.rendering.finish import finish
-from mjrec.rendering.recordings import recorded_episodes
 
 MOMENTS = 20
 # From the moment in which the child has begun to record.
@@ -172,7 +171,7 @@ def render_rest(directory: Path) -> None:
     is_left = True
     while is_left:
         assert time.monotonic() < deadline, "somebody holds a video for a minute"
-        outcomes = list(finish(directory, recorded_episodes(directory), workers=1))
+        outcomes = list(finish(directory, workers=1))
         assert not [outcome for outcome in outcomes if outcome.failure]
         is_left = any(outcome.is_elsewhere for outcome in outcomes)
 

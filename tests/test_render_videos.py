@@ -161,7 +161,7 @@ def test_a_camera_without_a_name_is_a_short_part_of_one(
     assert all(name.startswith(f"{VIDEO}.camera-") for name in names)
     assert painter.asked[-1][2] == View(camera={**far, "distance": 9.0})
     given = Variant(view=View(camera=dict(reversed(near.items()))))
-    trajectory = tmp_path / "openaigym.trajectory.0.7.episode000000.h5"
+    trajectory = "openaigym.trajectory.0.7.episode000000.h5"
     assert given.name_for(trajectory) == names[0]
 
 

@@ -61,8 +61,7 @@ def two(tmp_path: Path, painter: Painter) -> Path:
 
 
 def finish(directory: Path, **options: Any) -> list[Outcome]:
-    keys = recorded_episodes(directory)
-    return list(module.finish(directory, keys, workers=1, **options))
+    return list(module.finish(directory, workers=1, **options))
 
 
 def reasons_in(directory: Path) -> dict[str, str | None]:

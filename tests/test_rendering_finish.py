@@ -44,7 +44,6 @@ from mjrec.rendering.recordings import (
     look_at,
     may_be_left,
     recorded_episodes,
-    recordings,
 )
 from mjrec.rendering.rendered_manifests import reconcile, update_manifest
 
@@ -57,7 +56,7 @@ ENDS = ("framehash", "meta.json", "mp4")
 
 def finish(directory: Path, **options: Any) -> list[Outcome]:
     options = {"workers": 1, **options}
-    return list(module.finish(directory, recordings(directory), **options))
+    return list(module.finish(directory, **options))
 
 
 def manifest_in(directory: Path) -> dict[str, Any]:

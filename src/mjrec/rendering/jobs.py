@@ -28,8 +28,10 @@ class Variant:
 
     Attributes:
         view: from where, how large and how well it is drawn.
-        max_fps: the most frames per second of simulated time.
-        fps: frames per second of the file.
+        max_fps: the most frames per second of simulated time: frames 0, n, 2n ... of
+            those recorded, with the smallest n that fits, and the last.
+        fps: frames per second of the file. If None, a second of the video is as much
+            simulated time as when the episode was recorded.
         annotate: whether episode, step, time and return are written on the frames.
 
     Raises:
@@ -46,8 +48,8 @@ class Variant:
             if rate is not None:
                 to_rate(rate)
 
-    def name_for(self, trajectory: Path) -> str:
-        """Return the name of the video that shows an episode this way.
+    def name_for(self, trajectory: str) -> str:
+        """Return the name of the video that shows a trajectory this way.
 
         It is the original's with what is other before its extension, such as
         `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. A camera whose
@@ -71,9 +73,9 @@ class Variant:
                 parts.append(f"{prefix}{name_part(f'{float(rate):g}')}fps")
         if self.annotate is not None:
             parts.append("annotated" if self.annotate else "plain")
-        key = key_of(trajectory.name)
-        stem = trajectory.stem if key is None else Path(key.video_name).stem
-        return ".".join([stem, *parts, "mp4"])
+        key = key_of(trajectory)
+        usual = Path(trajectory if key is None else key.video_name)
+        return ".".join([usual.stem, *parts, "mp4"])
 
 
 @dataclass(frozen=True, kw_only=True)
