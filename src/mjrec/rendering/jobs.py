@@ -19,7 +19,7 @@ from typing import Any, Self
 from ..formats.video_names import camera_part, name_part
 from ..rates import to_rate
 from .recordings import RecordingKey, key_of
-from .views import View, plain_camera
+from .views import View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class Variant:
         """
         view, parts = self.view, []
         if isinstance(view.camera, Mapping):
-            members = json.dumps(plain_camera(view.camera), sort_keys=True)
+            members = json.dumps(view.camera, sort_keys=True)
             digest = hashlib.sha256(members.encode()).hexdigest()
             parts.append(f"camera-{digest[:8]}")
         elif view.camera is not None:

@@ -261,7 +261,7 @@ def _shots(
     further = list(video.get("cameras") or ())[1:]
     first = video_path(recording, facts) if out is None else out
     if view.camera is not None:
-        return [_Shot(first, view, {"camera": plain_camera(view.camera)})]
+        return [_Shot(first, view, {"camera": view.camera})]
 
     def second_name(path: Path) -> dict[str, str]:
         second = None if out is not None else video.get("also_named")
@@ -278,7 +278,7 @@ def _shots(
     shots = [
         _Shot(
             path,
-            replace(view, camera=plain_camera(camera)),
+            replace(view, camera=camera),
             {"camera": camera, "first_video": first.name, **second_name(path)},
         )
         for path, camera in zip(paths, further, strict=False)

@@ -24,7 +24,7 @@ from .jobs import Outcome, Variant, VideoJob
 from .progress import Progress
 from .recordings import RecordingKey, key_of, parts_of, recordings
 from .shared_pool import check_workers
-from .views import View, plain_camera
+from .views import View
 
 _SHOWN = 20
 
@@ -157,7 +157,7 @@ def render_videos(
     """
     variant = Variant(
         view=View(
-            camera=None if camera is None else plain_camera(camera),
+            camera=camera,
             height=height,
             width=width,
             quality=quality,
