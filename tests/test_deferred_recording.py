@@ -16,18 +16,18 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.envs.mujoco import MujocoEnv
 from parts import parametrize
 from processes import children
 from recordings import frames_in, in_flight, manifest_of, metadata_of, videos_in
 from touch_grid import TOUCH_GRID
 
 import mjrec
+from mjrec.environments.mjcf_environments import MjcfEnvironment
 
 SIZE: dict[str, Any] = {"height": 48, "width": 64}
 
@@ -347,33 +347,6 @@ def test_impossible_options_are_refused_before_anything_is_made(
     assert not (tmp_path / "d").exists()
 
 
-class Touching(MujocoEnv):
-    """A ball on the floor, whose touch a plugin draws."""
-
-    metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": ["human", "rgb_array", "depth_array"],
-        "render_fps": 500,
-    }
-
-    def __init__(self, path: Path, render_mode: str | None) -> None:
-        path.write_text(TOUCH_GRID)
-        space = gymnasium.spaces.Box(-np.inf, np.inf, (13,), np.float64)
-        super().__init__(
-            str(path), 1, observation_space=space, render_mode=render_mode, **SIZE
-        )
-
-    def step(self, action: Any) -> Any:
-        self.do_simulation(action, 1)
-        return self._state(), 0.0, False, False, {}
-
-    def reset_model(self) -> Any:
-        self.set_state(self.init_qpos, self.init_qvel)
-        return self._state()
-
-    def _state(self) -> Any:
-        return np.concatenate([self.data.qpos, self.data.qvel])
-
-
 @pytest.mark.parametrize(
     ("how", "mode", "error"),
     [
@@ -391,7 +364,9 @@ def test_a_plugin_that_draws_is_recorded_live_or_refused(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Its frames do not follow from what can be put back, and one message says so."""
-    env = Touching(tmp_path / "grid.xml", mode)
+    path = tmp_path / "grid.xml"
+    path.write_text(TOUCH_GRID)
+    env = MjcfEnvironment(path, render_mode=mode, **SIZE)
     with mjrec.Monitor(
         env, tmp_path / "d", render=how, env_id="Touching-v0"
     ) as monitor:
