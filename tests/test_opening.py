@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from full_disk import file_size_limit
 from result_files import ENV_INFO, entry, write_journal, write_saved
 from trajectories_by_hand import write_log
 
@@ -204,13 +205,6 @@ def test_an_impossible_directory_is_an_error(path: str, tmp_path: Path) -> None:
         monitor(tmp_path / ("x" * 300))
 
 
-def test_failed_opening_removes_what_it_made(tmp_path: Path) -> None:
-    """Directories made on the way go again."""
-    with pytest.raises(mjrec.NoPictures):
-        mjrec.Monitor(Corridor(render_mode=None), tmp_path / "a" / "b")
-    assert not (tmp_path / "a").exists()
-
-
 def test_joining_looks_at_no_other_files(tmp_path: Path) -> None:
     """Also where they cannot be read; numbers begin with 0."""
     write_video(tmp_path, "0.elsewhere", 7)
@@ -245,3 +239,10 @@ def test_joining_leaves_dead_monitors_as_they_are(
     assert not any(path.exists() for path in left)
     assert dead.exists()
     assert "Not recovered" not in caplog.text
+
+
+def test_failed_opening_removes_what_it_made(tmp_path: Path) -> None:
+    """On a full disk; directories made on the way go again."""
+    with file_size_limit(0), pytest.raises(DirectoryNotWritable):
+        monitor(tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()

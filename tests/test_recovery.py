@@ -76,8 +76,8 @@ def die(env=None):
 """
 
 
-def kill(code: str, directory: Path) -> str:
-    """Run a program, which kills itself, on a directory; return what it said."""
+def kill(code: str, directory: Path) -> None:
+    """Run a program, which kills itself, on a directory."""
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM + code, directory],
         capture_output=True,
@@ -85,7 +85,6 @@ def kill(code: str, directory: Path) -> str:
         check=False,
     )
     assert done.returncode == -signal.SIGKILL, done.stderr
-    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -272,32 +271,28 @@ def test_a_killed_encoder_is_reported(killed: Callable[[str], Path]) -> None:
     assert part.exists()
 
 
-def test_an_encoder_that_outlives_its_process_is_waited_for(tmp_path: Path) -> None:
+def test_an_encoder_that_outlives_its_process_is_waited_for(
+    killed: Callable[[str], Path],
+) -> None:
     """As long as asked for; then it is reported, and the next time it is done."""
-    code = (
+    directory = killed(
         "env = monitor()\nrun(env, 7)\npid = encoding(env)._process.pid\n"
-        "os.kill(pid, signal.SIGSTOP)\nprint(pid, flush=True)\ndie()"
+        "os.kill(pid, signal.SIGSTOP)\nopen(sys.argv[1] + '.pid', 'w')"
+        ".write(str(pid))\n"
+        "die()"
     )
-    said = tmp_path / "said"
-    with said.open("w") as file:
-        # Not a pipe, which the encoder would hold open.
-        subprocess.run(
-            [sys.executable, "-c", PROGRAM + code, tmp_path / "run"],
-            stdout=file,
-            check=False,
-        )
     try:
-        recovery = mjrec.recover(tmp_path / "run", timeout=0.1)
+        recovery = mjrec.recover(directory, timeout=0.1)
         [failure] = recovery.failures
         assert failure.name.endswith("video000000.mp4")
         assert "still finishing" in str(recovery)
-        assert videos_in(tmp_path / "run") == []
+        assert videos_in(directory) == []
     finally:
-        os.kill(int(said.read_text()), signal.SIGCONT)
-    assert mjrec.recover(tmp_path / "run").failures == ()
-    assert len(frames_in(tmp_path / "run", 0)) == 8
-    assert len(manifest_of(tmp_path / "run")["videos"]) == 1
-    assert_in_order(tmp_path / "run")
+        os.kill(int(directory.with_suffix(".pid").read_text()), signal.SIGCONT)
+    assert mjrec.recover(directory).failures == ()
+    assert len(frames_in(directory, 0)) == 8
+    assert len(manifest_of(directory)["videos"]) == 1
+    assert_in_order(directory)
 
 
 def test_a_video_that_got_its_name_gets_its_metadata(

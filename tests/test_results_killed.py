@@ -189,6 +189,17 @@ def test_the_source_with_more_episodes_wins(
     assert load(tmp_path)["initial_reset_timestamps"] == [98.0]
 
 
+def test_a_closed_monitors_journal_is_not_looked_into(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """For the statistics, so that its damage is not reported; it may be long."""
+    write_saved(tmp_path, "0.7", 1, 2)
+    with write_journal(tmp_path, "0.7", 1).open("ab") as journal:
+        journal.write(b"damaged\n")
+    assert load(tmp_path)["episode_lengths"] == [11, 12]
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("witness", ["journal", "lock", "log", "metadata"])
 def test_without_a_manifest_something_else_says_what_was_recorded(
     tmp_path: Path, witness: str
