@@ -560,11 +560,29 @@ def test_a_backend_that_does_not_work(
         pool.frames(ride.path, range(FRAMES))
 
 
+# Takes more than five seconds: both backends are tried by processes of their own.
+def test_where_egl_does_not_work_another_backend_draws(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No frame is lost or drawn by EGL, and nothing is tried twice."""
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
+    with WorkerPool(2) as pool:
+        assert len(list(pool.frames(ride.path, range(FRAMES)))) == FRAMES
+        before = pids(pool)
+        assert len(list(pool.frames(ride.path, range(FRAMES)))) == FRAMES
+        assert pids(pool) == before
+        environment = Path(f"/proc/{before[0]}/environ").read_bytes().split(b"\0")
+    assert b"MUJOCO_GL=osmesa" in environment
+
+
 def test_no_backend_works(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None:
     """One error with the reasons of all; the workers may be asked again."""
     broken = Probe("", False, cause="it is broken")
     monkeypatch.setattr(choice, "probe", lambda name: broken)
     monkeypatch.setenv("MUJOCO_GL", "off")
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
     with WorkerPool(2) as pool:
         for _ in range(2):
             with pytest.raises(GLError, match=r"(?s)egl.*broken.*osmesa.*broken"):

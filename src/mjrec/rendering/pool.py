@@ -26,6 +26,7 @@ from ..errors import ClosedError, Error, GLError, InvalidArgument
 from ..frames import Frame
 from ..gl import backend_for_children
 from ..gl.backends import (
+    BACKENDS,
     backend_in_environment,
     environment_for,
     rendering_is_off,
@@ -39,6 +40,8 @@ logger = logging.getLogger(__name__)
 # What a worker sends begins with its kind and length.
 HEADER = struct.Struct("=cQ")
 FRAME, TEXT = b"F", b"T"
+# The argument of a worker that is to look first at a frame of its own.
+TRY = "--try"
 
 _MOST_BUFFERED = 2
 # What users may have without privileges: one frame of 480x480, and more.
@@ -61,6 +64,8 @@ class WorkerPool:
 
     They use the backend that `MUJOCO_GL` names. Where it names none, or turns rendering
     off (which is for the simulation), it is the first that works, as of `mjrec.use_gl`.
+    They begin with EGL then, and look at a frame of theirs before they draw others'; a
+    process that tries the backends one by one comes only where that fails.
 
     For one thread at a time.
 
@@ -97,6 +102,8 @@ class WorkerPool:
         self.limit = count
         self.gl_facts: dict[str, Any] = {}
         self._has_drawn = False
+        # Whether the backend is the user's, or has drawn what it should.
+        self._is_tried = "MUJOCO_GL" in self._environ
         # What is drawn: of which call, what, and the numbers of its frames.
         self._call = 0
         self._drawing: Mapping[str, Any] = {}
@@ -199,8 +206,25 @@ class WorkerPool:
         if worker.child is not None:
             return
         if "MUJOCO_GL" not in self._environ:
-            self._environ = environment_for(backend_for_children(), self._environ)
-        worker.start(self._environ)
+            self._environ = environment_for(BACKENDS[0], self._environ)
+        # One that tries it is enough: the first frame of all is the first worker's.
+        tries = worker is self._workers[0] and not self._is_tried
+        worker.start(self._environ, *[TRY] * tries)
+
+    def _try_backends(self) -> None:
+        """Let all workers begin anew with the first backend that works.
+
+        Raises:
+            GLError: there is none.
+        """
+        for worker in self._workers:
+            worker.end()
+            worker.give_back()
+        self._environ = environment_for(backend_for_children(), self._environ)
+        self._is_tried = True
+        for worker in self._workers:
+            if worker.owes:
+                self._order(worker)
 
     def _order(self, worker: _Worker) -> None:
         """Tell a worker what to draw, and start it if need be."""
@@ -262,6 +286,9 @@ class WorkerPool:
                     )
             heard = [key.data for key, _ in selector.select(seconds)]
         for worker in heard:
+            if worker.child is None:
+                # With the backend of another one.
+                continue
             try:
                 self._take_in(worker)
             except EOFError:
@@ -289,9 +316,14 @@ class WorkerPool:
             said = json.loads(content)
             if "log" in said:
                 logger.log(said["log"][0], "%s", said["log"][1])
+            elif "untried" in said:
+                logger.info("Workers cannot draw with %s: %s", BACKENDS[0], said)
+                self._try_backends()
+                return
             elif "error" in said:
                 worker.error = unpacked(said["error"])
             else:
+                self._is_tried = self._is_tried or worker is self._workers[0]
                 worker.shape = (*said["size"], 3)
                 self.gl_facts = said["gl"]
 
@@ -317,6 +349,9 @@ class WorkerPool:
     ) -> None:
         """End a worker's process; the second that is lost at a frame is an error."""
         worker.end()
+        if not self._is_tried:
+            self._try_backends()
+            return
         position = worker.owes.start
         if worker.lost_at == position:
             source = self._drawing.get("trajectory", "the given states")
@@ -358,10 +393,12 @@ class _Worker:
         is_full = len(self.arrived) >= _MOST_BUFFERED
         return bool(self.owes) and self.error is None and not is_full
 
-    def start(self, environ: Mapping[str, str]) -> None:
+    def start(self, environ: Mapping[str, str], *arguments: str) -> None:
         try:
             # No directory of others is kept from being removed or unmounted.
-            self.child = Child("mjrec.rendering.worker", environ=environ, cwd="/")
+            self.child = Child(
+                "mjrec.rendering.worker", *arguments, environ=environ, cwd="/"
+            )
         except OSError as error:
             raise Error(
                 f"No process that draws could be started: {sys.executable!r}: {error}."
@@ -372,6 +409,12 @@ class _Worker:
         with contextlib.suppress(OSError):
             fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         self.messages = _messages(pipe)
+
+    def give_back(self) -> None:
+        """Owe again what has arrived and was not taken."""
+        first = self.owes.start - self.owes.step * len(self.arrived)
+        self.owes = range(first, self.owes.stop, self.owes.step)
+        self.arrived.clear()
 
     def leave(self) -> None:
         """Forget the job; a process that has more to send of it is ended."""

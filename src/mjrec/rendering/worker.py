@@ -12,6 +12,8 @@ count. What it says begins with a `pool.HEADER`. It is the bytes of a frame,
     {"size": [48, 64], "gl": {...}}         before the frames of a job
     {"error": {...}}                        instead of a frame and all that would follow
     {"log": [30, "..."]}                    for the parent's log
+    {"untried": "..."}                      with `--try`, where a frame of its own is
+                                            not what it should be: then it ends
 
 Whatever drivers print goes to the standard error. It ends when its standard input
 does, in mid-drawing too: nothing that it does is of use to anybody but its parent.
@@ -34,8 +36,9 @@ import numpy as np
 from ..carried_errors import carried
 from ..child_python import say_stacks_when_asked, take_standard_output
 from ..simulation.canvas import KeptCanvas
+from ..simulation.gl_probe import try_backend
 from .drawing import open_drawing
-from .pool import FRAME, HEADER, TEXT
+from .pool import FRAME, HEADER, TEXT, TRY
 
 _NICE = 10
 
@@ -48,6 +51,13 @@ def main() -> None:
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
     orders: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     threading.Thread(target=_read, args=[orders], daemon=True).start()
+    if TRY in sys.argv[1:]:
+        try:
+            try_backend(os.environ["MUJOCO_GL"])
+        except Exception as error:
+            answers.say(untried=str(error))
+            # Not `sys.exit`, which would wait for the driver.
+            os._exit(1)
     kept = KeptCanvas()
     while True:
         order = orders.get()

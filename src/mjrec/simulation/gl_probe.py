@@ -18,6 +18,7 @@ goes to standard error.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import ctypes
 import dataclasses
 import faulthandler
@@ -35,6 +36,7 @@ from ..machine import gpu_device_files
 from .gl_info import current_gl_strings, egl_devices
 
 _SIZE = 480
+_SMALL = 96
 _MEASURED_SECONDS = 0.8
 _MEASURED_FRAMES = 200
 
@@ -96,6 +98,17 @@ def check_picture(picture: np.ndarray) -> None:
             )
 
 
+def try_backend(backend: str) -> None:
+    """Raise unless a backend draws what it should, in a small frame of this process.
+
+    Raises:
+        Exception: of any kind; drivers raise what they like.
+    """
+    with contextlib.ExitStack() as closing:
+        draw = _drawing_function(backend, _SMALL, closing=closing)
+        check_picture(draw())
+
+
 def main() -> int:
     """Try the backend that `MUJOCO_GL` names and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -145,29 +158,40 @@ def _report_devices(say: Callable[..., None], backend: str) -> None:
         say(devices=[*map(dataclasses.asdict, egl_devices())])
 
 
-def _drawing_function(backend: str) -> Callable[[], np.ndarray]:
-    """Return a function that draws the scene, at MuJoCo's default quality."""
+def _drawing_function(
+    backend: str, size: int = _SIZE, *, closing: contextlib.ExitStack | None = None
+) -> Callable[[], np.ndarray]:
+    """Return a function that draws the scene.
+
+    At MuJoCo's default quality; where a small frame is enough, without shadows.
+    """
     # Not at the top: this import is part of what is tried.
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(_SCENE)
+    if size < _SIZE:
+        model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    gl_context = _gl_context_class(mujoco, backend)(_SIZE, _SIZE)
+    gl_context = _gl_context_class(mujoco, backend)(size, size)
     gl_context.make_current()
     context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    if closing is not None:
+        # The drawing context first, while OpenGL's is current.
+        closing.callback(gl_context.free)
+        closing.callback(context.free)
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
     scene = mujoco.MjvScene(model, maxgeom=100)
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
     camera.fixedcamid = 0
     option = mujoco.MjvOption()
-    viewport = mujoco.MjrRect(0, 0, _SIZE, _SIZE)
+    viewport = mujoco.MjrRect(0, 0, size, size)
 
     def draw() -> np.ndarray:
         # The context is named so that it lives as long as this function.
         gl_context.make_current()
-        picture = np.zeros((_SIZE, _SIZE, 3), np.uint8)
+        picture = np.zeros((size, size, 3), np.uint8)
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
         mujoco.mjr_render(viewport, scene, context)
