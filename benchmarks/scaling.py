@@ -27,7 +27,7 @@ from mjrec.evaluation.settling import settle_monitor
 from mjrec.evaluation.summaries import Bootstrap
 from mjrec.evaluation.summarizing import summarize_results
 from mjrec.recorder.selection import UNDECIDED
-from mjrec.rendering.pending import remove_unfinished
+from mjrec.rendering.recordings import remove_unfinished
 
 from .children import call
 from .many_monitors import TASK, results_of, write_evaluation, write_monitors

@@ -21,8 +21,10 @@ import numpy as np
 import pytest
 from packed_runs import record_pendulum
 from processes import children
+from trajectories_by_hand import Painter
 
 from mjrec.formats.ffmpeg import ffmpeg_executable
+from mjrec.rendering import shared_pool
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
@@ -212,6 +214,14 @@ def stuck_encoder(
     program.chmod(0o755)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
     return begun
+
+
+@pytest.fixture
+def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
+    """Draw without processes and without OpenGL; the encoder is the real one."""
+    painter = Painter()
+    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
+    return painter
 
 
 @pytest.fixture

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec render`: pending videos are made, and recorded episodes shown another way."""
+"""`mjrec render`: what it says, and how it ends. `test_render_videos` has the rest."""
 
 from __future__ import annotations
 
@@ -23,13 +23,11 @@ from trajectories_by_hand import (
     write_pending_manifest,
 )
 
-from mjrec import GLError, Monitor, clear_monitor_files, iter_episodes
+from mjrec import Monitor, clear_monitor_files, iter_episodes
 from mjrec.commands import main
 from mjrec.formats.monitor_directory import Infix
-from mjrec.rendering import again, shared_pool
-from mjrec.rendering.again import Variant
-from mjrec.rendering.pending import EpisodeKey, claim
-from mjrec.rendering.progress import Progress
+from mjrec.rendering.jobs import Variant
+from mjrec.rendering.recordings import RecordingKey, claim
 from mjrec.rendering.views import View
 
 VIDEO = "openaigym.video.0.7.video000000"
@@ -45,23 +43,6 @@ def mjrec(capsys: pytest.CaptureFixture[str]) -> Run:
         return status, *capsys.readouterr()
 
     return run
-
-
-@pytest.fixture
-def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
-    """Draw without processes and without OpenGL."""
-    painter = Painter()
-    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
-
-    class InWith:
-        def __init__(self, count: int) -> None: ...
-        def __enter__(self) -> Painter:
-            return painter
-
-        def __exit__(self, *error: object) -> None: ...
-
-    monkeypatch.setattr(again, "WorkerPool", InWith)
-    return painter
 
 
 def content_of(directory: Path) -> dict[str, bytes]:
@@ -83,78 +64,53 @@ def test_pending_videos_are_rendered(
         "2 videos rendered, in",
         f"  {tmp_path}",
     ]
-
-
-@pytest.mark.parametrize("option", [[], ["--pending"]])
-def test_nothing_to_render_is_said(
-    option: list[str], tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
-    """It is no failure."""
-    write_finished(tmp_path, video=None)
-    assert mjrec(tmp_path, *option) == (0, f"Nothing is pending in {tmp_path}.\n", "")
-
-
-def test_a_directory_without_recordings_is_an_error(tmp_path: Path, mjrec: Run) -> None:
-    """One message, which says what to do."""
-    status, _, err = mjrec(tmp_path)
-    assert status == 1
-    assert "holds no recordings" in err
-    assert "mjrec record" in err
-    status, _, err = mjrec(tmp_path / "missing")
-    assert status == 1
-    assert "There is no directory or file" in err
-
-
-def test_what_fails_is_listed_with_its_reason(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
-    """The others are rendered; the exit status tells."""
-    for episode_id in (0, 1):
-        write_finished(tmp_path, episode_id).write_bytes(b"torn")
-    write_finished(tmp_path, 2)
-    write_finished(tmp_path, 3, frames=False)
-    status, out, _ = mjrec(tmp_path)
-    assert status == 1
-    assert "1 video rendered" in out
-    assert "3 videos could not be rendered:" in out
-    assert "nothing that pictures can be made of" in out
-
-
-def test_one_episode_can_be_finished(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
-    """By its number or by its file; a second time there is nothing pending."""
-    trajectories = [write_finished(tmp_path, k) for k in range(3)]
-    assert mjrec(tmp_path, "--episode", 1)[0] == 0
-    assert mjrec(trajectories[2])[0] == 0
-    assert [path.name[-10:] for path in sorted(tmp_path.glob("*.mp4"))] == [
-        "000001.mp4",
-        "000002.mp4",
-    ]
+    nothing = (0, f"Nothing is pending in {tmp_path}.\n", "")
+    assert mjrec(tmp_path) == mjrec(tmp_path, "--pending") == nothing
     status, _, err = mjrec(tmp_path, "--episode", 1)
     assert status == 1
     assert "--camera" in err
 
 
-def test_an_episode_that_is_not_there(tmp_path: Path, mjrec: Run) -> None:
-    """The message says which there are."""
-    write_finished(tmp_path, 3)
-    status, _, err = mjrec(tmp_path, "--episode", 4)
-    assert status == 1
-    assert "It has those of 3." in err
-
-
-def test_what_another_process_renders_is_left_to_it(
+def test_what_is_not_rendered_is_listed_with_its_reason(
     tmp_path: Path, mjrec: Run, painter: Painter
 ) -> None:
-    """And said."""
-    write_finished(tmp_path)
-    lock = claim(tmp_path, EpisodeKey(INFIX, 0))
+    """The others are; the exit status tells, and so does one JSON object."""
+    for episode_id in (0, 1):
+        write_finished(tmp_path, episode_id).write_bytes(b"torn")
+    write_finished(tmp_path, 2)
+    write_finished(tmp_path, 3, frames=False)
+    write_finished(tmp_path, 4)
+    lock = claim(tmp_path, RecordingKey(INFIX, 4))
     assert lock is not None
     status, out, _ = mjrec(tmp_path)
-    lock.release()
-    assert status == 0
+    assert status == 1
+    assert "1 video rendered" in out
     assert "1 video left to another process" in out
+    assert "3 videos could not be rendered:" in out
+    assert "nothing that pictures can be made of" in out
+    lock.release()
+    status, out, _ = mjrec(tmp_path, "--json")
+    assert status == 1
+    report = json.loads(out)
+    assert report["directory"] == str(tmp_path)
+    name = "openaigym.video.0.7.video000004.mp4"
+    assert report["videos"] == [{"name": name, "frame_count": 5}]
+    assert len(report["failures"]) == 3
+    assert (report["elsewhere"], report["interrupted"]) == ([], False)
+
+
+def test_one_episode_can_be_finished_or_shown_another_way(
+    tmp_path: Path, mjrec: Run, painter: Painter
+) -> None:
+    """By its number, its trajectory, or the video's name, which one sees and copies."""
+    trajectories = [write_finished(tmp_path, k) for k in range(3)]
+    assert mjrec(tmp_path, "--episode", 1)[0] == 0
+    assert mjrec(trajectories[2])[0] == 0
+    rendered = {path.name[-10:] for path in tmp_path.glob("*.mp4")}
+    assert rendered == {"000001.mp4", "000002.mp4"}
+    [video, _] = sorted(tmp_path.glob("*.mp4"))
+    assert mjrec(video, "--camera", "side")[0] == 0
+    assert video.with_suffix(".side.mp4").exists()
 
 
 def test_another_view_is_a_new_file_beside_the_original(
@@ -204,19 +160,8 @@ def test_every_variant_has_a_name_of_its_own() -> None:
     assert f"{VIDEO}.side.mp4" in names
 
 
-def test_progress_ends_with_all_that_was_chosen(
-    tmp_path: Path, painter: Painter
-) -> None:
-    """Also where frames are left out, and where a video fails."""
-    paths = [write_finished(tmp_path, 0), write_finished(tmp_path, 1, frames=False)]
-    seen: list[Progress] = []
-    variant = Variant(max_fps=10)
-    list(again.render_again(paths, variant, workers=1, on_progress=seen.append))
-    assert seen[-1] == Progress(videos_done=2, videos=2, frames_done=3, frames=3)
-
-
 def test_readers_still_find_the_original(
-    tmp_path: Path, mjrec: Run, corridor: Any, play: Callable[..., None]
+    tmp_path: Path, corridor: Any, play: Callable[..., None]
 ) -> None:
     """A file with another camera's name is no episode's video."""
     with Monitor(corridor, tmp_path, lambda _: True) as monitor:
@@ -245,27 +190,14 @@ def test_out_names_the_file(
     name: str, tmp_path: Path, mjrec: Run, painter: Painter
 ) -> None:
     """As recorded if nothing else is said, whatever the trajectory is called."""
-    trajectory = write_finished(tmp_path)
-    trajectory = trajectory.rename(tmp_path / name)
+    trajectory = write_finished(tmp_path).rename(tmp_path / name)
     out = tmp_path / "elsewhere" / "mine.mp4"
     out.parent.mkdir()
     status, printed, _ = mjrec(trajectory, "--out", out)
     assert status == 0
     assert str(out.parent) in printed
     assert len(frames_of(out)) == 5
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        ["elsewhere", name]
-    )
-
-
-def test_a_videos_name_stands_for_its_episode(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
-    """One copies what one sees."""
-    write_finished(tmp_path)
-    mjrec(tmp_path)
-    assert mjrec(tmp_path / f"{VIDEO}.mp4", "--camera", "side")[0] == 0
-    assert (tmp_path / f"{VIDEO}.side.mp4").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"elsewhere", name}
 
 
 @pytest.mark.parametrize(
@@ -277,10 +209,16 @@ def test_a_videos_name_stands_for_its_episode(
         (["--max-fps", "0"], "fps"),
         (["--fps", "-1"], "fps"),
         (["--workers", "0"], "workers"),
-        (["--out", f"{VIDEO}.mp4"], "name of a recorded video"),
-        (["--out", f"{VIDEO}.mkv"], "name of a recorded video"),
+        (["--out", "x.mp4"], "several episodes"),
+        (["--out", f"{VIDEO}.mp4", "--episode", "0"], "name of a recorded video"),
+        (["--out", f"{VIDEO}.mkv", "--episode", "0"], "name of a recorded video"),
         (["--out", "x.txt", "--episode", "0"], "ends in"),
         (["--out", "/no/such/directory/x.mp4", "--episode", "0"], "does not exist"),
+        (["--address", "auto"], "--engine ray"),
+        (["--engine-option", "partition=gpu"], "--engine slurm"),
+        (["--engine", "local", "--engine-option", "partition"], "KEY=VALUE"),
+        (["--engine", "local", "--workers", "0"], "workers"),
+        (["--episode", "4"], "It has those of 0, 1."),
     ],
 )
 def test_what_cannot_be_is_one_clear_error(
@@ -293,7 +231,8 @@ def test_what_cannot_be_is_one_clear_error(
 ) -> None:
     """And nothing is written."""
     monkeypatch.chdir(tmp_path)
-    write_finished(tmp_path)
+    for episode_id in (0, 1):
+        write_finished(tmp_path, episode_id)
     before = content_of(tmp_path)
     status, out, err = mjrec(tmp_path, *arguments)
     assert status == 1
@@ -301,44 +240,26 @@ def test_what_cannot_be_is_one_clear_error(
     assert content_of(tmp_path) == before
 
 
-def test_one_file_for_several_episodes_is_an_error(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
-    """One would replace the other."""
-    for episode_id in (0, 1):
-        write_finished(tmp_path, episode_id)
-    status, _, err = mjrec(tmp_path, "--out", tmp_path / "x.mp4")
+def test_a_directory_without_recordings_is_an_error(tmp_path: Path, mjrec: Run) -> None:
+    """One message, which says what to do."""
+    status, _, err = mjrec(tmp_path)
     assert status == 1
-    assert "several episodes" in err
-
-
-def test_json_is_one_object(tmp_path: Path, mjrec: Run, painter: Painter) -> None:
-    """With what was rendered and what was not, and nothing else."""
-    write_finished(tmp_path, 0)
-    write_finished(tmp_path, 1, frames=False)
-    status, out, _ = mjrec(tmp_path, "--json")
-    assert status == 1
-    report = json.loads(out)
-    assert report["directory"] == str(tmp_path)
-    assert report["videos"] == [{"name": f"{VIDEO}.mp4", "frame_count": 5}]
-    assert list(report["failures"]) == ["openaigym.video.0.7.video000001.mp4"]
-    assert (report["elsewhere"], report["interrupted"]) == ([], False)
+    assert "holds no recordings" in err
+    assert "mjrec record" in err
 
 
 def test_ctrl_c_keeps_what_is_done(
-    tmp_path: Path, mjrec: Run, painter: Painter, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, mjrec: Run, painter: Painter
 ) -> None:
     """The exit status is the shells', and nothing half-done stays."""
     for episode_id in (0, 1):
         write_finished(tmp_path, episode_id)
-    draw = painter.frames
 
-    def interrupted(trajectory: Path, *rest: Any) -> Any:
+    def interrupt(trajectory: Path, *_: object) -> None:
         if "000001" in trajectory.name:
             raise KeyboardInterrupt
-        return draw(trajectory, *rest)
 
-    monkeypatch.setattr(painter, "frames", interrupted)
+    painter.breaks_at = interrupt
     status, out, _ = mjrec(tmp_path)
     assert status == 130
     assert "Interrupted." in out
@@ -361,45 +282,6 @@ def test_strict_fails_where_nothing_is_to_be_seen(
     assert len(list(tmp_path.glob("*.mp4"))) == 1
     content = json.loads(manifest.read_text())
     assert len(content["mjrec"]["pending"]) == bool(again_at)
-
-
-def test_where_nothing_can_be_drawn_one_try_is_enough(
-    tmp_path: Path, mjrec: Run, painter: Painter, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each video is told with the reason."""
-    tries: list[Path] = []
-
-    def fail(trajectory: Path, *rest: object) -> None:
-        tries.append(trajectory)
-        raise GLError("nothing renders here")
-
-    monkeypatch.setattr(painter, "frames", fail)
-    for episode_id in range(3):
-        write_finished(tmp_path, episode_id)
-    status, out, _ = mjrec(tmp_path, "--fps", "30")
-    assert status == 1
-    assert "3 videos could not be rendered:" in out
-    assert len(tries) == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--address", "auto"], "--engine ray"),
-        (["--engine-option", "partition=gpu"], "--engine slurm"),
-        (["--engine", "local", "--engine-option", "partition"], "KEY=VALUE"),
-        (["--engine", "local", "--workers", "0"], "workers"),
-    ],
-)
-def test_a_wrong_engine_is_one_clear_error(
-    arguments: list[str], message: str, tmp_path: Path, mjrec: Run
-) -> None:
-    """And nothing is rendered."""
-    write_finished(tmp_path)
-    status, out, err = mjrec(tmp_path, *arguments)
-    assert (status, out) == (1, "")
-    assert message in err
-    assert not list(tmp_path.glob("*.mp4"))
 
 
 def test_an_engine_says_what_this_process_would(tmp_path: Path, mjrec: Run) -> None:

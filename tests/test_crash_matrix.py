@@ -22,8 +22,8 @@ from parts import parametrize
 from recordings import frames_of
 
 import mjrec
-from mjrec.rendering.finishing import finish_pending
-from mjrec.rendering.pending import recorded_episodes
+from mjrec.rendering.finish import finish
+from mjrec.rendering.recordings import recorded_episodes
 
 MOMENTS = 20
 # From the moment in which the child has begun to record.
@@ -163,7 +163,7 @@ def check_nothing_is_half(directory: Path) -> None:
         json.loads(path.read_text())
 
 
-def finish(directory: Path) -> None:
+def render_rest(directory: Path) -> None:
     """Render what is pending, also what the dead process's renderer still holds.
 
     It ends when it notices that its parent is gone, and until then is left alone.
@@ -172,9 +172,7 @@ def finish(directory: Path) -> None:
     is_left = True
     while is_left:
         assert time.monotonic() < deadline, "somebody holds a video for a minute"
-        outcomes = list(
-            finish_pending(directory, recorded_episodes(directory), workers=1)
-        )
+        outcomes = list(finish(directory, recorded_episodes(directory), workers=1))
         assert not [outcome for outcome in outcomes if outcome.failure]
         is_left = any(outcome.is_elsewhere for outcome in outcomes)
 
@@ -205,7 +203,7 @@ def test_what_was_complete_is_there(
     check_statistics(tmp_path, crashed)
     mjrec.recover(tmp_path)
     assert not mjrec.recover(tmp_path), "something was left to recover"
-    finish(tmp_path)
+    render_rest(tmp_path)
     check_statistics(tmp_path, crashed)
     check_trajectories(tmp_path, crashed)
     check_videos(tmp_path, crashed)

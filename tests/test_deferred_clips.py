@@ -23,8 +23,8 @@ import mjrec
 from mjrec.commands import main
 from mjrec.formats.in_flight import add_facts, drop_recording
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.rendering.finishing import finish_pending
-from mjrec.rendering.pending import key_of, look_at, recordings
+from mjrec.rendering import finish as module
+from mjrec.rendering.recordings import key_of, look_at, recordings
 
 
 class Blinking(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -87,7 +87,7 @@ def record(directory: Path, env: Any, steps: int, **options: Any) -> None:
 
 def finish(directory: Path) -> list[Any]:
     """Render what is pending."""
-    return list(finish_pending(directory, recordings(directory), workers=1))
+    return list(module.finish(directory, recordings(directory), workers=1))
 
 
 def parts(directory: Path) -> list[str]:
@@ -233,16 +233,6 @@ def test_clip_that_begins_with_an_episode_has_its_name(tmp_path: Path) -> None:
     [outcome] = finish(tmp_path)
     assert (outcome.name, outcome.frame_count) == (entry["video"], 6)
     assert (tmp_path / "rl-video-episode-1.mp4").exists()
-
-
-@pytest.mark.thorough
-def test_clip_that_runs_at_close_is_as_long_as_it_is(tmp_path: Path) -> None:
-    """It says that it is shorter than asked for, and why."""
-    record(tmp_path, hopper(), 7, step_trigger=lambda step: step == 4, video_length=99)
-    [about] = told(tmp_path)
-    assert (about["complete"], about["reason"]) == (False, "close")
-    assert (about["length"], about["frame_count"]) == (3, 5)
-    assert len(mjrec.load_results(tmp_path)["videos"]) == 1
 
 
 def test_running_clip_is_its_monitors_business(tmp_path: Path) -> None:
@@ -395,7 +385,9 @@ def test_no_other_video_is_written_over(name: str | None, tmp_path: Path) -> Non
     before = sorted(tmp_path.iterdir())
     [outcome] = finish(tmp_path)
     assert "not that of its own" in str(outcome.failure)
-    assert sorted(tmp_path.iterdir()) == before
+    said = [*tmp_path.glob("openaigym.clip.*.failed.json")]
+    assert len(said) == 1
+    assert sorted(tmp_path.iterdir()) == sorted(before + said)
 
 
 def test_a_video_is_found_by_its_own_name(tmp_path: Path) -> None:
@@ -415,7 +407,6 @@ def test_a_clip_is_written_at_the_rate_that_was_asked_for(tmp_path: Path) -> Non
         fps=12,
         max_fps=62.5,
     )
-    assert not next(finish_pending(tmp_path, recordings(tmp_path), workers=1)).failure
+    assert not finish(tmp_path)[0].failure
     [about] = told(tmp_path)
-    assert about["frame_count"] == 5
-    assert about["fps"] == "12"
+    assert (about["frame_count"], about["fps"]) == (5, "12")

@@ -11,7 +11,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from forged_episodes import swap_model
 from forged_videos import drawn, forge, metadata, say, swap, video
 from packed_runs import edit_json, make_bag_fit, record_pendulum, the, unpacked
 from parts import parametrize
+from recordings import edit_journal
 
 import mjrec
 from mjrec.evidence.verification import Level, Verdict
@@ -96,10 +96,7 @@ def edit_a_reward_everywhere(bag: Path) -> None:
         total += reward
     forge_episode(path, rewards=rewards, facts={"reward": total})
     say(video(recordings(bag), 1), reward=total)
-    journal = the(bag, "*.jsonl")
-    lines = [json.loads(line) for line in journal.read_text().splitlines()]
-    lines[1]["reward"] = total
-    journal.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    edit_journal(recordings(bag), 1, reward=total)
     edit_json(
         the(bag, "*.stats.json"),
         lambda stats: stats["episode_rewards"].__setitem__(1, total),
@@ -114,10 +111,7 @@ def edit_a_reward_and_delete_the_seed(bag: Path) -> None:
     edit_a_reward_everywhere(bag)
     forge_episode(episode(bag, 1), facts={"seed": None, "random_state": None})
     say(video(recordings(bag), 1), seed=None)
-    journal = the(bag, "*.jsonl")
-    lines = [json.loads(line) for line in journal.read_text().splitlines()]
-    lines[1]["seed"] = None
-    journal.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    edit_journal(recordings(bag), 1, seed=None)
     rows = read_table(bag)
     rows[1]["seed"] = ""
     write_table(bag, rows)

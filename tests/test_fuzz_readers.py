@@ -41,7 +41,7 @@ from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.formats.video_metadata import is_broken
 from mjrec.json_text import dumps, loads
 from mjrec.rendering.recorded_facts import open_for_rendering
-from mjrec.rendering.rendered_manifests import reconcile
+from mjrec.results.listing import write_listings
 
 FEW = settings(
     derandomize=True,
@@ -233,7 +233,7 @@ def check_manifest(tmp_path: Path, data: bytes) -> None:
         assert all(len(os.fsencode(name)) <= 255 for name in names)
         write_manifest(path, found)
         # It uses more of it than reading checks.
-        reconcile(tmp_path)
+        write_listings(tmp_path)
 
 
 @FEW

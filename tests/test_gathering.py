@@ -206,7 +206,7 @@ def test_what_readers_leave_out_is_a_problem(tmp_path: Path) -> None:
         file.write('{"episode_id": 2, "len\n')
     contents = gather(tmp_path)
     assert len(contents.tasks[0].episodes.run) == 2
-    assert any("line 3 (episode 2)" in problem for problem in contents.problems)
+    assert any("line 4 (episode 2)" in problem for problem in contents.problems)
 
 
 def test_a_video_that_leads_elsewhere_is_left_out(

@@ -45,7 +45,7 @@ from mjrec.formats.span_writer import LOOK_PREFIX, SpanLogs
 from mjrec.formats.trajectory import Array, ModelChange, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.json_text import dumps, loads
-from mjrec.rendering.rendered_manifests import reconcile
+from mjrec.results.listing import write_listings
 from mjrec.simulation.model_trust import note_models
 from mjrec.simulation.source_compiler import compile_within
 
@@ -311,7 +311,7 @@ def test_a_pending_video_elsewhere_is_not_looked_at(directory: Path) -> None:
     path = manifest(directory)
     entry = {"pending": [{"episode_id": 0, "video": name}]}
     path.write_text(json.dumps({**json.loads(path.read_text()), "mjrec": entry}))
-    reconcile(directory)
+    write_listings(directory)
     assert read_manifest(path).videos == ()
 
 

@@ -120,10 +120,9 @@ def test_options_of_any_type_do_not_stop_a_run(path: Path) -> None:
 def test_the_first_line_says_what_is_recorded(path: Path) -> None:
     """Once a journal, also where one is written on; readers need no episode for it."""
     writer = JournalWriter(path, run={"env_info": ENV_INFO})
-    writer.begin()
-    assert run_facts(path) == {"env_info": ENV_INFO}
     writer.append(ENTRY)
     writer.close()
+    assert run_facts(path) == {"env_info": ENV_INFO}
     writer = JournalWriter(path, run={"env_info": {}})
     writer.append(NEXT)
     writer.close()

@@ -25,7 +25,7 @@ import mjrec
 from mjrec import UnreadableFile, UntrustedModel, load_trajectory
 from mjrec.commands import main
 from mjrec.formats.in_flight import recordings_in_flight
-from mjrec.rendering.video_jobs import VideoWorker
+from mjrec.rendering.engine_jobs import VideoWorker
 from mjrec.simulation.model_store import load_model
 from mjrec.simulation.model_trust import (
     TRUST_VARIABLE,

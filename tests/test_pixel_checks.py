@@ -391,12 +391,10 @@ def test_every_kind_of_video_is_drawn_again(
 @pytest.mark.thorough
 def test_a_video_rendered_again_beside_the_original(alone: Path) -> None:
     """It shows what its metadata says, of the recorded pictures."""
-    from mjrec.rendering.again import Variant, render_again
-    from mjrec.rendering.views import View
-
-    variant = Variant(view=View(camera=-1, height=24, width=32), max_fps=10)
-    [outcome] = render_again(sorted(alone.glob("*.h5"))[:1], variant, workers=1)
-    checks = [check for check in checks_of(alone) if check.subject == outcome.name]
+    view: dict[str, Any] = {"camera": -1, "height": 24, "width": 32}
+    rendered = mjrec.render_videos(min(alone.glob("*.h5")), **view, max_fps=10)
+    [name] = rendered.videos
+    checks = [check for check in checks_of(alone) if check.subject == name]
     assert [check.verdict for check in checks] == [PASS] * 5
 
 

@@ -207,7 +207,7 @@ def test_what_was_recovered_stands_in_the_manifest(
     details.pop("surroundings")
     assert details == {
         "format_version": 1,
-        "schedule": {"name": "<lambda>", "recorded": [0, 1, 2]},
+        "schedule": {"name": "monitor.<locals>.<lambda>", "recorded": [0, 1, 2]},
         "first_episode_id": 0,
         "next_episode_id": 3,
         "pending": [],
@@ -224,7 +224,7 @@ def test_deferred_episodes_become_trajectories_and_stay_pending(
     """The one in flight too, marked as killed; rendered, it shows what was recorded."""
     directory = killed(
         "env = cheetah(workers=0)\nrun(env)\nrun(env, 6)\n"
-        "env._recorder._states.finish()\ndie()"
+        "env._recorder._subject.states.finish()\ndie()"
     )
     before = results_of(directory)
     mjrec.recover(directory)
@@ -678,7 +678,7 @@ def test_a_damaged_manifest_is_made_again(killed: Callable[[str], Path]) -> None
 def test_provenance_of_a_manifest_is_kept(killed: Callable[[str], Path]) -> None:
     """Packages, machine and policy stay known though the monitor was killed later."""
     directory = killed(
-        "from mjrec.surroundings import look_around\n"
+        "from mjrec.provenance import look_around\n"
         "env = monitor()\nrun(env)\nlook_around().found(wait=True)\n"
         "run(env)\nrun(env)\ndie(env)"
     )

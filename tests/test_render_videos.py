@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The library's form of `mjrec render`."""
+"""`mjrec.render_videos`: pending or another way, here or by an engine's workers."""
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import gymnasium
+import h5py
+import numpy as np
 import pytest
 from parts import parametrize
-from recordings import frames_of
+from recordings import frames_of, in_flight
 from trajectories_by_hand import (
     INFIX,
     Painter,
@@ -19,60 +26,91 @@ from trajectories_by_hand import (
     write_pending_manifest,
 )
 
-import mjrec
-from mjrec import InvalidArgument, LocalEngine, UnknownName, render_videos
-from mjrec.rendering import again, shared_pool
-from mjrec.rendering.again import Variant
-from mjrec.rendering.directory_videos import RenderedVideos
-from mjrec.rendering.pending import EpisodeKey, claim
+from mjrec import (
+    GLError,
+    InvalidArgument,
+    LocalEngine,
+    Monitor,
+    UnknownName,
+    render_videos,
+)
+from mjrec.engines.work import Job, JobOutcome, Work
+from mjrec.rendering.engine_jobs import VideoWorker
+from mjrec.rendering.jobs import Outcome, Variant, VideoJob
 from mjrec.rendering.progress import Progress
+from mjrec.rendering.recordings import RecordingKey, claim
+from mjrec.rendering.render_videos import RenderedVideos
 from mjrec.rendering.views import View
+from mjrec.simulation.model_trust import note_models
 
 VIDEO = "openaigym.video.0.7.video000000"
+DIED = "Its worker died, which was try 3 of 3: it was killed by SIGKILL."
 
 
-@pytest.fixture
-def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
-    """Draw without processes and without OpenGL."""
-    painter = Painter()
+class Here:
+    """An engine whose one worker is this process, and dies at some of the jobs.
 
-    class InWith:
-        def __init__(self, count: int) -> None: ...
-        def __enter__(self) -> Painter:
-            return painter
+    Args:
+        dies: parts of the keys of these jobs.
+    """
 
-        def __exit__(self, *error: object) -> None: ...
+    def __init__(self, *dies: str) -> None:
+        self.dies = dies
+        self.works: list[Work] = []
+        self.jobs: list[Job] = []
+        self.is_cancelled = False
+        self.workers = 1
+        self.unfinished = 0
 
-    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
-    monkeypatch.setattr(again, "WorkerPool", InWith)
-    return painter
+    def begin(self, work: Work) -> Self:
+        self.works.append(work)
+        return self
+
+    def submit(self, job: Job) -> None:
+        self.jobs.append(job)
+
+    def results(self, *, patience_s: float | None = None) -> Iterator[JobOutcome]:
+        worker = VideoWorker()
+        for job in self.jobs:
+            arguments = json.loads(json.dumps(job.arguments))
+            value: Mapping[str, Any] | None = None
+            failure = DIED if any(name in job.key for name in self.dies) else None
+            if failure is None:
+                value = json.loads(json.dumps(worker(arguments)))
+            yield JobOutcome(key=job.key, value=value, failure=failure)
+        worker.close()
+
+    def cancel(self) -> None:
+        self.is_cancelled = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.cancel()
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    """Record two episodes of which the videos are pending."""
-    environment = gymnasium.make("InvertedPendulum-v5", width=40, height=32)
-    directory = tmp_path / "run"
-    with mjrec.Monitor(
-        environment, directory, lambda _: True, workers=0, quality="draft"
-    ) as monitor:
-        for _ in range(2):
-            monitor.reset(seed=0)
-            while not monitor.step(environment.action_space.low)[2]:
-                pass
-    return directory
+@pytest.fixture(params=[None, Here], ids=["here", "engine"])
+def engine(request: pytest.FixtureRequest) -> Here | None:
+    """Where it is done."""
+    return request.param and Here()
 
 
-def test_pending_videos_are_made_once(tmp_path: Path, painter: Painter) -> None:
+# What comes of each
+
+
+def test_pending_videos_are_made_once(
+    tmp_path: Path, painter: Painter, engine: Here | None
+) -> None:
     """The result says what became of each; a second call has nothing to do."""
     write_finished(tmp_path, 0)
     write_finished(tmp_path, 1).write_bytes(b"torn")
     write_log(tmp_path, 2, video=None)
     write_finished(tmp_path, 3)
     write_pending_manifest(tmp_path, 0, 1, 3)
-    lock = claim(tmp_path, EpisodeKey(INFIX, 3))
+    lock = claim(tmp_path, RecordingKey(INFIX, 3))
     assert lock is not None
-    rendered = render_videos(str(tmp_path))
+    rendered = render_videos(str(tmp_path), engine=engine)
     lock.release()
     assert rendered.directory == tmp_path
     assert rendered.videos == {f"{VIDEO}.mp4": 5}
@@ -80,23 +118,31 @@ def test_pending_videos_are_made_once(tmp_path: Path, painter: Painter) -> None:
     assert list(rendered.failures) == ["openaigym.video.0.7.video000001.mp4"]
     assert rendered.elsewhere == ("openaigym.video.0.7.video000003.mp4",)
     assert not rendered.is_empty
-    assert render_videos(tmp_path, episode=0) == RenderedVideos(directory=tmp_path)
+    nothing = RenderedVideos(directory=tmp_path)
+    assert render_videos(tmp_path, episode=0, engine=engine and Here()) == nothing
 
 
-@parametrize("engine", [None, "local", LocalEngine(1)])
-def test_every_engine_makes_them(run: Path, engine: Any) -> None:
+@parametrize("given", [None, "local", LocalEngine(1)])
+def test_every_engine_makes_them(tmp_path: Path, given: Any) -> None:
     """By its name, or as it is given; and another view beside the original."""
-    rendered = render_videos(run, engine=engine)
+    environment = gymnasium.make("InvertedPendulum-v5", width=40, height=32)
+    run = tmp_path / "run"
+    with Monitor(
+        environment, run, lambda _: True, workers=0, quality="draft"
+    ) as monitor:
+        for _ in range(2):
+            monitor.reset(seed=0)
+            while not monitor.step(environment.action_space.low)[2]:
+                pass
+    rendered = render_videos(run, engine=given)
     assert len(rendered.videos) == 2
     for name, frames in rendered.videos.items():
         assert len(frames_of(run / name)) == frames
-    assert render_videos(run, engine=engine).is_empty
-    out = run.parent / "other.mp4"
-    other = render_videos(
-        run, episode=1, camera=-1, height=24, width=24, out=out, engine=engine
-    )
-    assert list(other.videos) == ["other.mp4"]
-    assert other.directory == run.parent
+    assert render_videos(run, engine=given).is_empty
+    out = tmp_path / "other.mp4"
+    view: dict[str, Any] = {"camera": -1, "height": 24, "width": 24}
+    other = render_videos(run, episode=1, **view, out=out, engine=given)
+    assert (list(other.videos), other.directory) == (["other.mp4"], tmp_path)
     assert frames_of(out)[0].shape == (24, 24, 3)
 
 
@@ -115,65 +161,67 @@ def test_a_camera_without_a_name_is_a_short_part_of_one(
     assert all(name.startswith(f"{VIDEO}.camera-") for name in names)
     assert painter.asked[-1][2] == View(camera={**far, "distance": 9.0})
     given = Variant(view=View(camera=dict(reversed(near.items()))))
-    assert (
-        given.name_for(tmp_path / "openaigym.trajectory.0.7.episode000000.h5")
-        == (names[0])
-    )
+    trajectory = tmp_path / "openaigym.trajectory.0.7.episode000000.h5"
+    assert given.name_for(trajectory) == names[0]
 
 
 def test_what_shows_nothing_is_told_where_asked(
-    tmp_path: Path, painter: Painter
+    tmp_path: Path, painter: Painter, engine: Here | None
 ) -> None:
     """The video is there."""
     painter.plain = True
     write_finished(tmp_path)
-    rendered = render_videos(tmp_path, strict=True)
+    rendered = render_videos(tmp_path, strict=True, engine=engine)
     assert list(rendered.blank) == list(rendered.videos) == [f"{VIDEO}.mp4"]
     assert rendered.failures == {}
 
 
-def test_progress_is_told(tmp_path: Path, painter: Painter) -> None:
-    """After every frame."""
-    write_finished(tmp_path)
-    seen: list[Progress] = []
-    render_videos(tmp_path, on_progress=seen.append)
-    assert seen[-1] == Progress(videos_done=1, videos=1, frames_done=5, frames=5)
+@pytest.mark.parametrize("options", [{}, {"fps": 30}], ids=["pending", "another way"])
+def test_where_nothing_can_be_drawn_one_try_is_enough(
+    tmp_path: Path, painter: Painter, engine: Here | None, options: dict[str, Any]
+) -> None:
+    """And each video is told with the reason."""
+
+    def fail(*_: object) -> None:
+        raise GLError("nothing renders here")
+
+    painter.breaks_at = fail
+    for number in range(3):
+        write_finished(tmp_path, number)
+    rendered = render_videos(tmp_path, engine=engine, **options)
+    assert list(rendered.failures.values()) == ["nothing renders here"] * 3
+    assert len(painter.asked) == 1
 
 
-def test_ctrl_c_leaves_what_is_finished(tmp_path: Path, painter: Painter) -> None:
-    """And nothing half-done."""
+@pytest.mark.parametrize("options", [{}, {"max_fps": 10}])
+def test_ctrl_c_leaves_what_is_finished(
+    tmp_path: Path, painter: Painter, options: dict[str, Any]
+) -> None:
+    """And nothing half-done; models were trusted during the call only."""
     for number in (0, 1):
         write_finished(tmp_path, number)
+    seen: list[tuple[Progress, str | None]] = []
 
     def interrupt(progress: Progress) -> None:
-        if progress.frames_done == 7:
+        seen.append((progress, os.environ.get("MJREC_TRUST_MODELS")))
+        if progress.videos_done and progress.frames_done > 4:
             raise KeyboardInterrupt
 
+    trusted: dict[str, Any] = {"trust_models": True, **options}
     with pytest.raises(KeyboardInterrupt):
-        render_videos(tmp_path, on_progress=interrupt)
-    assert [path.name for path in tmp_path.glob("*.mp4")] == [f"{VIDEO}.mp4"]
-    assert list(render_videos(tmp_path).videos) == [
-        "openaigym.video.0.7.video000001.mp4"
-    ]
-
-
-def test_models_are_trusted_during_the_call_only(
-    tmp_path: Path, painter: Painter, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also where it is interrupted."""
-    monkeypatch.delenv("MJREC_TRUST_MODELS", raising=False)
-    write_finished(tmp_path)
-    seen: list[str | None] = []
-
-    def look(progress: Progress) -> None:
-        seen.append(os.environ.get("MJREC_TRUST_MODELS"))
-        if progress.frames_done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        render_videos(tmp_path, trust_models=True, on_progress=look)
-    assert set(seen) == {"1"}
+        render_videos(tmp_path, on_progress=interrupt, **trusted)
+    assert [path.name[:31] for path in tmp_path.glob("*.mp4")] == [VIDEO]
+    assert {trust for _, trust in seen if _.frames_done} == {"1"}
     assert "MJREC_TRUST_MODELS" not in os.environ
+    seen.clear()
+    rest = render_videos(
+        tmp_path, episode=1, on_progress=lambda now: seen.append((now, None)), **options
+    )
+    assert len(rest.videos) == 1
+    frames = 3 if options else 5
+    assert seen[-1][0] == Progress(
+        videos_done=1, videos=1, frames_done=frames, frames=frames
+    )
 
 
 WRONG: list[tuple[dict[str, Any], type[Exception], str]] = [
@@ -214,3 +262,207 @@ def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
     copy = write_finished(tmp_path).rename(tmp_path / "copy.h5")
     with pytest.raises(InvalidArgument, match="no recording has such a name"):
         render_videos(copy)
+
+
+# By an engine's workers
+
+
+def content_of(directory: Path) -> dict[str, Any]:
+    """Return what each file holds; of trajectories the arrays and what they say."""
+    return {
+        path.name: _of_hdf5(path) if path.suffix == ".h5" else path.read_bytes()
+        for path in directory.iterdir()
+    }
+
+
+def _of_hdf5(path: Path) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+
+    def note(name: str, item: Any) -> None:
+        said = {key: np.asarray(value).tolist() for key, value in item.attrs.items()}
+        rows = item[()].tobytes() if isinstance(item, h5py.Dataset) else None
+        found[name] = (said, rows)
+
+    with h5py.File(path) as file:
+        note("/", file)
+        file.visititems(note)
+    return found
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clip, and episodes by two cameras; interrupted, so that all are logs."""
+    directory = tmp_path_factory.mktemp("recorded") / "run"
+    small: dict[str, Any] = {"height": 32, "width": 40, "quality": "draft"}
+    for options in (
+        {"step_trigger": lambda step: step == 2, "video_length": 5},
+        {"video_callable": lambda _: True, "camera": ["track", -1]},
+    ):
+        environment = gymnasium.make("HalfCheetah-v5", max_episode_steps=3)
+        with (
+            suppress(RuntimeError),
+            Monitor(
+                environment, directory, resume=True, workers=0, **small, **options
+            ) as monitor,
+        ):
+            for _ in range(3):
+                monitor.reset(seed=0)
+                for _ in range(3):
+                    monitor.step(np.ones(6))
+            raise RuntimeError
+    return directory
+
+
+OTHER: dict[str, Any] = {
+    "camera": {"type": 0, "distance": 5.0},
+    "height": 24,
+    "width": 32,
+    "quality": "draft",
+    "fps": 12.5,
+    "max_fps": Fraction(30000, 1001),
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("options", "count"), [({}, 7), (OTHER, 3)])
+def test_two_workers_make_the_files_that_this_process_makes(
+    interrupted: Path, tmp_path: Path, options: dict[str, Any], count: int
+) -> None:
+    """Byte for byte: videos, metadata, frame hashes, manifests, trajectories."""
+    here, there = (
+        shutil.copytree(interrupted, tmp_path / name) for name in ("here", "there")
+    )
+    assert len([path for path in in_flight(here) if path.suffix == ".h5"]) == 3
+    own = render_videos(here, workers=1, **options)
+    others = render_videos(there, engine=LocalEngine(2), **options)
+    assert own.videos == others.videos
+    assert len(list(there.glob("*.mp4"))) == len(own.videos) == count
+    assert content_of(there) == content_of(here)
+
+
+@pytest.mark.parametrize(
+    "variant",
+    [
+        None,
+        Variant(),
+        Variant(view=View(camera=-1, height=2), max_fps=29.97, annotate=False),
+        Variant(view=View(camera={"lookat": [0, 0, 1]}), fps=Fraction(24000, 1001)),
+    ],
+)
+def test_jobs_and_outcomes_survive_the_way(
+    variant: Variant | None, tmp_path: Path
+) -> None:
+    """Exactly."""
+    video = variant and tmp_path / "v.mp4"
+    job = VideoJob(directory=tmp_path, recording="r", variant=variant, video=video)
+    said = json.loads(json.dumps(job.as_json()))
+    assert VideoJob.from_json(said).as_json() == said
+    outcome = Outcome(
+        name="v.mp4", directory=tmp_path, is_video=True, further_videos=("v.side.mp4",)
+    )
+    assert Outcome.from_json(json.loads(json.dumps(outcome.as_json()))) == outcome
+
+
+def test_progress_counts_videos_as_they_come(tmp_path: Path, painter: Painter) -> None:
+    """Each recording is taken for a video until it is over; frames are not known."""
+    write_finished(tmp_path, 0)
+    write_finished(tmp_path, 1, frames=False)
+    write_log(tmp_path, 2, video=None)
+    seen: list[Progress] = []
+    render_videos(tmp_path, engine=Here(), on_progress=seen.append)
+    counts = [(now.videos, now.videos_done, now.frames_done) for now in seen]
+    assert counts == [(3, 0, 0), (3, 1, 5), (3, 2, 5), (2, 2, 5)]
+    assert {now.frames for now in seen} == {None}
+
+
+def test_a_job_whose_workers_die_is_that_videos_failure(
+    tmp_path: Path, painter: Painter
+) -> None:
+    """The manifest says so, and the rest goes on."""
+    for number in (0, 1):
+        write_finished(tmp_path, number)
+    manifest = write_pending_manifest(tmp_path, 0, 1)
+    rendered = render_videos(tmp_path, engine=Here("video000000"))
+    assert rendered.failures == {f"{VIDEO}.mp4": DIED}
+    assert len(rendered.videos) == 1
+    [pending] = json.loads(manifest.read_text())["mjrec"]["pending"]
+    assert pending["reason"] == DIED
+
+
+def test_what_is_done_is_no_job(tmp_path: Path, painter: Painter) -> None:
+    """Without a look into any trajectory; and without a job there is no run."""
+    write_finished(tmp_path)
+    render_videos(tmp_path, engine=Here())
+    next(tmp_path.glob("*.h5")).write_bytes(b"torn")
+    engine = Here()
+    assert render_videos(tmp_path, engine=engine).is_empty
+    assert engine.works == []
+
+
+@pytest.mark.parametrize("variant", [None, Variant(fps=30)])
+def test_a_job_done_twice_is_done_once(
+    tmp_path: Path, painter: Painter, variant: Variant | None
+) -> None:
+    """The second time there is nothing to do, or the same file comes in its place."""
+    path = write_finished(tmp_path)
+    job = VideoJob(
+        directory=tmp_path,
+        recording=path.name,
+        variant=variant,
+        video=variant and tmp_path / "x.mp4",
+    )
+    assert VideoWorker()(job.as_json())["outcome"]["is_video"]
+    before = content_of(tmp_path)
+    again = VideoWorker()(job.as_json())["outcome"]
+    assert (again is None) == (variant is None)
+    assert content_of(tmp_path) == before
+
+
+def test_one_worker_serves_several_directories(
+    tmp_path: Path, painter: Painter
+) -> None:
+    """One after the other, and back."""
+    worker = VideoWorker()
+    for name, number in (("a", 0), ("b", 0), ("a", 1)):
+        (tmp_path / name).mkdir(exist_ok=True)
+        write_finished(tmp_path / name, number)
+        job = VideoJob.finishing(tmp_path / name, RecordingKey(INFIX, number))
+        assert worker(job.as_json())["outcome"]["is_video"]
+    worker.close()
+    assert len(list(tmp_path.glob("*/*.mp4"))) == 3
+
+
+def test_workers_get_what_rendering_needs(
+    tmp_path: Path, painter: Painter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One thread each, this user's models and trust, and where all see files."""
+    monkeypatch.setenv("MJREC_TRUST_MODELS", "1")
+    monkeypatch.delenv("LP_NUM_THREADS", raising=False)
+    monkeypatch.chdir(tmp_path)
+    write_finished(tmp_path)
+    digest = "0123456789abcdef" * 4
+    note_models([digest, digest[::-1]])
+    (tmp_path / f"openaigym.model.{digest[:16]}.mjb.gz").touch()
+    engine = Here()
+    render_videos(Path(), engine=engine)
+    [work] = engine.works
+    assert work.environ == {"LP_NUM_THREADS": "1", "MJREC_TRUST_MODELS": "1"}
+    assert work.settings == {"models": [digest]}
+    assert work.shared_directory == tmp_path
+    assert engine.jobs[0].arguments["directory"] == str(tmp_path)
+
+
+def test_who_stops_listening_ends_the_run(tmp_path: Path, painter: Painter) -> None:
+    """As Ctrl-C does; what is finished stays."""
+    for number in (0, 1):
+        write_finished(tmp_path, number)
+    engine = Here()
+
+    def interrupt(progress: Progress) -> None:
+        if progress.videos_done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_videos(tmp_path, engine=engine, on_progress=interrupt)
+    assert engine.is_cancelled
+    assert [path.name for path in tmp_path.glob("*.mp4")] == [f"{VIDEO}.mp4"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,9 @@ from trajectories_by_hand import INFIX, add_row, new_logs, write_log
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import Array, RowLayout, TrajectoryHeader
-from mjrec.formats.trajectory_file import finish_trajectory
+from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.drawing import Drawing, trajectory_drawing
+from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.views import View
 from mjrec.simulation.canvas import KeptCanvas
 from mjrec.simulation.renderer import SceneRenderer
@@ -37,30 +38,56 @@ def drawing(ride: Ride) -> Iterator[Drawing]:
     drawing.close()
 
 
-def test_pictures_are_those_that_were_seen(ride: Ride, drawing: Drawing) -> None:
-    """Byte for byte, over an infinite plane and through changes of the model."""
-    drawn = [drawing.draw(number) for number in range(FRAMES)]
+ORDER = [*range(FRAMES), *reversed(range(FRAMES)), 4, 4]
 
+
+@pytest.mark.parametrize("order", [range(FRAMES), ORDER, [0], [4], [FRAMES - 1]])
+def test_frames_are_those_that_were_seen(
+    ride: Ride, drawing: Drawing, order: Sequence[int]
+) -> None:
+    """In any order, byte for byte, over an infinite plane; the model changes back."""
+    if order is ORDER:
+        random.Random(0).shuffle(ORDER)
     assert drawing.size == (HEIGHT, WIDTH)
+    drawn = [drawing.draw(number) for number in order]
     assert all(frame.std() > 5 for frame in drawn)
-    assert np.array_equal(drawn, ride.frames)
-    assert len({frame.tobytes() for frame in drawn}) == FRAMES
+    assert np.array_equal(drawn, [ride.frames[number] for number in order])
+    for number in (FRAMES, -1):
+        with pytest.raises(InvalidArgument, match="there are 9"):
+            drawing.draw(number)
 
 
-def test_the_order_does_not_matter(ride: Ride, drawing: Drawing) -> None:
-    """Terrain and textures change back too, and the plane is where it was."""
-    order = [*range(FRAMES), *reversed(range(FRAMES)), 4, 4]
-    random.Random(0).shuffle(order)
-    for number in order:
-        assert np.array_equal(drawing.draw(number), ride.frames[number]), number
+def test_a_grid_is_what_each_camera_shows(ride: Ride, tmp_path: Path) -> None:
+    """Byte for byte, in any order; and so it is where the log has become HDF5."""
+    side = record(tmp_path, camera="side")
+    path = finish_trajectory(side.path)
+    cameras = [None, "rider", "side"]
+    with contextlib.closing(trajectory_drawing(path, View(), cameras=cameras)) as grid:
+        assert grid.size == (2 * HEIGHT, 2 * WIDTH)
+        for number in (*range(FRAMES), 3, 7, 0):
+            frame = grid.draw(number)
+            upper, lower = frame[:HEIGHT], frame[HEIGHT:]
+            np.testing.assert_array_equal(upper[:, :WIDTH], side.frames[number])
+            np.testing.assert_array_equal(upper[:, WIDTH:], ride.frames[number])
+            np.testing.assert_array_equal(lower[:, :WIDTH], side.frames[number])
+            assert not lower[:, WIDTH:].any()
 
 
-def test_a_picture_alone_is_the_same(ride: Ride) -> None:
-    """Also the first thing that is drawn."""
-    for number in (0, 4, FRAMES - 1):
-        drawing = trajectory_drawing(ride.path, View())
-        assert np.array_equal(drawing.draw(number), ride.frames[number])
-        drawing.close()
+@pytest.mark.thorough
+def test_a_camera_that_follows_does_not_depend_on_the_order(ride: Ride) -> None:
+    """Each frame moves it: those that another worker draws count too."""
+    tracking = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
+    view = View(
+        camera={"type": tracking, "trackbodyid": 1, "distance": 4, "elevation": -30}
+    )
+    with contextlib.closing(trajectory_drawing(ride.path, view)) as drawing:
+        frames = [drawing.draw(number) for number in range(FRAMES)]
+        for number in (4, 2, 8, 0, 0, 5, 7):
+            np.testing.assert_array_equal(drawing.draw(number), frames[number])
+    with WorkerPool(2) as workers:
+        drawn = list(workers.frames(ride.path, range(FRAMES), view))
+    np.testing.assert_array_equal(drawn, frames)
+    assert len({frame.tobytes() for frame in frames}) == FRAMES
 
 
 def test_the_plane_depends_on_the_picture_before(ride: Ride, tmp_path: Path) -> None:
@@ -100,43 +127,42 @@ def test_the_first_picture_comes_after_those_of_episodes_before(
 
 def test_the_context_is_kept_from_drawing_to_drawing(ride: Ride) -> None:
     """The first has changed its terrain, a texture and a plane; the next sees none."""
-    other = View(height=30, width=50, quality="draft")
+    other = View(height=30, quality="draft")
     with contextlib.closing(KeptCanvas()) as kept:
-        canvases = []
-        for view in (View(), View(), other, View()):
+        canvases = set()
+        for view in (View(), other, View()):
             drawing = trajectory_drawing(ride.path, view, kept=kept)
             drawn = [drawing.draw(number) for number in range(FRAMES)]
-            canvases.append(drawing._cameras[0].renderer._canvas)
+            canvases.add(id(drawing._cameras[0].renderer._canvas))
             drawing.close()
-            if view != other:
-                assert np.array_equal(drawn, ride.frames)
-    assert len(set(map(id, canvases))) == 1
+            # What is not asked for is as recorded.
+            assert drawn[0].shape == (view.height or HEIGHT, WIDTH, 3)
+            assert np.array_equal(drawn, ride.frames) == (view != other)
+    assert len(canvases) == 1
 
 
-def test_a_finished_recording_gives_the_same(ride: Ride, tmp_path: Path) -> None:
-    """HDF5 instead of the log."""
-    path = finish_trajectory(record(tmp_path).path)
-    drawing = trajectory_drawing(path, View())
-    drawn = [drawing.draw(number) for number in range(FRAMES)]
-    drawing.close()
-
-    assert path.suffix == ".h5"
-    assert np.array_equal(drawn, ride.frames)
+MEMBERS = {"lookat": [1, 0, 0.5], "distance": 3.0, "azimuth": 70, "elevation": -20}
 
 
-def test_another_view_takes_the_place_of_the_recorded_one(ride: Ride) -> None:
-    """Camera, size and quality; the visual options stay."""
-    view = View(camera="side", height=30, width=50, quality="draft")
-    drawing = trajectory_drawing(ride.path, view)
-    drawn = [drawing.draw(number) for number in (2, 0, 1)]
-    drawing.close()
-
+@pytest.mark.parametrize("camera", ["side", MEMBERS])
+def test_another_view_takes_the_place_of_the_recorded_one(
+    ride: Ride, camera: Any
+) -> None:
+    """Camera, by its name or its members, size and quality; visual options stay."""
+    view = View(camera=camera, height=30, width=50, quality="draft")
+    with contextlib.closing(trajectory_drawing(ride.path, view)) as drawing:
+        drawn = [drawing.draw(number) for number in (2, 0, 1)]
+    shown = camera
+    if isinstance(camera, dict):
+        shown = mujoco.MjvCamera()
+        for name, value in camera.items():
+            setattr(shown, name, value)
     model, data = start()
     with SceneRenderer(
         model,
         height=30,
         width=50,
-        camera="side",
+        camera=shown,
         scene_option=inertia_shown(),
         quality="draft",
     ) as renderer:
@@ -145,13 +171,6 @@ def test_another_view_takes_the_place_of_the_recorded_one(ride: Ride) -> None:
             move(model, data, number)
             expected.append(renderer.render(data))
     assert np.array_equal(drawn, [expected[2], expected[0], expected[1]])
-
-
-def test_one_side_alone_leaves_the_other_as_recorded(ride: Ride) -> None:
-    """None is as recorded, for each by itself."""
-    drawing = trajectory_drawing(ride.path, View(height=20))
-    assert drawing.draw(0).shape == (20, WIDTH, 3)
-    drawing.close()
 
 
 def test_the_recorded_quality_is_the_default(ride: Ride, tmp_path: Path) -> None:
@@ -166,24 +185,6 @@ def test_the_recorded_quality_is_the_default(ride: Ride, tmp_path: Path) -> None
     assert np.array_equal(pictures[None], pictures["draft"])
     assert not np.array_equal(pictures[None], pictures["full"])
     assert np.array_equal(pictures["full"], ride.frames[1])
-
-
-def test_a_camera_by_its_members(ride: Ride) -> None:
-    """What an `MjvCamera` holds, as JSON has it."""
-    members = {"lookat": [1, 0, 0.5], "distance": 3.0, "azimuth": 70, "elevation": -20}
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = members["lookat"]
-    camera.distance, camera.azimuth, camera.elevation = 3, 70, -20
-    model, data = start()
-    move(model, data, 0)
-    with SceneRenderer(
-        model, height=HEIGHT, width=WIDTH, camera=camera, scene_option=inertia_shown()
-    ) as renderer:
-        expected = renderer.render(data)
-
-    drawing = trajectory_drawing(ride.path, View(camera=members))
-    assert np.array_equal(drawing.draw(0), expected)
-    drawing.close()
 
 
 @pytest.mark.parametrize(
@@ -202,44 +203,31 @@ def test_a_camera_that_the_model_lacks(ride: Ride, camera: Any, message: str) ->
         trajectory_drawing(ride.path, View(camera=camera))
 
 
-def test_a_picture_that_is_not_there(drawing: Drawing) -> None:
-    """It says how many there are."""
-    for number in (FRAMES, -1):
-        with pytest.raises(InvalidArgument, match="there are 9"):
-            drawing.draw(number)
-
-
-def test_a_trajectory_without_snapshots(tmp_path: Path) -> None:
-    """The reason of the recording is told, and another way."""
-    facts = {"scene": None, "refusal": "a plugin draws"}
-    path = write_log(tmp_path, frames=False, **facts)
-
-    with pytest.raises(NoPictures, match=r"a plugin draws.*render_states"):
-        trajectory_drawing(path, View())
-
-
-def test_a_missing_model_is_named(tmp_path: Path) -> None:
-    """It lies beside the recording, and may have been left behind."""
-    ride = record(tmp_path)
-    [model] = tmp_path.glob("openaigym.model.*")
-    model.unlink()
-    with pytest.raises(UnreadableFile, match=r"openaigym\.model\."):
-        trajectory_drawing(ride.path, View())
-
-
 @pytest.mark.parametrize(
     "facts",
     [
         {"scene": {"camera": 3}},
         {"model": None},
         {"model": {"sha256": "0", "mjb": "../../etc/passwd"}},
+        {},
     ],
 )
-def test_facts_that_cannot_be(tmp_path: Path, facts: dict[str, Any]) -> None:
-    """A file may be hostile: one error that names it."""
+def test_what_cannot_be_drawn_is_one_clear_error(
+    tmp_path: Path, facts: dict[str, Any]
+) -> None:
+    """A file may be hostile; its model may have been left behind."""
     ride = record(tmp_path, facts=facts)
-    with pytest.raises(UnreadableFile, match="Cannot read"):
+    if not facts:
+        next(tmp_path.glob("openaigym.model.*")).unlink()
+    with pytest.raises(UnreadableFile, match=r"Cannot read.*(h5|model\.)"):
         trajectory_drawing(ride.path, View())
+
+
+def test_a_trajectory_without_snapshots(tmp_path: Path) -> None:
+    """The reason of the recording is told, and another way."""
+    path = write_log(tmp_path, frames=False, scene=None, refusal="a plugin draws")
+    with pytest.raises(NoPictures, match=r"a plugin draws.*render_states"):
+        trajectory_drawing(path, View())
 
 
 @parametrize(
@@ -298,8 +286,6 @@ def test_a_view_is_checked_when_it_is_made() -> None:
 
 
 def header_of(ride: Ride) -> TrajectoryHeader:
-    from mjrec.formats.trajectory_file import open_trajectory
-
     with open_trajectory(ride.path) as reader:
         return reader.header
 

@@ -23,7 +23,14 @@ from parts import parametrize
 from recordings import frames_of, metadata_of
 from trajectories_by_hand import Painter, write_log, write_pending_manifest
 
-from mjrec import BlankVideo, FileNotWritten, Monitor, RenderError, VideoRecorder
+from mjrec import (
+    BlankVideo,
+    FileNotWritten,
+    Monitor,
+    RenderError,
+    VideoRecorder,
+    render_videos,
+)
 from mjrec.formats.ffmpeg import ffmpeg_executable
 from mjrec.formats.in_flight import recordings_in_flight
 from mjrec.formats.trajectory_file import (
@@ -32,22 +39,13 @@ from mjrec.formats.trajectory_file import (
     open_trajectory,
 )
 from mjrec.formats.video_metadata import metadata_path
-from mjrec.rendering import shared_pool
-from mjrec.rendering.directory_videos import render_videos
-from mjrec.rendering.finishing import finish_pending
-from mjrec.rendering.outcomes import Outcome
-from mjrec.rendering.pending import recorded_episodes
+from mjrec.rendering import finish as module
+from mjrec.rendering.jobs import Outcome
+from mjrec.rendering.progress import Progress
+from mjrec.rendering.recordings import recorded_episodes
 
 VIDEO = "openaigym.video.0.7.video00000{}.mp4"
 FRAMES = 5
-
-
-@pytest.fixture
-def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
-    """Draw without processes and without OpenGL; the encoder is the real one."""
-    painter = Painter()
-    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
-    return painter
 
 
 @pytest.fixture
@@ -62,8 +60,9 @@ def two(tmp_path: Path, painter: Painter) -> Path:
     return directory
 
 
-def finish(directory: Path) -> list[Outcome]:
-    return list(finish_pending(directory, recorded_episodes(directory), workers=1))
+def finish(directory: Path, **options: Any) -> list[Outcome]:
+    keys = recorded_episodes(directory)
+    return list(module.finish(directory, keys, workers=1, **options))
 
 
 def reasons_in(directory: Path) -> dict[str, str | None]:
@@ -84,7 +83,7 @@ def check_nothing_is_half(directory: Path) -> None:
     for path in directory.glob("*.json"):
         assert json.loads(path.read_text())
     for key in recorded_episodes(directory):
-        path = find_trajectory(directory, key.infix, key.episode_id)
+        path = find_trajectory(directory, key.infix, key.number)
         assert path is not None
         with open_trajectory(path) as reader:
             assert reader.frame_count == FRAMES
@@ -127,10 +126,8 @@ def test_a_killed_encoder_gets_a_second_try(
     flag = tmp_path / "killed"
     once = f"if mkdir {flag} 2>/dev/null; then {KILLED}; fi"
     use_encoder(tmp_path, monkeypatch, of="video000000", instead=once)
-    told = []
-    outcomes = list(
-        finish_pending(two, recorded_episodes(two), workers=1, on_progress=told.append)
-    )
+    told: list[Progress] = []
+    outcomes = finish(two, on_progress=told.append)
     assert flag.exists()
     assert [outcome.failure for outcome in outcomes] == [None, None]
     assert "begun anew" in caplog.text

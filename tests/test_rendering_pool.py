@@ -5,36 +5,41 @@ import contextlib
 import gc
 import logging
 import os
+import re
 import select
 import signal
 import subprocess
 import sys
 import textwrap
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from interruption import ctrl_c_soon
+from parts import parametrize
 from processes import children
 from rides import FRAMES, HEIGHT, WIDTH, Ride, record
 
-import mjrec
 from mjrec import child_python
 from mjrec.carried_errors import carried, unpacked
 from mjrec.child_python import Child, environment_of_child
 from mjrec.errors import (
     ClosedError,
+    DirectoryNotWritable,
     Error,
     GLError,
     InvalidArgument,
     UnknownName,
     UnreadableFile,
 )
+from mjrec.formats.locks import Lock, try_lock
+from mjrec.formats.monitor_directory import render_lock_name
 from mjrec.gl import Probe, choice
+from mjrec.rendering import shared_pool
 from mjrec.rendering.pool import WorkerPool, _environment
+from mjrec.rendering.shared_pool import SharedPool
 from mjrec.rendering.views import View
 
 
@@ -87,49 +92,46 @@ def use_process(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
 # In order, whoever draws
 
 
-def test_one_worker_gives_what_was_seen(ride: Ride, one: WorkerPool) -> None:
-    """Byte for byte."""
-    assert np.array_equal(list(one.frames(ride.path, range(FRAMES))), ride.frames)
+@pytest.mark.parametrize("indices", [range(FRAMES), [8, 0, 0, 3, 7, 2, 2, 8]])
+def test_any_workers_give_what_was_seen(
+    ride: Ride, one: WorkerPool, three: WorkerPool, indices: Sequence[int]
+) -> None:
+    """Byte for byte, over an infinite plane, whose place depends on the frame before.
 
-
-def test_three_workers_give_the_same(ride: Ride, three: WorkerPool) -> None:
-    """Over an infinite plane, whose place depends on the picture before."""
-    drawn = list(three.frames(ride.path, range(FRAMES), View()))
-
+    In any order, also repeated; and who draws is known from the first frame on.
+    """
+    expected = [ride.frames[index] for index in indices]
+    assert np.array_equal(list(one.frames(ride.path, indices)), expected)
+    assert np.array_equal(list(three.frames(ride.path, indices, View())), expected)
     assert len(pids(three)) == 3
-    assert np.array_equal(drawn, ride.frames)
-
-
-@pytest.mark.thorough
-def test_more_frames_than_are_buffered(ride: Ride, three: WorkerPool) -> None:
-    """Each worker waits until its frames are taken; none takes another's turn."""
-    indices = [number % FRAMES for number in range(70)]
-
-    for frame, index in zip(three.frames(ride.path, indices), indices, strict=True):
-        assert np.array_equal(frame, ride.frames[index])
-
-
-def test_any_order_and_repetition(ride: Ride, three: WorkerPool) -> None:
-    """As asked for."""
-    indices = [8, 0, 0, 3, 7, 2, 2, 8]
-    drawn = list(three.frames(ride.path, indices))
-    assert np.array_equal(drawn, [ride.frames[index] for index in indices])
-
-
-def test_pictures_are_the_callers_to_keep(ride: Ride, one: WorkerPool) -> None:
-    """Nothing is drawn over them, and they may be written to."""
-    frames = one.frames(ride.path, [0] * 12)
-    first = next(frames)
-    first[:] = 1
-    assert all(np.array_equal(frame, ride.frames[0]) for frame in frames)
-    assert (first == 1).all()
+    strings = {"gl_vendor", "gl_renderer", "gl_version"}
+    assert three.gl_facts.keys() - {"gl_device"} == strings
+    assert os.getpriority(os.PRIO_PROCESS, pids(one)[0]) == 10
 
 
 def test_few_frames_are_kept_here(ride: Ride, three: WorkerPool) -> None:
     """However slow the caller is: two of each worker, besides what its pipe holds."""
-    frames = three.frames(ride.path, [number % FRAMES for number in range(60)])
-    for _ in frames:
+    indices = [number % FRAMES for number in range(60)]
+    kept = []
+    for index, frame in zip(indices, three.frames(ride.path, indices), strict=True):
+        assert np.array_equal(frame, ride.frames[index])
+        # They are the caller's to keep, and to write to.
+        frame[:] = 1
+        kept.append(frame)
         assert all(len(worker.arrived) <= 2 for worker in three._workers)
+    assert all((frame == 1).all() for frame in kept)
+
+
+def test_workers_stay_and_go_over_to_other_views(ride: Ride, three: WorkerPool) -> None:
+    """Larger and smaller frames through the same pipes; also if some are dropped."""
+    list(three.frames(ride.path, range(5)))
+    before = pids(three)
+    for height in (20, 90):
+        for frame in three.frames(ride.path, range(5), View(height=height)):
+            assert frame.shape == (height, WIDTH, 3)
+    assert pids(three) == before
+    next(three.frames(ride.path, range(FRAMES)))
+    assert np.array_equal(list(three.frames(ride.path, [5])), [ride.frames[5]])
 
 
 def test_no_pictures_are_no_work() -> None:
@@ -140,30 +142,10 @@ def test_no_pictures_are_no_work() -> None:
     assert new == []
 
 
-@pytest.mark.thorough
-def test_workers_stay_and_go_over_to_other_views(ride: Ride, three: WorkerPool) -> None:
-    """Larger and smaller frames through the same pipes."""
-    before = pids(three)
-    for height in (20, 90, 48):
-        for frame in three.frames(ride.path, range(5), View(height=height)):
-            assert frame.shape == (height, WIDTH, 3)
-    assert np.array_equal(list(three.frames(ride.path, [5])), [ride.frames[5]])
-    assert pids(three) == before
-
-
-def test_the_driver_is_told(ride: Ride, three: WorkerPool) -> None:
-    """Who draws is known from the first picture on."""
-    frames = three.frames(ride.path, [0])
-    strings = {"gl_vendor", "gl_renderer", "gl_version"}
-    assert three.gl_facts.keys() - {"gl_device"} == strings
-    assert three.gl_facts["gl_renderer"]
-    list(frames)
-
-
 # What goes wrong
 
 
-def test_errors_are_raised_by_the_call(ride: Ride, three: WorkerPool) -> None:
+def test_errors_come_at_their_place(ride: Ride, three: WorkerPool) -> None:
     """The same class and facts as in the worker; the workers go on."""
     with pytest.raises(UnknownName, match="no camera 'sid'") as caught:
         three.frames(ride.path, range(FRAMES), View(camera="sid"))
@@ -171,17 +153,25 @@ def test_errors_are_raised_by_the_call(ride: Ride, three: WorkerPool) -> None:
     with pytest.raises(UnreadableFile) as lost:
         three.frames(ride.path.with_name("lost.h5"), range(4))
     assert lost.value.path == ride.path.with_name("lost.h5")
+    frames = three.frames(ride.path, [0, 1, 2, 3, 99])
+    assert np.array_equal([next(frames) for _ in range(4)], ride.frames[:4])
+    with pytest.raises(InvalidArgument, match="no picture 99"):
+        next(frames)
     assert np.array_equal(list(three.frames(ride.path, [3])), [ride.frames[3]])
 
 
-def test_an_error_comes_at_its_place(ride: Ride, three: WorkerPool) -> None:
-    """The pictures before it are given."""
-    frames = three.frames(ride.path, [0, 1, 2, 3, 99])
-    assert [np.array_equal(next(frames), ride.frames[n]) for n in range(4)] == [
-        True
-    ] * 4
-    with pytest.raises(InvalidArgument, match="no picture 99"):
-        next(frames)
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        ({"type": "Path", "message": "no"}, "^no$"),
+        (carried(KeyError("qpos")), r"nobody foresaw.\nKeyError: 'qpos'"),
+    ],
+)
+def test_errors_are_carried_without_pickle(error: Any, message: str) -> None:
+    """A class that there is not is just an error, and ours to mend."""
+    told = unpacked(error)
+    assert type(told) is Error
+    assert re.search(message, str(told))
 
 
 def test_a_killed_worker_is_replaced(
@@ -198,28 +188,6 @@ def test_a_killed_worker_is_replaced(
 
     assert np.array_equal(drawn, [ride.frames[index] for index in indices])
     assert "killed by SIGKILL" in caplog.text
-
-
-def test_a_worker_that_dies_twice_is_an_error(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It names the signal, the file and what the worker said."""
-    use_process(
-        monkeypatch,
-        """
-        import os, signal, sys
-        sys.stdin.readline()
-        print("llvm: out of registers", file=sys.stderr, flush=True)
-        os.kill(os.getpid(), signal.SIGSEGV)
-        """,
-    )
-    with (
-        WorkerPool(2) as pool,
-        pytest.raises(Error, match=r"(?s)SIGSEGV.*out of registers") as caught,
-    ):
-        pool.frames(ride.path, range(FRAMES))
-
-    assert str(ride.path) in str(caught.value)
 
 
 @pytest.fixture
@@ -295,25 +263,6 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
 
 
 @pytest.mark.thorough
-def test_a_worker_that_was_stopped_hangs(
-    ride: Ride,
-    be_impatient: Callable[[WorkerPool], None],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """Of two, the other one draws on; the stopped one can still say where it was."""
-    indices = [number % FRAMES for number in range(40)]
-    with WorkerPool(2) as pool:
-        frames = pool.frames(ride.path, indices)
-        drawn = [next(frames)]
-        os.kill(pids(pool)[0], signal.SIGSTOP)
-        be_impatient(pool)
-        drawn += frames
-    assert np.array_equal(drawn, [ride.frames[index] for index in indices])
-    assert caplog.text.count("A drawing worker hangs") == 1
-    assert "in main" in caplog.text
-
-
-@pytest.mark.thorough
 def test_a_slow_worker_does_not_hang(
     ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -339,25 +288,53 @@ def test_a_slow_worker_does_not_hang(
     assert not caplog.records
 
 
-def test_a_crash_says_where(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The end of what a worker says has Python's stack."""
+def test_a_worker_that_dies_twice_is_an_error(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It names the signal, the file, and what the worker said, with Python's stack."""
     use_process(
         monkeypatch,
         """
-        import os, signal
+        import os, signal, sys
         import mjrec.rendering.worker as worker
         from mjrec.rendering import drawing
         def crash_in_the_driver(*arguments, **options):
+            print("llvm: out of registers", file=sys.stderr, flush=True)
             os.kill(os.getpid(), signal.SIGSEGV)
         drawing.Drawing.draw = crash_in_the_driver
         worker.main()
         """,
     )
-    with (
-        WorkerPool(1) as pool,
-        pytest.raises(Error, match=r"(?s)SIGSEGV.*in crash_in_the_driver"),
-    ):
+    words = r"(?s)SIGSEGV.*out of registers.*in crash_in_the_driver"
+    with WorkerPool(2) as pool, pytest.raises(Error, match=words) as caught:
         pool.frames(ride.path, range(FRAMES))
+    assert str(ride.path) in str(caught.value)
+
+
+def test_what_a_worker_says_is_heard(
+    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Warnings are logged here; what a driver prints is not, however much."""
+    use_process(
+        monkeypatch,
+        """
+        import logging, os
+        import mjrec.rendering.worker as worker
+        from mjrec.rendering import drawing
+        draw = drawing.Drawing.draw
+        def loud(*arguments, **options):
+            os.write(1, b"x" * 100_000)
+            print("a driver speaks")
+            logging.getLogger("x").error("no %s", "GPU")
+            return draw(*arguments, **options)
+        drawing.Drawing.draw = loud
+        worker.main()
+        """,
+    )
+    with WorkerPool(1) as pool:
+        assert np.array_equal(list(pool.frames(ride.path, range(4))), ride.frames[:4])
+    levels = {r.getMessage(): r.levelno for r in caplog.records}
+    assert levels == {"no GPU": logging.ERROR}
 
 
 def test_a_worker_that_cannot_be_started(
@@ -369,47 +346,6 @@ def test_a_worker_that_cannot_be_started(
         pool.frames(ride.path, range(FRAMES))
 
 
-def test_what_a_driver_prints_does_not_disturb(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neither on the standard output nor as much of it as no pipe holds."""
-    use_process(
-        monkeypatch,
-        """
-        import os, sys
-        import mjrec.rendering.worker as worker
-        from mjrec.rendering import drawing
-        draw = drawing.Drawing.draw
-        def loud(*arguments, **options):
-            os.write(1, b"x" * 100_000)
-            print("a driver speaks")
-            return draw(*arguments, **options)
-        drawing.Drawing.draw = loud
-        worker.main()
-        """,
-    )
-    with WorkerPool(1) as pool:
-        assert np.array_equal(list(pool.frames(ride.path, range(4))), ride.frames[:4])
-
-
-def test_errors_that_nobody_foresaw_keep_their_traceback() -> None:
-    """They are ours to mend."""
-    try:
-        raise KeyError("qpos")
-    except KeyError as error:
-        told = unpacked(carried(error))
-
-    assert type(told) is Error
-    assert "test_rendering_pool.py" in str(told)
-    assert "KeyError: 'qpos'" in str(told)
-
-
-def test_errors_are_carried_without_pickle() -> None:
-    """A class that there is not is just an error."""
-    told = unpacked({"type": "Path", "message": "no"})
-    assert (type(told), str(told)) == (Error, "no")
-
-
 @pytest.mark.parametrize("count", [0, -1, 1.5, True, "2"])
 def test_a_number_of_workers_that_cannot_be(count: Any) -> None:
     """One error before anything is started."""
@@ -418,20 +354,6 @@ def test_a_number_of_workers_that_cannot_be(count: Any) -> None:
 
 
 # Their life
-
-
-@pytest.mark.thorough
-def test_dropping_the_iterator_leaves_the_workers_usable(
-    ride: Ride, three: WorkerPool
-) -> None:
-    """What was ordered and is not wanted any more does not come."""
-    for _ in range(3):
-        for number, frame in enumerate(three.frames(ride.path, range(FRAMES))):
-            assert np.array_equal(frame, ride.frames[number])
-            if number == 1:
-                break
-    backwards = list(three.frames(ride.path, range(FRAMES - 1, -1, -1)))
-    assert np.array_equal(backwards, ride.frames[::-1])
 
 
 def test_a_later_call_takes_the_workers_over(ride: Ride, three: WorkerPool) -> None:
@@ -497,21 +419,13 @@ def test_a_worker_ends_with_its_input_in_mid_drawing(
     del frames
 
 
-def test_workers_are_nice(ride: Ride, one: WorkerPool) -> None:
-    """They give way to the simulation."""
-    list(one.frames(ride.path, [0]))
-    [pid] = pids(one)
-    assert os.getpriority(os.PRIO_PROCESS, pid) == 10
-
-
 # Wherever the caller is
 
 CALLER = """
 import os, sys
 import numpy as np
 from pathlib import Path
-from mjrec.gl import Probe, choice
-from mjrec.rendering.pool import WorkerPool, _environment
+from mjrec.rendering.pool import WorkerPool
 with WorkerPool(2) as pool:
     frames = list(pool.frames(Path(os.environ["RIDE"]), range(9)))
 print(len(frames), sum(int(frame.sum()) for frame in frames))
@@ -537,26 +451,7 @@ def said(ride: Ride) -> str:
     return f"{FRAMES} {sum(int(frame.sum()) for frame in ride.frames)}\n"
 
 
-@pytest.mark.thorough
-def test_from_standard_input(ride: Ride) -> None:
-    """`python -` has no main module that could be imported."""
-    done = run(["-"], ride, text=CALLER)
-    assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
-
-
-def test_from_a_script_without_a_guard(ride: Ride, tmp_path: Path) -> None:
-    """It runs once, and what lies beside it is not taken for Python's own modules."""
-    (tmp_path / "script.py").write_text(CALLER)
-    (tmp_path / "mujoco.py").write_text("raise RuntimeError('not this one')")
-    done = run([str(tmp_path / "script.py")], ride)
-    assert "not this one" not in done.stderr
-    assert (done.returncode, done.stdout) == (0, said(ride))
-
-
-@pytest.mark.thorough
-def test_from_a_daemonic_process(ride: Ride) -> None:
-    """Which may have no children of multiprocessing's."""
-    script = f"""
+DAEMONIC = f"""
 import multiprocessing
 def work():
     exec({CALLER!r})
@@ -566,20 +461,32 @@ if __name__ == "__main__":
     process.join()
     raise SystemExit(process.exitcode)
 """
-    done = run(["-c", script], ride)
-    assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
+THREAD = f"""
+import threading
+thread = threading.Thread(target=exec, args=[{CALLER!r}, {{}}])
+thread.start()
+thread.join()
+"""
 
 
-@pytest.mark.thorough
-def test_from_a_thread(ride: Ride, one: WorkerPool) -> None:
-    """Any thread, one at a time."""
-    drawn: list[Any] = []
-    thread = threading.Thread(
-        target=lambda: drawn.extend(one.frames(ride.path, range(FRAMES)))
+@parametrize(
+    ("way", "code"),
+    [
+        *(("script", CALLER), ("stdin", CALLER), ("command", DAEMONIC)),
+        ("command", THREAD),
+    ],
+)
+def test_any_program_can_have_workers(
+    way: str, code: str, ride: Ride, tmp_path: Path
+) -> None:
+    """A script without a guard runs once, and what lies beside it is not Python's."""
+    (tmp_path / "script.py").write_text(code)
+    (tmp_path / "mujoco.py").write_text("raise RuntimeError('not this one')")
+    argument = {"script": [str(tmp_path / "script.py")], "stdin": ["-"]}
+    done = run(
+        argument.get(way, ["-c", code]), ride, text=code if way == "stdin" else None
     )
-    thread.start()
-    thread.join()
-    assert np.array_equal(drawn, ride.frames)
+    assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
 
 
 def test_a_killed_parent_leaves_no_workers(ride: Ride) -> None:
@@ -587,8 +494,7 @@ def test_a_killed_parent_leaves_no_workers(ride: Ride) -> None:
     script = """
 import os, signal, sys, time
 from pathlib import Path
-from mjrec.gl import Probe, choice
-from mjrec.rendering.pool import WorkerPool, _environment
+from mjrec.rendering.pool import WorkerPool
 pool = WorkerPool(2)
 frames = pool.frames(Path(os.environ["RIDE"]), range(9))
 if not os.fork():
@@ -623,23 +529,6 @@ os.kill(os.getpid(), signal.SIGKILL)
     os.close(writing)
     os.close(reading)
     process.stdout.close()
-
-
-@pytest.mark.thorough
-def test_leaving_in_mid_drawing_is_silent(ride: Ride) -> None:
-    """At interpreter exit the workers end, and nothing waits for them."""
-    script = """
-import os
-from pathlib import Path
-from mjrec.gl import Probe, choice
-from mjrec.rendering.pool import WorkerPool, _environment
-pool = WorkerPool(2)
-frames = pool.frames(Path(os.environ["RIDE"]), [0] * 1000)
-next(frames)
-print("end")
-"""
-    done = run(["-W", "error", "-c", script], ride)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "end\n", "")
 
 
 # What draws
@@ -725,29 +614,6 @@ def test_a_setting_that_crashes_mesa_is_left_out(
     assert "LP_NATIVE_VECTOR_WIDTH" in caplog.text
 
 
-def test_warnings_of_workers_are_logged_here(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """With their level."""
-    use_process(
-        monkeypatch,
-        """
-        import logging
-        from mjrec.rendering import worker
-        open_drawing = worker.open_drawing
-        def open_and_warn(*arguments):
-            logging.getLogger("x").error("no %s", "GPU")
-            return open_drawing(*arguments)
-        worker.open_drawing = open_and_warn
-        worker.main()
-        """,
-    )
-    with WorkerPool(1) as pool:
-        list(pool.frames(ride.path, [0]))
-    levels = {r.getMessage(): r.levelno for r in caplog.records}
-    assert levels["no GPU"] == logging.ERROR
-
-
 def test_workers_find_what_their_parent_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     """The main script's directory last, everything else in its order."""
     main = sys.modules["__main__"]
@@ -758,18 +624,133 @@ def test_workers_find_what_their_parent_finds(monkeypatch: pytest.MonkeyPatch) -
     assert found == {"A": "1", "PYTHONPATH": f"/b:{relative}:/scripts"}
 
 
-@pytest.mark.thorough
-def test_a_parent_that_found_mjrec_by_itself(ride: Ride, tmp_path: Path) -> None:
-    """By a change of `sys.path`, in a Python that looks nowhere else."""
-    package = Path(mjrec.__file__).parent
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / "mjrec").symlink_to(package)
-    script = f"""
-import sys
-sys.path.insert(0, {str(tmp_path / "elsewhere")!r})
-{CALLER}
-import mjrec
-assert "elsewhere" in mjrec.__file__
+# CPUs, shared by all that render into a directory
+
+# Takes what is free of the two CPUs of argv[1], says how many, and waits.
+HOLDER = """
+import pathlib, sys
+from mjrec.rendering import shared_pool
+shared_pool.usable_cpus = lambda: 2
+shared = shared_pool.SharedPool(pathlib.Path(sys.argv[1]), workers=None)
+print(shared.at_work().limit, flush=True)
+sys.stdin.read()
 """
-    done = run(["-c", script], ride)
-    assert (done.returncode, done.stdout, done.stderr) == (0, said(ride), "")
+
+
+class Waited(Exception):
+    """Stands for a wait without an end."""
+
+
+def raise_waited(seconds: float) -> None:
+    raise Waited
+
+
+@pytest.fixture
+def two_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the machine have two CPUs."""
+    monkeypatch.setattr(shared_pool, "usable_cpus", lambda: 2)
+
+
+def pool_of(
+    directory: Path, wait: Callable[[float], object] = raise_waited
+) -> SharedPool:
+    return SharedPool(directory, workers=None, wait=wait)
+
+
+def hold_one(directory: Path) -> Lock:
+    """Take a CPU, as somebody else does on a machine with one."""
+    lock = try_lock(directory / render_lock_name(0), "1\n")
+    assert lock is not None
+    return lock
+
+
+@pytest.mark.usefixtures("two_cpus")
+def test_all_that_is_free_is_taken(
+    tmp_path: Path, names: Callable[[Path], list[str]]
+) -> None:
+    """By the first comer, and given back; a number of workers waits for nobody."""
+    other = hold_one(tmp_path)
+    first, second = pool_of(tmp_path), pool_of(tmp_path)
+    assert first.at_work().limit == 1
+    other.release()
+    assert first.at_work().limit == 2
+    assert names(tmp_path) == [f".openaigym.render.{k}.lock" for k in (0, 1)]
+    with pytest.raises(Waited):
+        second.at_work()
+    assert SharedPool(tmp_path, workers=3, wait=raise_waited).at_work().limit == 3
+    first.rest()
+    assert second.at_work().limit == 2
+    second.close()
+    assert names(tmp_path) == []
+
+
+@pytest.mark.usefixtures("two_cpus")
+def test_one_who_has_none_waits_for_the_first(tmp_path: Path) -> None:
+    """However long it takes."""
+    first = pool_of(tmp_path)
+    first.at_work()
+    waits: list[float] = []
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        if len(waits) == 3:
+            first.rest()
+
+    assert pool_of(tmp_path, wait).at_work().limit == 2
+    assert len(waits) == 3
+
+
+@pytest.mark.usefixtures("two_cpus")
+def test_the_cpus_of_a_dead_process_are_free(tmp_path: Path) -> None:
+    """Though its files are still there."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"2\n"
+        with pytest.raises(Waited):
+            pool_of(tmp_path).at_work()
+        holder.kill()
+    assert pool_of(tmp_path).at_work().limit == 2
+
+
+@pytest.mark.usefixtures("two_cpus")
+def test_workers_can_be_started_before_there_is_work(tmp_path: Path) -> None:
+    """As many as CPUs are free, which others may use until there is work."""
+    before = children()
+    pool = pool_of(tmp_path)
+    pool.start()
+    pool.start()
+    started = children() - before
+    assert len(started) == 2
+    assert pool_of(tmp_path).at_work().limit == 2
+    pool.close()
+    assert children() == before
+
+
+@pytest.mark.usefixtures("two_cpus")
+def test_workers_stay_while_cpus_come_and_go(tmp_path: Path) -> None:
+    """Others take one between two videos; nobody starts the workers anew."""
+    ride = record(tmp_path)
+    before = children()
+    shared = pool_of(tmp_path)
+    list(shared.at_work().frames(ride.path, range(4)))
+    both = children() - before
+    assert len(both) == 2
+    shared.rest()
+    other = hold_one(tmp_path)
+    alone = list(shared.at_work().frames(ride.path, range(4)))
+    other.release()
+    together = list(shared.at_work().frames(ride.path, range(4)))
+    assert children() - before == both
+    assert np.array_equal(alone, together)
+    shared.close()
+    assert children() == before
+
+
+def test_a_directory_that_is_gone(tmp_path: Path) -> None:
+    """It is one clear error."""
+    with pytest.raises(DirectoryNotWritable):
+        pool_of(tmp_path / "gone").at_work()

@@ -25,8 +25,8 @@ from mjrec.evaluation.settling import settle, unsettled_monitors
 from mjrec.evidence.verification import Verdict
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.recorder.selection import UNDECIDED
-from mjrec.rendering.finishing import finish_pending
-from mjrec.rendering.pending import recorded_episodes
+from mjrec.rendering.finish import finish
+from mjrec.rendering.recordings import recorded_episodes
 
 RULE = "best"
 
@@ -152,7 +152,7 @@ def test_trajectories_that_are_final_already_are_settled_too(
 
 
 @pytest.mark.parametrize(
-    "step", ["add_facts", "finish_log", "write_manifest", "update_manifest"]
+    "step", ["add_facts", "finish_trajectory", "_journal_choice", "write_listing"]
 )
 @pytest.mark.parametrize("times", [0, 1])
 def test_it_goes_on_where_it_was_killed(
@@ -177,7 +177,7 @@ def test_it_goes_on_where_it_was_killed(
 def test_the_videos_are_rendered_of_what_was_chosen(folder: Path) -> None:
     """Manifest and metadata say so, and nothing is pending any more."""
     best = settle_best(folder)
-    outcomes = list(finish_pending(folder, recorded_episodes(folder), workers=1))
+    outcomes = list(finish(folder, recorded_episodes(folder), workers=1))
     assert [outcome.failure for outcome in outcomes] == [None]
     assert videos_in(folder) == [best.episode_id]
     assert all(not each["pending"] for each in manifests_of(folder).values())
@@ -189,18 +189,18 @@ def test_a_video_that_somebody_has_rendered_meanwhile_stays(folder: Path) -> Non
     """What is there is listed, chosen or not."""
     best = best_of(folder)
     other = next(key for key in recorded_episodes(folder) if _is_not(key, best))
-    list(finish_pending(folder, [other], workers=1))
+    list(finish(folder, [other], workers=1))
     settle_best(folder)
     details = manifests_of(folder)[str(other.infix)]
-    assert other.episode_id in details["schedule"]["recorded"]
-    assert other.episode_id not in [each["episode_id"] for each in details["pending"]]
-    assert videos_in(folder) == [other.episode_id]
+    assert other.number in details["schedule"]["recorded"]
+    assert other.number not in [each["episode_id"] for each in details["pending"]]
+    assert videos_in(folder) == [other.number]
     name = f"openaigym.manifest.{other.infix}.manifest.json"
     assert len(json.loads((folder / name).read_text())["videos"]) == 1
 
 
 def _is_not(key: Any, best: EpisodeResult) -> bool:
-    return (str(key.infix), key.episode_id) != (best.monitor, best.episode_id)
+    return (str(key.infix), key.number) != (best.monitor, best.episode_id)
 
 
 def test_a_monitor_that_is_open_is_left_alone(folder: Path) -> None:
@@ -289,7 +289,7 @@ def test_a_settled_folder_can_be_packed_and_verified(
 ) -> None:
     """Nothing fails; who chose among all monitors' episodes is not proved."""
     settle_best(folder)
-    list(finish_pending(folder, recorded_episodes(folder), workers=1))
+    list(finish(folder, recorded_episodes(folder), workers=1))
     archive = tmp_path / "run.zip"
     mjrec.pack(folder, archive)
     checks = mjrec.verify(archive, level="stats").checks

@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -424,6 +425,44 @@ def test_a_full_disk_leaves_the_log_and_nothing_else(path: Path, room: int) -> N
         pytest.raises(FileNotWritten, match=r"\.h5: File too large"),
     ):
         finish_trajectory(path)
+    assert not [name for name in path.parent.iterdir() if ".states." not in name.name]
+    finish_trajectory(path)
+
+
+def write_long(path: Path) -> None:
+    """Write 24 MB of frames that cannot be compressed."""
+    frames = RowLayout.packed([("geom_xpos", Array("<f8", (5000,)))])
+    write(path, 600, every=1, header=dataclasses.replace(HEADER, snapshot=frames))
+
+
+def test_memory_does_not_grow_with_the_episode(path: Path) -> None:
+    """What was written is in the file, and not in memory as well."""
+    write_long(path)
+    tracemalloc.start()
+    try:
+        finish_trajectory(path)
+        assert tracemalloc.get_traced_memory()[1] < 16e6 < path.stat().st_size
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_ctrl_c_leaves_the_log_and_nothing_else(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also between HDF5 and its file, where an exception would crash it."""
+    write_long(path)
+    unfailing = trajectory_hdf5._Unfailing
+
+    def interrupted(self: Any, data: Any) -> int:
+        signal.raise_signal(signal.SIGINT)
+        return usual(self, data)
+
+    usual = unfailing.write
+    monkeypatch.setattr(unfailing, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        finish_trajectory(path)
+    monkeypatch.undo()
     assert not [name for name in path.parent.iterdir() if ".states." not in name.name]
     finish_trajectory(path)
 

@@ -8,7 +8,7 @@ its snapshots, with a white pixel in a corner.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +36,18 @@ def grey(frame: int) -> int:
 
 
 class Painter:
-    """Draws pictures of trajectories of this module, as `WorkerPool` would.
+    """Draws frames of trajectories of this module, as `WorkerPool` would.
+
+    Those of a camera that was asked for are a little brighter.
 
     Args:
-        size: of the pictures.
+        size: of the frames.
         plain: whether to leave the white pixel out.
+
+    Attributes:
+        asked: what was to be drawn: trajectory, indices and view.
+        tiles: the cameras that were to be in one frame, for each of these.
+        breaks_at: called before each frame, with trajectory, view and index.
     """
 
     gl_facts = {"gl_renderer": "a painter"}  # noqa: RUF012  as it is asked for
@@ -51,24 +58,33 @@ class Painter:
         self.size = size
         self.plain = plain
         self.asked: list[tuple[Path, list[int], View]] = []
+        self.tiles: list[Any] = []
+        self.breaks_at: Callable[[Path, View, int], object] = lambda *_: None
 
     def frames(
-        self, trajectory: Path, indices: Sequence[int], view: View | None = None
+        self,
+        trajectory: Path,
+        indices: Sequence[int],
+        view: View | None = None,
+        *,
+        cameras: Any = None,
     ) -> Iterator[Any]:
-        self.asked.append((trajectory, list(indices), view or View()))
+        view = view or View()
+        self.asked.append((trajectory, list(indices), view))
+        self.tiles.append(cameras)
         with open_trajectory(trajectory) as reader:
             shown = [int(reader.snapshots(i, i + 1)[0, 0]) for i in indices]
-        return map(self._picture, shown)
+        for index, brightness in enumerate(shown):
+            self.breaks_at(trajectory, view, index)
+            brighter = 0 if view.camera is None else 5
+            picture = np.full((*self.size, 3), brightness | brighter, np.uint8)
+            if not self.plain:
+                picture[-1, -1] = 255
+            yield picture
 
     def start(self) -> None: ...
 
     def close(self) -> None: ...
-
-    def _picture(self, brightness: int) -> Any:
-        picture = np.full((*self.size, 3), brightness, np.uint8)
-        if not self.plain:
-            picture[-1, -1] = 255
-        return picture
 
 
 def new_logs(directory: Path, infix: Infix = INFIX) -> SpanLogs:

@@ -66,12 +66,12 @@ if TYPE_CHECKING:
     from .monitors.vector_monitor import VectorMonitor as VectorMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
-    from .rendering.directory_videos import RenderedVideos as RenderedVideos
-    from .rendering.directory_videos import render_videos as render_videos
-    from .rendering.pictures import render as render
-    from .rendering.pictures import render_states as render_states
     from .rendering.recovery import recover as recover
     from .rendering.recovery_report import Recovery as Recovery
+    from .rendering.render_frames import render as render
+    from .rendering.render_frames import render_states as render_states
+    from .rendering.render_videos import RenderedVideos as RenderedVideos
+    from .rendering.render_videos import render_videos as render_videos
     from .reporting.film_strips import film_strip as film_strip
     from .reporting.report_folder import write_report as write_report
     from .results import Episode as Episode
@@ -99,7 +99,7 @@ _LAZY = {
     "Monitor": "monitors",
     "RayEngine": "engines.ray",
     "Recovery": "rendering.recovery_report",
-    "RenderedVideos": "rendering.directory_videos",
+    "RenderedVideos": "rendering.render_videos",
     "SlurmEngine": "engines.slurm",
     "StatsRecorder": "recorder.stats_recorder",
     "Terminated": "signals",
@@ -123,9 +123,9 @@ _LAZY = {
     "merge_stats_files": "results",
     "pack": "evidence.packing",
     "recover": "rendering.recovery",
-    "render": "rendering.pictures",
-    "render_states": "rendering.pictures",
-    "render_videos": "rendering.directory_videos",
+    "render": "rendering.render_frames",
+    "render_states": "rendering.render_frames",
+    "render_videos": "rendering.render_videos",
     "save_video": "formats.frames_to_videos",
     "use_gl": "gl",
     "verify": "evidence.verifying",

@@ -15,9 +15,8 @@ from .. import json_text
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
 from ..monitors.progress import render_progress
-from ..rendering.again import Variant
-from ..rendering.directory_videos import RenderedVideos, iter_rendered_videos
-from ..rendering.outcomes import Outcome
+from ..rendering.jobs import Outcome, Variant
+from ..rendering.render_videos import RenderedVideos, iter_rendered_videos
 from ..rendering.views import View
 from .counted import counted
 from .engine_options import NO_ENGINE, EngineOptions

@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ..rendering.finishing import bring_up_to_date, finish_pending
-from ..rendering.pending import EpisodeKey
+from ..rendering.finish import bring_up_to_date, finish
 from ..rendering.progress import Progress
+from ..rendering.recordings import RecordingKey
 from .evaluation import EvaluationProgress
 from .following import TaskRun
 
@@ -94,12 +94,12 @@ def drawn_by_workers(directory: Path, runs: Sequence[TaskRun]) -> ChosenVideos:
 
 def _render(
     folder: Path,
-    keys: Sequence[EpisodeKey],
+    keys: Sequence[RecordingKey],
     workers: int,
     show: Callable[[Progress], object],
 ) -> dict[str, str]:
     """Return why videos are not there, or show nothing, by their names."""
-    outcomes = finish_pending(folder, keys, workers=workers, on_progress=show)
+    outcomes = finish(folder, keys, workers=workers, on_progress=show)
     reasons = {
         outcome.name: outcome.failure or "Another process is drawing it."
         for outcome in outcomes
@@ -129,7 +129,7 @@ def _again(folder: Path) -> str:
 def _sort(
     videos: ChosenVideos,
     folder: Path,
-    keys: Sequence[EpisodeKey],
+    keys: Sequence[RecordingKey],
     reasons: Mapping[str, str],
     problem: str | None,
 ) -> None:
@@ -144,9 +144,9 @@ def _sort(
             videos.pending[path] = why
 
 
-def _not_promised(folder: Path, key: EpisodeKey) -> str:
+def _not_promised(folder: Path, key: RecordingKey) -> str:
     return (
         "It was not among the chosen when its recording was settled, before more was "
-        f"asked for. To draw it: mjrec render {folder / key.trajectory_name}.h5 "
+        f"asked for. To draw it: mjrec render {folder / key.name}.h5 "
         "--out VIDEO.mp4"
     )

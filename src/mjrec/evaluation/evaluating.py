@@ -28,8 +28,7 @@ from ..errors import (
 from ..formats.locks import try_lock
 from ..gl.choice import choose
 from ..recorder.versions import versions
-from ..rendering.on_engine import given_engine
-from ..rendering.video_jobs import environ_for_drawing
+from ..rendering.engine_jobs import environ_for_drawing, given_engine
 from ..simulation.model_trust import stored_models
 from .chosen_videos import ChosenVideos, drawn_by_workers, render_chosen
 from .dataclass_json import to_json

@@ -20,10 +20,9 @@ from ..carried_errors import unpacked
 from ..engines.work import Job, JobOutcome, Run
 from ..errors import EnvironmentNotMade, PicturesDiffer
 from ..formats.monitor_directory import Infix
-from ..rendering.finishing import note_failure
-from ..rendering.outcomes import Outcome
-from ..rendering.pending import EpisodeKey, may_be_left
-from ..rendering.video_jobs import outcome_of
+from ..rendering.engine_jobs import outcome_of
+from ..rendering.jobs import VideoJob
+from ..rendering.recordings import RecordingKey, may_be_left
 from ..simulation.model_trust import note_models
 from .episode_results import EpisodeResult
 from .evaluation import EvaluationProgress
@@ -73,18 +72,18 @@ class TaskRun:
     not_drawn: dict[str, str] = field(default_factory=dict)
 
     @property
-    def chosen_keys(self) -> list[EpisodeKey]:
+    def chosen_keys(self) -> list[RecordingKey]:
         """The chosen episodes as their recording knows them, each once."""
         return list(self.chosen_models)
 
     @property
-    def chosen_models(self) -> dict[EpisodeKey, Sequence[str]]:
+    def chosen_models(self) -> dict[RecordingKey, Sequence[str]]:
         """The models of the chosen episodes, as far as workers have reported them."""
-        keys: dict[EpisodeKey, Sequence[str]] = {}
+        keys: dict[RecordingKey, Sequence[str]] = {}
         for result, _ in self.chosen:
             infix = Infix.parse(result.monitor or "")
             if infix is not None and result.episode_id is not None:
-                key = EpisodeKey(infix, result.episode_id)
+                key = RecordingKey(infix, result.episode_id)
                 keys[key] = self.models.get(result.unit, ())
         return keys
 
@@ -213,7 +212,7 @@ class _Runner:
         self._tasks = {task.folder: TaskRun(task) for task in plan.tasks}
         self._settled: list[TaskRun] = []
         self._batches: dict[str, Batch] = {}
-        self._recordings: dict[str, EpisodeKey] = {}
+        self._recordings: dict[str, RecordingKey] = {}
         self._counts = LedgerCounts(directory / task.folder for task in plan.tasks)
 
     def run(self, done: _Done, checked: Mapping[str, CheckedTask]) -> list[TaskRun]:
@@ -334,15 +333,12 @@ class _Runner:
         key = self._recordings[outcome.key]
         folder = self._directory / of.task.folder
         of.videos_done += 1
-        drawn = outcome_of(outcome, Outcome(name=key.told_name, directory=folder))
+        drawn = outcome_of(outcome, VideoJob.finishing(folder, key))
         if drawn is None:
             return
         reason = "Another process is drawing it." if drawn.is_elsewhere else None
         if (reason := drawn.failure or reason) is not None:
             of.not_drawn[drawn.name] = reason
-        if outcome.failure is not None:
-            # Its worker has died, and could not.
-            note_failure(folder, drawn.name, outcome.failure)
 
     def _progress(self) -> EvaluationProgress:
         plan = self._plan

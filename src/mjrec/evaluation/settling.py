@@ -33,11 +33,14 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.spans import FINISHED
-from ..formats.trajectory_file import amend_trajectory, find_trajectory
+from ..formats.trajectory_file import (
+    amend_trajectory,
+    find_trajectory,
+    finish_trajectory,
+)
 from ..formats.video_metadata import is_done
-from ..rendering.log_finishing import finish_log
-from ..rendering.pending import EpisodeKey, claim, recorded_episodes
 from ..rendering.recorded_facts import open_for_rendering
+from ..rendering.recordings import RecordingKey, claim, recorded_episodes
 from ..results.listing import listing_lock, write_listing
 from ..results.run import Run
 
@@ -120,7 +123,7 @@ def settle_monitor(
     for key in _episodes_of(folder, infix):
         with _claimed(folder, key):
             if _settle_episode(folder, key, verdicts):
-                promised.append(key.episode_id)
+                promised.append(key.number)
     _journal_choice(folder, infix, rule, promised)
     write_listing(folder, infix)
 
@@ -133,10 +136,10 @@ def finish_logs(folder: Path, monitor: str) -> None:
     """
     infix = Infix.parse(monitor)
     for key in () if infix is None else _episodes_of(folder, infix):
-        path = folder / f"{key.trajectory_name}{FINISHED}"
+        path = folder / f"{key.name}{FINISHED}"
         if is_in_flight(path):
             with _claimed(folder, key):
-                finish_log(path)
+                finish_trajectory(path)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,7 +170,7 @@ class _Verdicts:
         return is_done(self.folder / f"{video_prefix(self.infix, episode_id)}.mp4")
 
 
-def _episodes_of(folder: Path, infix: Infix) -> list[EpisodeKey]:
+def _episodes_of(folder: Path, infix: Infix) -> list[RecordingKey]:
     """Return the episodes of a monitor that have a trajectory, in order.
 
     Its manifest says which numbers it gave: thousands of monitors may have recorded
@@ -178,7 +181,7 @@ def _episodes_of(folder: Path, infix: Infix) -> list[EpisodeKey]:
     if numbers is None:
         return [key for key in recorded_episodes(folder) if key.infix == infix]
     return [
-        EpisodeKey(infix, number)
+        RecordingKey(infix, number)
         for number in numbers
         if find_trajectory(folder, infix, number) is not None
     ]
@@ -196,19 +199,19 @@ def _numbers_of(manifest: Manifest) -> range | None:
     return range(first, following) if first >= 0 and is_few else None
 
 
-def _settle_episode(folder: Path, key: EpisodeKey, verdicts: _Verdicts) -> bool:
+def _settle_episode(folder: Path, key: RecordingKey, verdicts: _Verdicts) -> bool:
     """Settle an episode, and return whether it has a video, or will have."""
-    path = folder / f"{key.trajectory_name}{FINISHED}"
+    path = folder / f"{key.name}{FINISHED}"
     with open_for_rendering(path) as reader:
         facts = dict(reader.header.facts)
     if facts.get("candidate") is True:
-        verdict = verdicts.facts(key.episode_id, facts.get("video") or {})
+        verdict = verdicts.facts(key.number, facts.get("video") or {})
         amend: Callable[[Path, Mapping[str, Any]], None]
         amend = amend_trajectory if path.exists() else add_facts
         amend(path, verdict)
         facts.update(verdict)
     if is_in_flight(path):
-        finish_log(path)
+        finish_trajectory(path)
     return bool(facts.get("video"))
 
 
@@ -243,13 +246,13 @@ def _is_unsettled(folder: Path, infix: Infix) -> bool:
 
 
 @contextlib.contextmanager
-def _claimed(folder: Path, key: EpisodeKey) -> Iterator[None]:
+def _claimed(folder: Path, key: RecordingKey) -> Iterator[None]:
     """Hold the lock of an episode, once whoever renders it is done."""
     end = time.monotonic() + _SECONDS
     while (lock := claim(folder, key)) is None:
         if time.monotonic() > end:
             raise Error(
-                f"Another process has been at {folder / key.trajectory_name} for "
+                f"Another process has been at {folder / key.name} for "
                 f"{_SECONDS:g} seconds, rendering it perhaps. When it has ended, do "
                 "this again: nothing is lost."
             )

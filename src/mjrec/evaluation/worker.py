@@ -45,7 +45,7 @@ from .plan import Batch, EvaluationPlan
 from .running import Evaluation, make_acting, rendering_of, run_batch
 
 if TYPE_CHECKING:
-    from ..rendering.video_jobs import VideoWorker
+    from ..rendering.engine_jobs import VideoWorker
 
 logger = logging.getLogger(__name__)
 
@@ -152,15 +152,15 @@ class EvaluationWorker:
         return {}
 
     def _draw(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        from ..rendering.pending import key_of
-        from ..rendering.video_jobs import VideoWorker, finishing_job
+        from ..rendering.engine_jobs import VideoWorker
+        from ..rendering.jobs import VideoJob
 
-        key = key_of(arguments["recording"])
-        assert key is not None
         note_models(arguments["models"])
         if self._videos is None:
             self._videos = VideoWorker()
-        return dict(self._videos(finishing_job(self._folder(arguments), key)))
+        folder, recording = self._folder(arguments), arguments["recording"]
+        job = VideoJob(directory=folder, recording=recording)
+        return dict(self._videos(job.as_json()))
 
     def _folder(self, arguments: Mapping[str, Any]) -> Path:
         return self._evaluation.directory / str(arguments["folder"])

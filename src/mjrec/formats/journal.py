@@ -129,15 +129,6 @@ class JournalWriter:
         self._size = 0
         self._closed = False
 
-    def begin(self) -> None:
-        """Write the first line, where there is none.
-
-        Raises:
-            ClosedError, OSError: as `append`.
-        """
-        if self._file is None:
-            self._append(b"")
-
     def append(self, entry: JournalEntry) -> None:
         """Write down a completed episode.
 

@@ -10,6 +10,8 @@
     ├── openaigym.video.<infix>.video000027.mp4         a video ...
     ├── openaigym.video.<infix>.video000027.meta.json   ... and all about it
     ├── openaigym.video.<infix>.video000027.framehash   ... and its pictures' hashes
+    ├── openaigym.video.<infix>.video000027.failed.json why it is still pending
+    ├── openaigym.clip.<infix>.step000000137.failed.json    likewise, of a clip
     ├── openaigym.video.<infix>.video000027.json        a text recording (asciicast)
     ├── openaigym.video.<infix>.video000027.side.mp4    a further camera's
     ├── openaigym.states.<infix>.000000.spans           recordings in flight ...
@@ -83,6 +85,7 @@ _VISIBLE = {
     ),
     "episodes": re.compile(rf"openaigym\.episodes\.{_INFIX_PART}\.jsonl"),
     "video": re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
+    "clip": re.compile(rf"{_CLIP}\.failed\.json"),
     "trajectory": re.compile(rf"{_TRAJECTORY}\.h5"),
     "states": re.compile(rf"{_STATES}\.(spans|log|tail|looks|spans\.damaged)"),
     "model": re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),

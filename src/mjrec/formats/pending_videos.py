@@ -26,7 +26,11 @@ _CUT = " [...] "
 
 
 def failure_path(video: Path) -> Path:
-    """Return the name of the file that says why a video could not be rendered."""
+    """Return the name of the file that says why a video could not be rendered.
+
+    Args:
+        video: or a part of a clip, whose video may not be known.
+    """
     return video.with_suffix(FAILED)
 
 

@@ -15,6 +15,8 @@ import io
 import json
 import math
 import os
+import signal
+import threading
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -89,19 +91,94 @@ def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
         FileNotWritten: the disk is full, or the directory is gone.
         UnreadableFile: what is read turned out to be damaged.
     """
-    # In memory, compressed as it will be in the file: the HDF5 library does not survive
-    # a write that fails (it crashes the process when it closes what is left).
-    image = io.BytesIO()
-    with h5py.File(image, "w", libver=_LIBVER) as file:
-        _write(file, reader)
     try:
-        with replacing(path) as temporary, temporary.open("xb") as output:
-            output.write(image.getbuffer())
-            output.flush()
+        with replacing(path) as temporary, temporary.open("x+b", buffering=0) as output:
+            unfailing = _Unfailing(output)
+            # Nothing is read any more after Ctrl-C, so that it is soon over.
+            with (
+                _signals_waiting(reader.close),
+                h5py.File(unfailing, "w", libver=_LIBVER) as file,
+            ):
+                _write(file, reader)
+            if unfailing.error is not None:
+                raise unfailing.error
             # The log is removed next: what it held must not be in a cache alone.
             os.fsync(output.fileno())
     except OSError as error:
         raise FileNotWritten(path, error.strerror or error) from error
+
+
+@contextlib.contextmanager
+def _signals_waiting(on_signal: Callable[[], object]) -> Iterator[None]:
+    """Handle signals after the block: HDF5 crashes where its file raises an exception.
+
+    Args:
+        on_signal: called at once, in the block.
+    """
+    came: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        del frame
+        came.append(number)
+        on_signal()
+
+    handlers: dict[signal.Signals, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if callable(handler := signal.getsignal(number)):
+                handlers[number] = handler
+                signal.signal(number, note)
+    try:
+        yield
+    finally:
+        for handled, handler in handlers.items():
+            signal.signal(handled, handler)
+        for each in came:
+            signal.raise_signal(each)
+
+
+class _Unfailing(io.RawIOBase):
+    """A file in which no write fails, for the HDF5 library.
+
+    It does not survive one: it crashes the process when it closes what is left. So what
+    the disk has no room for is held in memory, and `error` says so.
+    """
+
+    def __init__(self, file: io.FileIO) -> None:
+        self.error: OSError | None = None
+        self._file = file
+        self._held: list[tuple[int, bytes]] = []
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def write(self, data: Any) -> int:
+        start, view = self._file.tell(), memoryview(data).cast("B")
+        done = 0
+        while done < len(view) and self.error is None:
+            try:
+                done += self._file.write(view[done:])
+            except OSError as error:
+                self.error = error
+        if done < len(view):
+            self._held.append((start + done, bytes(view[done:])))
+            self._file.seek(start + len(view))
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        view, start = memoryview(buffer).cast("B"), self._file.tell()
+        self._file.readinto(view)
+        for offset, data in self._held:
+            begin, end = max(offset, start), min(offset + len(data), start + len(view))
+            if begin < end:
+                view[begin - start : end - start] = data[begin - offset : end - offset]
+        self._file.seek(start + len(view))
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        with contextlib.suppress(OSError):
+            self._file.truncate(size)
+        return size or 0
 
 
 class TrajectoryHdf5Reader(TrajectoryReader):

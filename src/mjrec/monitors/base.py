@@ -14,9 +14,9 @@ from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
 from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
-from ..recorder.ended_trajectories import Rendering
 from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
+from ..recorder.finisher import Finisher
 from ..recorder.options import (
     DEFERRED,
     LIVE,
@@ -29,7 +29,7 @@ from ..recorder.recorder import Recorder
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.subject import Subject
 from ..recorder.video_recorder import VideoRecorder
-from ..rendering.render_service import RenderService
+from ..rendering.background import Background
 from ..simulation.inside import simulation_time
 from .cameras import CameraPictures
 from .progress import render_progress
@@ -234,7 +234,7 @@ class MonitorBase(Closable):
         scenes: Callable[[], Scenes],
         close_environment: Callable[[Any], None],
         env_index: int | None = None,
-        rendering: Callable[[Path], Rendering] | None = None,
+        rendering: Callable[[Path], Finisher] | None = None,
     ) -> None:
         """Open the directory; from here on the environment is this monitor's.
 
@@ -250,7 +250,7 @@ class MonitorBase(Closable):
             rendering = None
         elif rendering is None:
             rendering = functools.partial(
-                RenderService, workers=options.workers, strict=options.strict
+                Background, workers=options.workers, strict=options.strict
             )
         self._options = options
         self._recorder = Recorder(
@@ -270,8 +270,7 @@ class MonitorBase(Closable):
                 random_state=known.random_state,
             ),
             options=options,
-            rendering=rendering,
-            finish_log=_finish_log,
+            finisher=rendering,
         )
         closings = [self._recorder.close]
         closings += [each.close for each in (known.states, clip_states) if each]
@@ -344,10 +343,3 @@ def _note_last_error(recorder: Recorder) -> None:
     error = last_error()
     if error is not None:
         recorder.note_error(error)
-
-
-def _finish_log(log: Path) -> None:
-    # Not at the top: it loads h5py, which the simulation has no use for.
-    from ..rendering.log_finishing import finish_log
-
-    finish_log(log)

@@ -16,7 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
 from ..environments.gymnasium_scenes import gymnasium_scenes
-from ..recorder.ended_trajectories import Rendering
+from ..recorder.finisher import Finisher
 from ..recorder.options import RecorderOptions
 from .base import MonitorBase
 from .cameras import camera_pictures
@@ -52,7 +52,7 @@ class GymnasiumMonitor(MonitorBase, gymnasium.Wrapper[Any, Any, Any, Any]):
         width: int | None = None,
         env_id: str | None = None,
         env_index: int | None = None,
-        rendering: Callable[[Path], Rendering] | None = None,
+        rendering: Callable[[Path], Finisher] | None = None,
         close_environment: Callable[[Any], None] = close_environment,
     ) -> None:
         super().__init__(env)

@@ -21,7 +21,7 @@ from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
 from ..recorder.options import RecorderOptions
-from ..rendering.shared_rendering import SharedRendering
+from ..rendering.background import Background
 from .base import Closable, MonitorBase, call_all
 from .gymnasium_monitor import GymnasiumMonitor
 from .progress import render_progress
@@ -116,7 +116,9 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
         env_id = env_id or (common_env_id(envs) if inside else env_id_outside(env))
         shared = None
         if options.workers != 0:
-            shared = SharedRendering(workers=options.workers, strict=options.strict)
+            shared = Background(
+                directory, workers=options.workers, strict=options.strict
+            )
         # How a sub-environment is closed; until all have monitors, not at all.
         closing: dict[str, Callable[[Env], None]] = {"by": lambda env: None}
         kind = SlotMonitor if inside is None else GymnasiumMonitor
@@ -131,7 +133,7 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
                     **view,
                     env_id=env_id,
                     env_index=index,
-                    rendering=None if shared is None else shared.share,
+                    rendering=None if shared is None else lambda _: shared.share(),
                     close_environment=lambda env: closing["by"](env),
                 )
                 for index, each in enumerate(envs)

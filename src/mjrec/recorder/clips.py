@@ -3,8 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol
+
+from .deferred_clip import DeferredClip
+from .live_videos import LiveClip
+from .monitored_run import MonitoredRun
+from .options import DEFERRED
 
 
 class Clip(Protocol):
@@ -48,23 +53,15 @@ class Clips:
     each. Without a length it ends with the episode.
 
     Args:
-        length: in steps; None is until the end of the episode.
-        trigger: tells by the number of steps taken so far whether one begins before
-            the next; None where only episodes begin them.
-        make: returns what records one; it is given the number of steps taken so far,
-            or None where it begins with an episode.
+        run: of which they are. `video_length` is theirs in steps, None until the end of
+            the episode; `step_trigger` tells by the number of steps taken so far
+            whether one begins before the next, None where only episodes begin them.
     """
 
-    def __init__(
-        self,
-        *,
-        length: int | None,
-        trigger: Callable[[int], Any] | None,
-        make: Callable[[int | None], Clip],
-    ) -> None:
-        self._length = length
-        self._trigger = trigger
-        self._make = make
+    def __init__(self, run: MonitoredRun) -> None:
+        self._run = run
+        self._length = run.options.video_length
+        self._trigger = run.options.step_trigger
         self._clip: Clip | None = None
         self._steps = 0
         self._reward = 0.0
@@ -137,7 +134,7 @@ class Clips:
         self._settle()
 
     def _start(self, steps: int | None) -> None:
-        clip = self._make(steps)
+        clip = _new_clip(self._run, steps)
         self._clip = clip
         self._steps, self._reward = 0, 0.0
         clip.begin()
@@ -155,3 +152,23 @@ class Clips:
             self._clip = self._ending = None
             raise
         self._clip = self._ending = None
+
+
+def _new_clip(run: MonitoredRun, steps: int | None) -> Clip:
+    """Return what records a clip that begins now.
+
+    Args:
+        run: of which it is.
+        steps: how many were taken when a step began it; None where it begins with an
+            episode.
+    """
+    path = run.clip_path(steps)
+    second_name = run.second_name("episode", run.episode.episode_id)
+    if steps is not None:
+        second_name = run.second_name("step", steps)
+    states = run.subject.clip_states
+    if states is not None and run.subject.rendering.mode == DEFERRED:
+        start = states.begin_episode()
+        if run.can_be_deferred(start):
+            return DeferredClip(run, states, start, path, second_name=second_name)
+    return LiveClip(run, run.live_recorders(path, second_name=second_name))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A video that is counted in steps, written down as states and rendered later.
+"""A clip, a video that is counted in steps, written down as states.
 
 It may go on across resets, and a log is of one episode: so there is a log for each
 part of it that is of one episode. `clip` in the facts of a part says
@@ -19,83 +19,50 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import FileNotWritten, PicturesDiffer
-from ..formats.monitor_directory import Infix, clip_part_name
-from ..formats.span_writer import SpanLogs
+from ..formats.monitor_directory import clip_part_name
 from ..simulation.state_source import EpisodeStart, StateSource
-from .trajectory_recorder import Pace, TrajectoryRecorder
+from .monitored_run import MonitoredRun
+from .options import DEFERRED
+from .trajectory_recorder import TrajectoryRecorder
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass
-class ClipLogs:
-    """What all deferred clips of a run have in common.
-
-    Attributes:
-        logs: of the monitor.
-        infix: the monitor's.
-        states: of the simulation; nobody else's, who would miss what the other has
-            noticed of the model.
-        pace: how simulated time becomes frames. Which of the frames are wanted is
-            chosen when they are drawn, as they are counted over all parts.
-        facts: returns what is known of the running episode, for the header of a part
-            that begins now, given what `states` has said.
-        before: returns what was before it in that episode, for `clip` in the header.
-        tolerates: tells whether to go on after an error.
-        on_end: called with each clip that is over and has left something.
-    """
-
-    logs: SpanLogs
-    infix: Infix
-    states: StateSource
-    pace: Pace
-    facts: Callable[[EpisodeStart], Mapping[str, Any]]
-    before: Callable[[], Mapping[str, Any]]
-    tolerates: Callable[[Exception], bool]
-    on_end: Callable[[DeferredClip], object]
-
-
 class DeferredClip:
-    """Writes down one such video; a `Clip`.
+    """Writes down the states of one clip; a `Clip`.
 
     Args:
-        logs: what it has in common with the others.
-        start: what `logs.states.begin_episode` has just returned.
-        first_step: how many steps were recorded so far.
-        episode_id: of the running episode.
-        video: where the video will be.
-        facts: what else each part says.
-
-    Attributes:
-        episode_id: as given.
-        first_step: as given.
-        video: as given.
-        first_part: what its first part is called.
+        run: of which it is.
+        states: of the simulation; of no other reader, who would miss what this one has
+            noticed of the model.
+        start: what `states.begin_episode` has just returned.
+        path: where the video will be, without the ending.
+        second_name: what it is called besides.
     """
 
     def __init__(
         self,
-        logs: ClipLogs,
+        run: MonitoredRun,
+        states: StateSource,
         start: EpisodeStart,
+        path: Path,
         *,
-        first_step: int,
-        episode_id: int,
-        video: Path,
-        facts: Mapping[str, Any],
+        second_name: Mapping[str, str],
     ) -> None:
-        self.episode_id = self._last_episode_id = episode_id
-        self.first_step = first_step
-        self.video = video
-        self._logs = logs
-        self.first_part = logs.logs.directory / self._name(0)
+        self._run = run
+        self._states = states
         self._start = start
-        self._facts = facts
+        self._first_step = run.stats.total_steps
+        self._episode_id = self._last_episode_id = run.episode.episode_id
+        self._video = path.with_name(f"{path.name}.mp4")
+        promise = run.promise(path, DEFERRED, second_name=second_name)
+        self._facts = {"kept": False, "video": promise}
         self._part: TrajectoryRecorder | None = None
         self._parts = 0
         self._is_over = False
@@ -112,7 +79,7 @@ class DeferredClip:
         if part is None or part.is_stopped:
             return
         try:
-            start = self._logs.states.begin_episode()
+            start = self._states.begin_episode()
             if start.refusal is not None:
                 raise PicturesDiffer(start.refusal)
             coming = self._new_part(start)
@@ -155,47 +122,59 @@ class DeferredClip:
             # What is there is as much of a video as of a process that was killed.
             part.abandon()
             self._list(part)
-            if not self._logs.tolerates(error):
+            if not self._run.tolerates("video", error):
                 raise
         else:
             self._list(part)
 
     def _new_part(self, start: EpisodeStart) -> TrajectoryRecorder:
-        """Return what writes the part that begins now. Its log comes later."""
-        logs, number = self._logs, self._parts
+        """Return what writes the part that begins now. Its rows come later."""
+        run = self._run
+        clip = {
+            "first_step": self._first_step,
+            "part": self._parts,
+            "steps_before": run.stats.steps or 0,
+            "reward_before": run.stats.rewards or 0.0,
+            "reset_time": run.episode.reset_clock,
+        }
         return TrajectoryRecorder(
-            logs.logs,
-            self._name(number),
-            facts={
-                **logs.facts(start),
-                **self._facts,
-                "clip": {
-                    "first_step": self.first_step,
-                    "part": number,
-                    **logs.before(),
-                },
-            },
-            states=logs.states,
+            run.clip_logs,
+            self._name(self._parts),
+            facts={**run.recording_facts(start), **self._facts, "clip": clip},
+            states=self._states,
             start=start,
-            pace=replace(logs.pace, max_fps=None),
+            # Which of the frames are wanted is chosen when they are drawn: they are
+            # counted over all parts.
+            pace=replace(run.pace, max_fps=None),
         )
 
     def _stop(
         self, part: TrajectoryRecorder, error: PicturesDiffer | FileNotWritten
     ) -> None:
-        """Take down nothing more of the video, after an error."""
+        """Take down nothing more of the clip, after an error."""
         part.stop(str(error))
         if isinstance(error, FileNotWritten):
-            if not self._logs.tolerates(error):
+            if not self._run.tolerates("video", error):
                 raise error
             return
-        logger.warning("The video %s ends early: %s", self.video.name, error)
+        logger.warning("The video %s ends early: %s", self._video.name, error)
 
     def _list(self, part: TrajectoryRecorder) -> None:
         self._is_over = True
-        # Where the disk was too full for a single row there is nothing to promise.
-        if self._parts > 1 or part.is_there:
-            self._logs.on_end(self)
+        if self._parts == 1 and not part.is_there:
+            # The disk was too full for a single row: there is nothing to promise.
+            return
+        run, first_part = self._run, self._name(0)
+        run.journal.note(
+            "clip",
+            {
+                "episode_id": self._episode_id,
+                "clip": first_part,
+                "video": self._video.name,
+            },
+        )
+        run.videos.expect(self._video)
+        run.finisher.submit(run.directory / first_part)
 
     def _name(self, number: int) -> str:
-        return clip_part_name(self._logs.infix, self.first_step, number)
+        return clip_part_name(self._run.infix, self._first_step, number)

@@ -20,12 +20,10 @@ class EpisodeChoice:
     Attributes:
         selection: chooses among the episodes that are over; None where that is settled
             when they begin.
-        scheduled: the numbers of the episodes that the schedule chose.
     """
 
     def __init__(self, options: RecorderOptions, *, mode: str) -> None:
         self.selection: Selection | None = None
-        self.scheduled: list[int] = []
         self._schedule: Schedule = to_schedule(options.video_callable)
         if options.keep is not None:
             self._schedule = self.selection = selection_from(options.keep)
@@ -58,8 +56,6 @@ class EpisodeChoice:
         """
         if self._decided[0] != episode_id:
             self._decided = (episode_id, bool(self._schedule(episode_id)))
-            if self._decided[1]:
-                self.scheduled.append(episode_id)
         return self._decided[1]
 
     def may_keep_trajectory(self, episode_type: str) -> bool:

@@ -9,7 +9,7 @@ anybody may render once the monitor is gone. What falls out is deleted at once.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,7 @@ from ..formats.in_flight import add_facts, drop_recording
 from ..formats.json_fields import read_object, unreadable
 from ..formats.second_names import give_second_names
 from .deferred_video import DeferredVideo
-from .ended_trajectories import EndedTrajectories
-from .episode_videos import EpisodeVideos
+from .monitored_run import MonitoredRun
 from .selection import Selection, Standing
 from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
@@ -58,25 +57,13 @@ class KeptVideos:
     Each step may be interrupted (Ctrl-C) and is taken up again by the next `settle`.
 
     Args:
+        run: of which they are.
         selection: chooses.
-        note_dropped: told the number of an episode whose video falls out, though its
-            trajectory stays.
-        videos: watches for the videos that are chosen.
-        ended: takes over trajectories about which nothing is left to decide.
     """
 
-    def __init__(
-        self,
-        selection: Selection,
-        *,
-        note_dropped: Callable[[int], object],
-        videos: EpisodeVideos,
-        ended: EndedTrajectories,
-    ) -> None:
+    def __init__(self, run: MonitoredRun, selection: Selection) -> None:
+        self._run = run
         self._selection = selection
-        self._note_dropped = note_dropped
-        self._videos = videos
-        self._ended = ended
         # Number of the last episode that was judged, and how it stands.
         self._judged = (-1, Standing.DROPPED)
         self._held: dict[int, _Held] = {}
@@ -91,18 +78,10 @@ class KeptVideos:
         """Whether somebody else decides, when the monitor is gone."""
         return self._selection.is_left_open
 
-    def facts(self) -> dict[str, Any]:
-        """Return what is said of a video by which it may be known as hand-picked."""
-        return {"rule": self._selection.name, "decided": False}
-
-    def rule(self) -> dict[str, Any]:
-        """Return what the journal says of the choice from its beginning."""
-        left_open = {"left_open": True} if self.is_left_open else {}
-        return {"rule": self._selection.name, **left_open}
-
     def chosen_facts(self) -> dict[str, Any]:
-        """Return the same of a video that is chosen."""
-        return {**self.facts(), "decided": True, "finished": self._selection.finished}
+        """Return what is said of a video that is chosen, by which it is known."""
+        finished = self._selection.finished
+        return {**self._run.selection, "decided": True, "finished": finished}
 
     def judge(self, episode_id: int, episode: FinishedEpisode | None) -> Standing:
         """Tell how an episode stands that has just ended.
@@ -265,18 +244,18 @@ class KeptVideos:
             if held.trajectory is not None:
                 verdict = self.verdict(Standing.CHOSEN, held.promise)
                 add_facts(held.trajectory, verdict)
-                self._ended.add(held.trajectory)
+                self._run.finisher.submit(held.trajectory)
         finally:
             self._expect(held)
 
     def _expect(self, held: _Held) -> None:
         for recorder in held.live:
             if recorder.path is not None and "first_video" not in recorder.metadata:
-                self._videos.expect(Path(recorder.path))
+                self._run.videos.expect(Path(recorder.path))
             if recorder.finished and "also_named" in recorder.metadata:
                 give_second_names(Path(str(recorder.path)))
         if held.deferred is not None and held.trajectory is not None:
-            self._videos.expect(Path(held.deferred.path))
+            self._run.videos.expect(Path(held.deferred.path))
 
     def _drop(self, episode_id: int, held: _Held) -> None:
         # The last one that was finished is the sign that all are there.
@@ -287,8 +266,8 @@ class KeptVideos:
         if held.stays:
             verdict = self.verdict(Standing.DROPPED, held.promise)
             add_facts(held.trajectory, verdict)
-            self._ended.add(held.trajectory)
-            self._note_dropped(episode_id)
+            self._run.finisher.submit(held.trajectory)
+            self._run.journal.note("dropped", episode_id)
         else:
             drop_recording(held.trajectory)
 

@@ -4,81 +4,16 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..annotation import Caption
 from ..errors import Error
 from ..formats.second_names import give_second_names
-from ..formats.video_names import second_name_of
-from .options import RecorderOptions
-from .subject import EpisodePictures, Subject
+from .monitored_run import MonitoredRun
+from .options import LIVE
 from .video_recorder import VideoRecorder
-
-
-@dataclass(frozen=True, kw_only=True)
-class LiveVideoMaker:
-    """Makes what records the videos of one moment, from each camera.
-
-    Attributes:
-        subject: what is recorded.
-        options: what was asked for.
-        facts: returns what is known of the running episode, for metadata.
-        caption: returns what is written on the pictures of this moment.
-    """
-
-    subject: Subject
-    options: RecorderOptions
-    facts: Callable[[], Mapping[str, Any]]
-    caption: Callable[[], Caption]
-
-    def at(
-        self, path: Path, *, second_name: Mapping[str, str], enabled: bool = True
-    ) -> tuple[VideoRecorder, ...]:
-        """Return what records the first camera's video, and the others' if it can.
-
-        Args:
-            path: of the first one, without its ending.
-            second_name: what it is called besides, as `VideoPromises` says it.
-            enabled: False makes one that records nothing.
-        """
-        first = self._one(path, self.subject.pictures, enabled=enabled)
-        if first.path is None:
-            return (first,)
-        first.metadata.update(second_name)
-        others = [
-            self._one(path.with_name(f"{path.name}.{name}"), pictures)
-            for name, pictures in self.subject.further_pictures.items()
-        ]
-        for other in others:
-            assert other.path is not None
-            first_name, name = Path(first.path).name, Path(other.path).name
-            other.metadata["first_video"] = first_name
-            for second in second_name.values():
-                called = second_name_of(name, second, first=first_name)
-                other.metadata["also_named"] = called
-        return (first, *others)
-
-    def _one(
-        self, base_path: Path, pictures: EpisodePictures, *, enabled: bool = True
-    ) -> VideoRecorder:
-        options = self.options
-        return VideoRecorder(
-            pictures,
-            base_path=base_path,
-            metadata=self.facts() if enabled else None,
-            enabled=enabled,
-            fps=options.fps,
-            max_fps=options.max_fps,
-            frame_hashes=True,
-            clock=self.subject.clock,
-            declared=self.subject.declared,
-            facts=pictures.facts,
-            strict=options.strict,
-            caption=self.caption if options.annotate else None,
-        )
 
 
 class LiveVideos:
@@ -214,21 +149,21 @@ class LiveClip:
     """A video that is counted in steps, drawn while the simulation runs; a `Clip`.
 
     Args:
+        run: of which it is.
         recorders: what records it, of one camera or of each.
-        on_end: called with the recorders when they are closed.
-        tolerates: tells whether to go on after an error.
     """
 
-    def __init__(
-        self,
-        recorders: Sequence[VideoRecorder],
-        *,
-        on_end: Callable[[Sequence[VideoRecorder]], object],
-        tolerates: Callable[[Exception], bool],
-    ) -> None:
+    def __init__(self, run: MonitoredRun, recorders: Sequence[VideoRecorder]) -> None:
+        self._run = run
         self._recorders = recorders
-        self._videos = LiveVideos(recorders, tolerates=tolerates)
-        self._on_end = on_end
+        self._episode_id = run.episode.episode_id
+        self._videos = LiveVideos(
+            recorders, tolerates=functools.partial(run.tolerates, "video")
+        )
+        for recorder in recorders:
+            recorder.metadata.update(
+                first_step=run.stats.total_steps, last_episode_id=self._episode_id
+            )
 
     def begin(self) -> None:
         """Take the picture of this moment."""
@@ -255,5 +190,12 @@ class LiveClip:
             finally:
                 self._videos.end(facts)
         finally:
-            self._on_end(self._recorders)
+            self._list()
             self._videos.name_again()
+
+    def _list(self) -> None:
+        path = self._recorders[0].path
+        if path is not None:
+            facts = {"episode_id": self._episode_id, "recording": LIVE}
+            self._run.journal.note("clip", {**facts, "video": Path(path).name})
+            self._run.videos.expect(Path(path))

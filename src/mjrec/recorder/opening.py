@@ -16,6 +16,8 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from .. import json_text
 from ..errors import (
@@ -67,12 +69,14 @@ class OpenDirectory:
         infix: what the claim is for.
         first_episode_id: the number of the next episode.
         lock: held until the monitor closes.
+        run: what is known of the run.
     """
 
     path: Path
     infix: Infix
     first_episode_id: int
     lock: Lock
+    run: Mapping[str, Any]
 
 
 def open_directory(
@@ -82,6 +86,7 @@ def open_directory(
     resume: bool | str,
     uid: str | None,
     env_info: Mapping[str, str],
+    facts: Mapping[str, Any] = MappingProxyType({}),
 ) -> OpenDirectory:
     """Claim a place in `directory`, which is made where it is missing.
 
@@ -96,6 +101,8 @@ def open_directory(
             from 0.
         uid: stands in the file names instead of the process id.
         env_info: `env_id` of the environment, among others.
+        facts: what else is known of the run. It stands in the lock: so much is known of
+            a process that was killed before its journal had a line.
 
     Raises:
         ExistingRecordings: there are recordings, and neither `force` nor `resume`.
@@ -112,8 +119,9 @@ def open_directory(
         joins = resume == JOIN and not force
         numbers_on = not (force or joins)
         first = _next_episode_id(path, uid=wanted_uid) if numbers_on else 0
-        infix, lock = _claim(path, uid=wanted_uid, env_info=env_info, looks=not joins)
-    return OpenDirectory(path, infix, first, lock)
+        run = {"env_info": dict(env_info), **facts, "first_episode_id": first}
+        infix, lock = _claim(path, uid=wanted_uid, run=run, looks=not joins)
+    return OpenDirectory(path, infix, first, lock, run)
 
 
 @contextlib.contextmanager
@@ -208,20 +216,18 @@ def _last_counted(files: MonitorFiles) -> int:
 
 
 def _claim(
-    path: Path, *, uid: str | None, env_info: Mapping[str, str], looks: bool
+    path: Path, *, uid: str | None, run: Mapping[str, Any], looks: bool
 ) -> tuple[Infix, Lock]:
     """Return an infix that is this monitor's from now on, and its lock.
 
     Args:
         path: the directory.
         uid: stands in it instead of the process id.
-        env_info: of the environment.
+        run: what is known of the run.
         looks: also for stray files with it. Without that, a manifest, a journal or a
             lock say that it was somebody's: each monitor leaves one of them.
     """
-    content = json_text.dumps(
-        {"pid": os.getpid(), "since": time.time(), "env_info": dict(env_info)}
-    )
+    content = json_text.dumps({"pid": os.getpid(), "since": time.time(), "run": run})
     while True:
         infix = Infix(_monitor_ids.take(), uid or str(os.getpid()))
         if _is_taken(path, infix, looks=looks):

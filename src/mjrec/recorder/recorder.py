@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
-import itertools
 import logging
 import os
 import sys
@@ -16,56 +14,47 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from ..annotation import Caption
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.journal import JournalEntry
 from ..formats.monitor_directory import (
     episode_of,
     journal_name,
     stats_prefix,
-    trajectory_prefix,
     video_prefix,
 )
 from ..formats.pending_videos import note_failure, reason_of
-from ..formats.span_writer import SpanLogs
 from ..formats.spans import FINISHED
 from ..results.listing import write_listing
 from ..results.recorded_environment import GYM_VERSION
-from ..simulation.state_source import EpisodeStart, StateSource
-from .begun_episode import BegunEpisode
-from .clip_maker import ClipMaker
+from ..simulation.state_source import StateSource
 from .clips import Clips
-from .deferral import Deferral
 from .deferred_video import DeferredVideo
-from .ended_trajectories import EndedTrajectories, Rendering
 from .endings import CLOSE, INTERRUPT, RESET, ending
 from .episode_choice import EpisodeChoice
-from .episode_trajectory import EpisodeTrajectory
+from .episode_recording import EpisodeRecording
 from .episode_videos import EpisodeVideos
-from .fast_path import FastPath, counting
-from .faults import Faults, What
+from .fast_path import FastPath
+from .faults import Faults
+from .finisher import Finisher, LaterFinisher
 from .kept_videos import KeptVideos
-from .live_videos import LiveVideoMaker, LiveVideos
+from .monitored_run import BegunEpisode, MonitoredRun
 from .opening import OpenDirectory, open_directory
-from .options import DEFERRED, LIVE, RecorderOptions, type_of_mode
-from .recording_facts import RecordingFacts
-from .run_journal import RunJournal
+from .options import LIVE, RecorderOptions, type_of_mode
+from .run_journal import RunJournal, facts_of
 from .selection import Standing
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import Subject, check_pictures
 from .tracking import FinishedEpisode, Run, Trackers
-from .trajectory_recorder import Pace, TrajectoryRecorder
-from .video_promises import VideoPromises
 from .video_recorder import VideoRecorder
 
 logger = logging.getLogger(__name__)
 
 
 class Recorder:
-    """Drives statistics, journal, trajectory, video and manifest of one monitor.
+    """Drives statistics, journal, trajectories, videos and manifest of one monitor.
 
-    It is told what happens to an environment and never calls it, except for pictures
-    and states: `before_reset`, the environment's reset inside `resetting`, `reset`;
+    It is told what happens to an environment and never calls it, except for frames and
+    states: `before_reset`, the environment's reset inside `resetting`, `reset`;
     `before_step`, the environment's step, `step`, or, while there is a `fast` path,
     what that has instead; `close`. It belongs to the process that made it.
 
@@ -73,10 +62,8 @@ class Recorder:
         directory: the monitor directory.
         subject: what is recorded.
         options: what was asked for.
-        rendering: makes what renders, for the directory; None where nothing is to be
-            rendered now.
-        finish_log: gives the log of an ended episode its final form, where nothing
-            renders.
+        finisher: makes what finishes recordings, for the directory; None where nothing
+            is to be rendered now.
     """
 
     def __init__(
@@ -85,66 +72,53 @@ class Recorder:
         *,
         subject: Subject,
         options: RecorderOptions,
-        rendering: Callable[[Path], Rendering] | None = None,
-        finish_log: Callable[[Path], object],
+        finisher: Callable[[Path], Finisher] | None = None,
     ) -> None:
-        self._mode = subject.rendering.mode
-        self._choice = EpisodeChoice(options, mode=self._mode)
-        draws = self._choice.has_videos or options.has_clips
-        if draws and self._mode == LIVE:
+        mode = subject.rendering.mode
+        self._choice = EpisodeChoice(options, mode=mode)
+        if mode == LIVE and (self._choice.has_videos or options.has_clips):
             check_pictures(subject)
         self._subject = subject
-        self._states = subject.states
-        self._clip_states = subject.clip_states
         self._options = options
         self._pid = os.getpid()
         self._is_forked = False
         _recorders.add(self)
-        self._videos = EpisodeVideos()
-        self._faults = Faults(
-            options.on_error, lambda fault: self._journal.note("fault", fault)
-        )
         # Why the running episode ends early, once the environment has raised.
         self._ending: dict[str, Any] | None = None
         # What the last step said.
         self._flags = {"terminated": False, "truncated": False}
         self._success: bool | None = None
-        # The last one that is over.
+        # The last one that is over, and the last one that the journal has.
         self._finished: FinishedEpisode | None = None
-        env_info = {"gym_version": GYM_VERSION, "env_id": subject.env_id}
+        self._journaled = -1
+        self._recording: EpisodeRecording | None = None
+        self.closed = False
+        # What the next step may be recorded with; None where it needs a closer look.
+        self.fast: FastPath | None = None
+
         self._place: OpenDirectory = open_directory(
             directory,
             force=options.force,
             resume=options.resume,
             uid=options.uid,
-            env_info=env_info,
+            env_info={"gym_version": GYM_VERSION, "env_id": subject.env_id},
+            facts=facts_of(self._choice),
         )
+        self._next_episode_id = self._place.first_episode_id
         for states in self._all_states():
             states.open(self.directory)
-        self._ended = EndedTrajectories(
-            rendering(self.directory) if rendering else None, finish_log
+        self._finisher = (
+            LaterFinisher() if finisher is None else finisher(self.directory)
         )
-        self._kept: KeptVideos | None = None
-        if self._choice.selection is not None:
-            self._kept = KeptVideos(
-                self._choice.selection,
-                note_dropped=lambda number: self._journal.note("dropped", number),
-                videos=self._videos,
-                ended=self._ended,
-            )
-        self._next_episode_id = self._place.first_episode_id
-        self._episode: BegunEpisode | None = None
+        self._faults = Faults(
+            options.on_error, lambda fault: self._journal.note("fault", fault)
+        )
         self._journal = RunJournal(
             self.directory / journal_name(self._place.infix),
-            env_info=env_info,
-            schedule=self._choice.schedule_name,
-            keep=None if self._kept is None else self._kept.rule(),
-            first_episode_id=self._place.first_episode_id,
+            facts=self._place.run,
             options=options,
-            tolerates=functools.partial(self._tolerates, "journal"),
+            tolerates=lambda error: self._run.tolerates("journal", error),
         )
-        # The last episode that the journal has.
-        self._journaled = -1
         self.stats_recorder = StatsRecorder(
             str(self.directory),
             stats_prefix(self._place.infix),
@@ -152,8 +126,6 @@ class Recorder:
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
-        # The simulated time of the reset, where it is to be written on pictures.
-        self._reset_clock: float | None = None
         self._trackers = Trackers(
             Run(
                 directory=self.directory,
@@ -164,45 +136,22 @@ class Recorder:
             options.all_trackers,
             on_fault=self._note_tracker_fault,
         )
-        self._pace = Pace(
-            clock=subject.clock, declared=subject.declared, max_fps=options.max_fps
-        )
-        self._trajectory: EpisodeTrajectory | None = None
-        numbers = itertools.count()
-        self._logs, self._clip_logs = (
-            SpanLogs(
-                self.directory,
-                self._place.infix,
-                numbers=numbers,
-                tail_bytes=options.tail_bytes,
-            )
-            for _ in range(2)
-        )
-        self._deferral = Deferral(subject)
-        self.video_recorder: VideoRecorder | DeferredVideo | None = None
-        # The same, where it is drawn live, and those of further cameras.
-        self._live_videos: LiveVideos | None = None
-        self._live_maker = LiveVideoMaker(
+        selection = self._choice.selection
+        self._run = MonitoredRun(
+            self._place,
             subject=subject,
             options=options,
-            facts=self.live_video_facts,
-            caption=self._caption,
+            stats=self.stats_recorder,
+            journal=self._journal,
+            faults=self._faults,
+            finisher=self._finisher,
+            videos=EpisodeVideos(),
+            selection={}
+            if selection is None
+            else {"rule": selection.name, "decided": False},
         )
-        selection = {} if self._kept is None else self._kept.facts()
-        self._promises = VideoPromises(
-            directory=self.directory,
-            infix=self._place.infix,
-            subject=subject,
-            options=options,
-            selection=selection,
-        )
-        self._facts = RecordingFacts(
-            infix=str(self._place.infix), subject=subject, selection=selection
-        )
-        self._clips = self._new_clips() if options.has_clips else None
-        self.closed = False
-        # What the next step may be recorded with; None where it needs a closer look.
-        self.fast: FastPath | None = None
+        self._kept = None if selection is None else KeptVideos(self._run, selection)
+        self._clips = Clips(self._run) if options.has_clips else None
 
     @property
     def directory(self) -> Path:
@@ -247,9 +196,10 @@ class Recorder:
 
     def resetting(self) -> AbstractContextManager[None]:
         """Return what to put around the reset of the environment."""
-        if self._states is None or self._mode == LIVE:
+        states = self._subject.states
+        if states is None or self._subject.rendering.mode == LIVE:
             return contextlib.nullcontext()
-        return self._states.resetting()
+        return states.resetting()
 
     def before_reset(self) -> None:
         """Check that a reset may be made now, and take what it will overwrite.
@@ -287,31 +237,35 @@ class Recorder:
         """
         if self._is_unbegun():
             self._next_episode_id -= 1
-            self._discard_episode()
+            if self._recording is not None:
+                self._recording.discard()
         else:
             self._end_episode(otherwise=RESET)
         self._ending = None
         self.stats_recorder.after_reset()
-        self._reset_clock = self._subject.clock() if self._options.annotate else None
-        self._episode = BegunEpisode(
-            episode_id=self._next_episode_id,
-            type=self.stats_recorder.episode_type,
-            start_time=self._reset_time,
-            seed=seed,
-            options=options,
-            random_state=self._random_state,
+        self._run.begin(
+            BegunEpisode(
+                episode_id=self._next_episode_id,
+                type=self.stats_recorder.episode_type,
+                start_time=self._reset_time,
+                seed=seed,
+                options=options,
+                random_state=self._random_state,
+                reset_clock=self._subject.clock() if self._options.annotate else None,
+            )
         )
         self._next_episode_id += 1
+        # That of the episode before is over, whatever the schedule raises.
+        self._recording = EpisodeRecording(
+            self._run, self._kept, on_picture_error=self.note_error
+        )
         try:
-            self._begin_episode(self._episode, observation)
+            self._begin_episode(self._recording, observation)
         except Exception as error:
-            if not self._tolerates("video", error):
+            if not self._run.tolerates("video", error):
                 raise
-            # Where it is only the first picture, states are recorded all the same.
-            if self._live_videos is not None:
-                self._live_videos.give_up(str(error))
-            else:
-                self._begin_live_videos(self._episode.episode_id, enabled=False)
+            # Where it is only the first frame, states are recorded all the same.
+            self._recording.give_up(str(error))
         if self._options.write_upon_reset:
             try:
                 self._write_results()
@@ -343,8 +297,8 @@ class Recorder:
             self._refuse_step()
         if self._clips is not None:
             self._clips.before_step(stats.total_steps)
-        if self._trajectory is not None:
-            self._trajectory.before_step(action)
+        if self._recording is not None:
+            self._recording.before_step(action)
 
     def step(
         self,
@@ -387,12 +341,14 @@ class Recorder:
                 self._journal_episode(self._finished)
         finally:
             try:
-                if self._trajectory is not None:
-                    self._trajectory.step(
-                        reward, terminated, truncated, observation, done, picture
+                if self._recording is not None:
+                    self._recording.step(
+                        reward,
+                        terminated=terminated,
+                        truncated=truncated,
+                        observation=observation,
+                        picture=picture,
                     )
-                if self._live_videos is not None:
-                    self._live_videos.take(is_there=picture, last=done)
                 if self._clips is not None:
                     self._clips.step(
                         reward,
@@ -423,9 +379,8 @@ class Recorder:
         if self.closed:
             return
         self._end_by_close()
-        self._ended.wait(on_progress)
         try:
-            self._ended.finish()
+            self._finisher.wait(on_progress)
         except Error as error:
             if not self._faults.tolerates("trajectory", error, episode_id=None):
                 raise
@@ -443,7 +398,7 @@ class Recorder:
         """
         if self.closed:
             return
-        self._ended.stop()
+        self._finisher.stop()
         try:
             self._end_by_close()
         except Exception:
@@ -455,7 +410,7 @@ class Recorder:
     def _end_by_close(self) -> None:
         self.fast = None
         with contextlib.ExitStack() as ends:
-            for logs in (self._logs, self._clip_logs):
+            for logs in (self._run.logs, self._run.clip_logs):
                 ends.callback(self._settle, logs.close)
             for states in self._all_states():
                 # A trajectory without its model is worth nothing, and what stores it
@@ -469,41 +424,8 @@ class Recorder:
                 self._clips.close(self._ending or {"reason": CLOSE})
 
     def _all_states(self) -> list[StateSource]:
-        return [each for each in (self._states, self._clip_states) if each is not None]
-
-    def _new_clips(self) -> Clips:
-        maker = ClipMaker(
-            subject=self._subject,
-            promises=self._promises,
-            live=self._live_maker,
-            pace=self._pace,
-            episode_facts=lambda start: self._facts.of_log(self._running, start),
-            before=self._before_clip,
-            can_be_deferred=self._deferral.is_possible,
-            tolerates=functools.partial(self._tolerates, "video"),
-            note=functools.partial(self._journal.note, "clip"),
-            videos=self._videos,
-            ended=self._ended,
-            logs=self._clip_logs,
-        )
-        return Clips(
-            length=self._options.video_length,
-            trigger=self._options.step_trigger,
-            make=lambda steps: maker.make(
-                steps,
-                episode_id=self._running.episode_id,
-                total_steps=self.stats_recorder.total_steps,
-            ),
-        )
-
-    def _before_clip(self) -> dict[str, Any]:
-        """Return what of the running episode is not in a part that begins now."""
-        stats = self.stats_recorder
-        return {
-            "steps_before": stats.steps or 0,
-            "reward_before": stats.rewards or 0.0,
-            "reset_time": self._reset_clock,
-        }
+        both = (self._subject.states, self._subject.clip_states)
+        return [each for each in both if each is not None]
 
     def _finish_models(self, states: StateSource) -> None:
         try:
@@ -515,11 +437,11 @@ class Recorder:
     def add_video(self, video: VideoRecorder) -> None:
         """Let trackers know of one more video of an episode, which is closed."""
         if video.path is not None:
-            self._videos.expect(Path(video.path))
+            self._run.videos.expect(Path(video.path))
 
     def failures(self) -> Mapping[str, str]:
         """Return why videos could not be rendered, by their names."""
-        return self._ended.failures
+        return self._finisher.failures
 
     def _let_go(self) -> None:
         # Where it fails, all stays open, and the next close tries again. That is an
@@ -543,11 +465,9 @@ class Recorder:
 
     def _fast_path(self) -> FastPath | None:
         """Return what the coming steps may be recorded with, if they are usual."""
-        if self._live_videos is not None or self._clips is not None:
+        if self._clips is not None or self._recording is None:
             return None
-        if self._trajectory is None:
-            return counting(self.stats_recorder)
-        return self._trajectory.recorder.fast_path(self.stats_recorder)
+        return self._recording.fast_path()
 
     def _refuse_step(self) -> None:
         if self._is_forked:
@@ -567,116 +487,36 @@ class Recorder:
         return stats.done is False and stats.steps == 0 and self._ending is None
 
     @property
-    def _running(self) -> BegunEpisode:
-        assert self._episode is not None, "there was no reset"
-        return self._episode
+    def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
+        """What records the running episode, or not; None before the first reset."""
+        return None if self._recording is None else self._recording.video
 
-    def _begin_episode(self, episode: BegunEpisode, observation: Any) -> None:
-        # Those of the episode before are over, whatever the schedule raises.
-        self._trajectory = self._live_videos = self.video_recorder = None
-        episode_id = episode.episode_id
-        wanted = self._choice.decide(episode_id)
+    def _begin_episode(self, recording: EpisodeRecording, observation: Any) -> None:
+        episode = self._run.episode
+        wanted = self._choice.decide(episode.episode_id)
         chosen = wanted and self._kept is None
-        self._journal.run.begin(episode_id, chosen=chosen)
-        self._journal.begin()
+        self._journal.run.begin(episode.episode_id, chosen=chosen)
         if self._clips is not None:
-            self._clips.reset(episode_id, is_chosen=wanted)
+            self._clips.reset(episode.episode_id, is_chosen=wanted)
             # The episode has no video of its own.
             wanted = False
-        keeps = self._choice.keeps_trajectory(
-            episode_id, episode_type=episode.type, has_video=wanted
-        )
-        deferred = wanted and self._mode == DEFERRED
-        start = None
-        if self._states is not None and (keeps or deferred):
-            start = self._states.begin_episode()
-            deferred = deferred and self._deferral.is_possible(start)
-        if keeps or deferred:
-            promise = None
-            if wanted:
-                recording = DEFERRED if deferred else LIVE
-                promise = self._promises.of_episode(episode_id, recording)
-            self._trajectory = self._new_trajectory(
-                episode, start, observation, promise=promise, is_kept=keeps
-            )
-        if deferred:
-            assert self._trajectory is not None
-            self._ended.expect()
-            self.video_recorder = self._trajectory.deferred = DeferredVideo(
-                self._promises.path(episode_id), self._trajectory.recorder
-            )
-        else:
-            self._begin_live_videos(episode_id, enabled=wanted)
-
-    def _begin_live_videos(self, episode_id: int, *, enabled: bool) -> None:
-        recorders = self._live_maker.at(
-            self._promises.path(episode_id),
-            second_name=self._promises.second_name("episode", episode_id),
-            enabled=enabled,
-        )
-        main = self.video_recorder = recorders[0]
-        if not main.enabled:
-            return
-        self._live_videos = LiveVideos(
-            recorders,
-            tolerates=functools.partial(self._tolerates, "video"),
-            on_picture_error=self.note_error,
-        )
-        self._live_videos.begin()
-
-    def _caption(self) -> Caption:
-        """Return what is written on the picture of this moment."""
-        stats = self.stats_recorder
-        began, now = self._reset_clock, self._subject.clock()
-        return Caption(
-            episode_id=self._running.episode_id,
-            step=stats.steps or 0,
-            time=None if began is None or now is None else now - began,
-            reward=stats.rewards or 0.0,
-        )
-
-    def _new_trajectory(
-        self,
-        episode: BegunEpisode,
-        start: EpisodeStart | None,
-        observation: Any,
-        *,
-        promise: Mapping[str, Any] | None,
-        is_kept: bool,
-    ) -> EpisodeTrajectory:
-        name = trajectory_prefix(self._place.infix, episode.episode_id)
-        recorder = TrajectoryRecorder(
-            self._logs,
-            name,
-            facts=self._facts.of_trajectory(
-                episode, start, video=promise, is_kept=is_kept
+        recording.begin(
+            observation,
+            wants_video=wanted,
+            keeps=self._choice.keeps_trajectory(
+                episode.episode_id, episode_type=episode.type, has_video=wanted
             ),
-            states=None if start is None else self._states,
-            start=start,
-            pace=self._pace,
-            observation=observation if self._options.observations else None,
-            # It may be dropped without the others.
-            is_alone=self._kept is not None and promise is not None,
-        )
-        return EpisodeTrajectory(
-            recorder,
-            episode_id=episode.episode_id,
-            promise=promise,
-            stays=is_kept and self._choice.keeps_without_video(episode.type),
-            tolerates=functools.partial(self._tolerates, "trajectory"),
+            stays=self._choice.keeps_without_video(episode.type),
         )
 
     def _take_last_picture(self) -> None:
-        """Take the picture of the running episode's last step, if it was left out."""
-        if self.stats_recorder.done is not False or self._ending is not None:
-            return
-        if self._trajectory is not None:
-            self._trajectory.take_frame()
-        if self._live_videos is not None:
-            self._live_videos.take_last()
+        """Take the frame of the running episode's last step, if it was left out."""
+        is_running = self.stats_recorder.done is False and self._ending is None
+        if is_running and self._recording is not None:
+            self._recording.take_last()
 
     def _finished_episode(self) -> FinishedEpisode:
-        stats, episode = self.stats_recorder, self._running
+        stats, episode = self.stats_recorder, self._run.episode
         return FinishedEpisode(
             episode_id=episode.episode_id,
             length=stats.episode_lengths[-1],
@@ -700,25 +540,22 @@ class Recorder:
 
     def _journal_cut(self, facts: Mapping[str, Any]) -> None:
         """Write down an episode that is no part of the statistics."""
-        episode = self._episode
         is_over = self.stats_recorder.done is not False
-        if is_over or episode is None or self._journaled == episode.episode_id:
+        if is_over or self._journaled == self._run.episode.episode_id:
             return
-        self._journaled = episode.episode_id
-        cut = {"episode_id": episode.episode_id, "reason": facts.get("reason")}
+        self._journaled = self._run.episode.episode_id
+        cut = {"episode_id": self._journaled, "reason": facts.get("reason")}
         self._journal.note("cut", {**cut, **self._choice_facts(is_complete=False)})
 
     def _choice_facts(self, *, is_complete: bool) -> dict[str, Any]:
         """Return whether the running episode was chosen, and how it is filmed."""
+        assert self._recording is not None
         standing = self._standing(is_complete=is_complete)
-        chosen = self._choice.is_scheduled and standing is Standing.CHOSEN
-        recording = None
-        if self._trajectory is not None and self._trajectory.deferred is not None:
-            recording = DEFERRED
-        elif self._live_videos is not None:
-            recording = LIVE
         is_out = standing is Standing.DROPPED
-        return {"chosen": chosen, "recording": None if is_out else recording}
+        return {
+            "chosen": self._choice.is_scheduled and standing is Standing.CHOSEN,
+            "recording": None if is_out else self._recording.mode,
+        }
 
     def _tell_of_episode(self) -> None:
         if not self._trackers:
@@ -732,27 +569,12 @@ class Recorder:
 
     def _tell_of_videos(self) -> None:
         if self._trackers:
-            self._trackers.videos(self._videos.news())
+            self._trackers.videos(self._run.videos.news())
 
     def _note_tracker_fault(
         self, name: str, error: Exception, episode_id: int | None
     ) -> None:
         self._faults.note("tracker", f"{name}: {error}", episode_id=episode_id)
-
-    def _tolerates(self, what: What, error: BaseException) -> bool:
-        """Note what of the running episode is lost; tell whether to go on."""
-        return self._faults.tolerates(what, error, episode_id=self._next_episode_id - 1)
-
-    def _discard_episode(self) -> None:
-        for videos in (self.video_recorder, self._live_videos):
-            if videos is not None:
-                videos.discard()
-        self._discard_trajectory()
-
-    def _discard_trajectory(self) -> None:
-        trajectory, self._trajectory = self._trajectory, None
-        if trajectory is not None:
-            trajectory.discard()
 
     def _how_it_ended(self, otherwise: str) -> dict[str, Any]:
         """Return whether the running episode is complete, and what ended it."""
@@ -766,7 +588,7 @@ class Recorder:
     def _lacks_last_step(self) -> bool:
         """Whether a signal's handler raised before the last step's row was written."""
         steps = self.stats_recorder.steps or 0
-        return self._trajectory is not None and self._trajectory.lacks(steps)
+        return self._recording is not None and self._recording.lacks(steps)
 
     def _standing(self, *, is_complete: bool) -> Standing:
         """Return how the running episode stands, which is over."""
@@ -774,7 +596,7 @@ class Recorder:
             # What the schedule has said is final.
             return Standing.CHOSEN
         return self._kept.judge(
-            self._running.episode_id,
+            self._run.episode.episode_id,
             self._finished_episode() if is_complete else None,
         )
 
@@ -783,7 +605,7 @@ class Recorder:
         try:
             do()
         except (DirectoryNotWritable, FileNotWritten) as error:
-            if not self._tolerates("trajectory", error):
+            if not self._run.tolerates("trajectory", error):
                 raise
 
     def _end_episode(self, *, otherwise: str = CLOSE) -> None:
@@ -792,87 +614,20 @@ class Recorder:
         Args:
             otherwise: why, where it is not over and nothing was raised.
         """
+        if self._recording is None:
+            return
         facts = self._how_it_ended(otherwise)
         standing = self._standing(is_complete=facts["complete"])
         try:
             self._journal_cut(facts)
-            self._end_trajectory(facts, standing)
         finally:
-            if self._live_videos is not None:
-                self._end_live_videos(self._live_videos, facts, standing)
+            self._recording.end(facts, standing)
         if self._kept is not None:
             self._settle(self._kept.settle)
 
-    def _end_trajectory(self, facts: Mapping[str, Any], standing: Standing) -> None:
-        trajectory = self._trajectory
-        if trajectory is None:
-            return
-        if standing is Standing.DROPPED and not trajectory.stays:
-            self._discard_trajectory()
-            return
-        verdict: Mapping[str, Any] = {}
-        if self._kept is not None and self._choice.is_scheduled:
-            verdict = self._kept.verdict(standing, trajectory.promise or {})
-        trajectory.end(
-            {
-                **facts,
-                **verdict,
-                "length": trajectory.recorder.steps,
-                "reward": self.stats_recorder.rewards,
-                "end_time": time.time(),
-            }
-        )
-        self._trajectory = None
-        if trajectory.is_there:
-            self._hand_on(trajectory, standing)
-        # Else the disk was too full for a single row: there is nothing to promise.
-
-    def _hand_on(self, trajectory: EpisodeTrajectory, standing: Standing) -> None:
-        """Let others keep, render or finish a trajectory that is whole."""
-        episode_id, deferred = self._running.episode_id, trajectory.deferred
-        if deferred is not None:
-            deferred.close()
-        if self._kept is not None and standing is Standing.CANDIDATE:
-            self._kept.hold_trajectory(
-                episode_id,
-                trajectory.path,
-                size=trajectory.recorder.size,
-                promise=trajectory.promise or {},
-                stays=trajectory.stays,
-                deferred=deferred,
-            )
-            return
-        if deferred is not None and standing is Standing.CHOSEN:
-            self._videos.expect(Path(deferred.path))
-        self._ended.add(trajectory.path)
-
-    def _end_live_videos(
-        self, videos: LiveVideos, facts: Mapping[str, Any], standing: Standing
-    ) -> None:
-        """Finish the videos that were drawn live; what is known goes with them."""
-        if standing is Standing.DROPPED:
-            videos.discard()
-            return
-        stats, kept = self.stats_recorder, self._kept
-        known = {**facts, "length": stats.steps, "reward": stats.rewards}
-        if kept is not None and standing is Standing.CHOSEN:
-            known["selection"] = kept.chosen_facts()
-
-        def list_one(recorder: VideoRecorder) -> None:
-            if kept is not None and standing is Standing.CANDIDATE:
-                kept.hold_live(self._running.episode_id, recorder)
-            elif recorder.path is not None and "first_video" not in recorder.metadata:
-                self._videos.expect(Path(recorder.path))
-
-        try:
-            videos.end(known, list_one)
-        finally:
-            if standing is Standing.CHOSEN:
-                videos.name_again()
-
     def live_video_facts(self) -> dict[str, Any]:
         """Return what is known of a live video from its episode's beginning."""
-        return self._facts.of_live_video(self._running)
+        return self._run.live_facts()
 
     def _write_last_results(self) -> int:
         """Write what the run amounts to; return how many videos are pending."""

@@ -12,7 +12,9 @@ from ..file_digests import file_sha256
 from ..formats.journal import JournalEntry, JournalWriter
 from ..provenance import look_around
 from ..results.run import Run
+from .episode_choice import EpisodeChoice
 from .options import RecorderOptions
+from .selection import Selection
 from .versions import versions
 
 
@@ -21,11 +23,7 @@ class RunJournal:
 
     Args:
         path: of the journal.
-        env_info: what is recorded, as gym's manifests have it.
-        schedule: the name of what chooses the episodes that get a video.
-        keep: by which rule videos are kept, and whether another process decides; None
-            where all are kept.
-        first_episode_id: the number of the run's first episode.
+        facts: of the run.
         options: what was asked for.
         tolerates: tells whether to go on without a line that cannot be written.
 
@@ -37,34 +35,16 @@ class RunJournal:
         self,
         path: Path,
         *,
-        env_info: Mapping[str, str],
-        schedule: str,
-        keep: Mapping[str, Any] | None,
-        first_episode_id: int,
+        facts: Mapping[str, Any],
         options: RecorderOptions,
         tolerates: Callable[[FileNotWritten], bool],
     ) -> None:
-        facts = {
-            "env_info": dict(env_info),
-            "schedule": schedule,
-            "keep": keep,
-            "first_episode_id": first_episode_id,
-            "versions": dict(versions()),
-        }
         self.run = Run(facts)
         self._path = path
         self._writer = JournalWriter(path, run=facts)
         self._tolerates = tolerates
         self._policy = _policy_facts(options)
         self._surroundings = look_around()
-
-    def begin(self) -> None:
-        """Write down what the run is; once. A killed one is known by that.
-
-        Raises:
-            FileNotWritten: the disk is full.
-        """
-        self._write(self._writer.begin)
 
     def add(self, entry: JournalEntry) -> None:
         """Write down a completed episode.
@@ -107,6 +87,22 @@ class RunJournal:
             named = FileNotWritten(self._path, error.strerror or error)
             if not self._tolerates(named):
                 raise named from error
+
+
+def facts_of(choice: EpisodeChoice) -> dict[str, Any]:
+    """Return what is said of a run besides what is recorded."""
+    return {
+        "schedule": choice.schedule_name,
+        "keep": _rule(choice.selection),
+        "versions": dict(versions()),
+    }
+
+
+def _rule(selection: Selection | None) -> dict[str, Any] | None:
+    if selection is None:
+        return None
+    left_open = {"left_open": True} if selection.is_left_open else {}
+    return {"rule": selection.name, **left_open}
 
 
 def _policy_facts(options: RecorderOptions) -> dict[str, Any]:

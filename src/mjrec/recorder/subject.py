@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, Protocol
 
-from ..errors import NoPictures
+from ..errors import NoPictures, PicturesDiffer
 from ..simulation.state_source import StateSource
 from .options import RenderingChoice
 from .video_recorder import PictureSource, can_give_pictures
@@ -72,6 +72,30 @@ def check_pictures(subject: Subject) -> None:
         f"{what_is_missing(subject.pictures)}, or record statistics only with "
         "video_callable=False."
     )
+
+
+def check_refusal(subject: Subject, refusal: str) -> None:
+    """Check that videos can be drawn live that cannot be rendered later.
+
+    Args:
+        subject: what is recorded.
+        refusal: why they cannot be rendered later.
+
+    Raises:
+        PicturesDiffer: nothing else was asked for.
+        NoPictures: they cannot be drawn live either.
+    """
+    if subject.rendering.is_forced:
+        raise PicturesDiffer(
+            f"The videos of {subject.env_id} were to be rendered later, from recorded "
+            f'states, and cannot be: {refusal}. Use render="live".'
+        )
+    if not can_give_pictures(subject.pictures):
+        raise NoPictures(
+            f"The videos of {subject.env_id} cannot be rendered from its states: "
+            f"{refusal}. They cannot be drawn live either: "
+            f"{what_is_missing(subject.pictures)}."
+        )
 
 
 def what_is_missing(pictures: PictureSource) -> str:

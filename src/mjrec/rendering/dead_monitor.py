@@ -28,13 +28,13 @@ from ..formats.trajectory_file import finish_trajectory, open_trajectory
 from ..formats.video_metadata import is_done
 from ..json_text import loads
 from ..results.listing import Listing, listing_lock, write_listing
+from ..results.recorded_environment import locked_run
 from ..results.sources import MonitorResults
 from .cut_texts import finish_text
 from .cut_videos import finish_video
 from .known_episodes import KnownEpisodes
-from .pending import EpisodeKey, claim
-from .recorded_clips import ClipKey, clip_parts
-from .recorded_facts import open_for_rendering
+from .recorded_facts import open_for_rendering, video_path
+from .recordings import claim, key_of, parts_of
 from .recovery_report import RecoveredFile
 from .remains import (
     Remains,
@@ -43,7 +43,6 @@ from .remains import (
     model_leftovers,
     unfinished_logs,
 )
-from .videos import video_path
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +86,8 @@ class DeadMonitors:
                 raise
             lock.release()
             # A process that rendered meanwhile took the monitor for open.
-            write_listing(self._directory, infix)
+            if (self._directory / manifest_name(infix)).exists():
+                write_listing(self._directory, infix)
 
     def sweep_models(self) -> None:
         """Remove unfinished files of models."""
@@ -173,7 +173,7 @@ class DeadMonitors:
     @contextlib.contextmanager
     def _claimed(self, path: Path) -> Iterator[bool]:
         """Hold the lock of a file's episode; False where somebody keeps it."""
-        key = EpisodeKey.of(path.name) or EpisodeKey.of(_final_name(path.name))
+        key = key_of(path.name) or key_of(_final_name(path.name))
         if key is None:
             yield True
             return
@@ -269,20 +269,33 @@ def _missing_clips(remains: Remains) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
     One that cannot be read is left out; whoever renders the directory hears of it.
     """
-    keys = {ClipKey.of(path.name) for path in remains.clip_parts}
+    keys = {key_of(path.name) for path in remains.clip_parts}
     for key in keys - {None}:
         assert key is not None
         with contextlib.suppress(UnreadableFile, IndexError):
-            first = clip_parts(remains.directory, key)[0]
-            with open_for_rendering(first) as reader:
-                facts = reader.header.facts
-            video = video_path(first, facts)
-            clip = {"episode_id": facts.get("episode_id") or 0, "clip": first.name}
-            yield "clip", {**clip, "video": video.name}
+            parts = parts_of(remains.directory, key)
+            facts, last = _facts_of(parts[0]), _facts_of(parts[-1])
+            yield (
+                "clip",
+                {
+                    "episode_id": facts.get("episode_id") or 0,
+                    "last_episode_id": last.get("episode_id") or 0,
+                    "clip": parts[0].name,
+                    "video": video_path(parts[0], facts).name,
+                },
+            )
+
+
+def _facts_of(path: Path) -> Mapping[str, Any]:
+    with open_for_rendering(path) as reader:
+        return reader.header.facts
 
 
 def _run_facts(remains: Remains) -> Mapping[str, Any]:
-    """Return what the first line says of a journal that is gone."""
+    """Return what the first line says of a journal that is gone, or never was."""
+    with contextlib.suppress(OSError, ValueError):
+        if run := locked_run(remains.lock):
+            return run
     results = MonitorResults(remains.files)
     details = results.details
     return {
@@ -362,7 +375,7 @@ def _is_newer(line: bytes) -> bool:
 
 def _listed(infix: Infix, listing: Listing) -> Iterator[RecoveredFile]:
     """Yield the statistics and the manifest, as far as they were written."""
-    if listing.is_new_stats:
+    if listing.stats is not None and listing.is_new_stats:
         count = len(listing.stats.timestamps)
         what = f"{count} {'episode' if count == 1 else 'episodes'}"
         yield RecoveredFile(listing.manifest.stats, what)

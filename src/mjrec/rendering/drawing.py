@@ -23,7 +23,7 @@ from ..simulation.mujoco_warnings import log_mujoco_warnings
 from ..simulation.recorded_scene import RecordedScene
 from ..simulation.renderer import SceneRenderer
 from .recorded_facts import open_for_rendering
-from .recorded_pictures import check_has_pictures
+from .recorded_frames import check_has_frames
 from .views import PlainCamera, View
 
 
@@ -171,7 +171,7 @@ def trajectory_drawing(
     """
     with contextlib.ExitStack() as opened:
         reader = opened.enter_context(open_for_rendering(path))
-        check_has_pictures(reader)
+        check_has_frames(reader)
         facts = reader.header.facts
         scene = RecordedScene(reader)
         model, recorded = scene.model, scene.view

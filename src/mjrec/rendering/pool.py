@@ -3,17 +3,25 @@
 
 from __future__ import annotations
 
+import collections
+import contextlib
+import fcntl
 import itertools
 import json
 import logging
 import os
 import selectors
-from collections.abc import Iterator, Mapping, Sequence
+import struct
+import sys
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+
 from ..carried_errors import unpacked
+from ..child_python import Child
 from ..errors import ClosedError, Error, GLError, InvalidArgument
 from ..frames import Frame
 from ..gl import backend_for_children
@@ -22,11 +30,19 @@ from ..gl.backends import (
     environment_for,
     rendering_is_off,
 )
+from ..patience import Patience
 from ..simulation.model_trust import with_all_models_trusted
-from .pool_worker import FRAME, PoolWorker
 from .views import PlainCamera, View, plain_camera
 
 logger = logging.getLogger(__name__)
+
+# What a worker sends begins with its kind and length.
+HEADER = struct.Struct("=cQ")
+FRAME, TEXT = b"F", b"T"
+
+_MOST_BUFFERED = 2
+# What users may have without privileges: one frame of 480x480, and more.
+_PIPE_BYTES = 1 << 20
 
 
 class WorkerPool:
@@ -77,12 +93,14 @@ class WorkerPool:
         self._environ = _environment(os.environ, alone=count == 1)
         if trust_models:
             self._environ = with_all_models_trusted(self._environ)
-        self._workers = [PoolWorker() for _ in range(count)]
+        self._workers = [_Worker() for _ in range(count)]
         self.limit = count
         self.gl_facts: dict[str, Any] = {}
         self._has_drawn = False
-        # The number of the call whose frames are drawn.
+        # What is drawn: of which call, what, and the numbers of its frames.
         self._call = 0
+        self._drawing: Mapping[str, Any] = {}
+        self._indices: Sequence[int] = ()
         self._closed = False
         self._process_id = os.getpid()
 
@@ -142,7 +160,10 @@ class WorkerPool:
         """
         self._check_usable()
         self._call += 1
-        drawn = self._drawn(dict(drawing), indices, self._call)
+        for worker in self._workers:
+            worker.leave()
+        self._drawing, self._indices = dict(drawing), indices
+        drawn = self._drawn(self._call, self._workers[: self.limit])
         first = list(itertools.islice(drawn, 1))
         return itertools.chain(first, drawn)
 
@@ -174,20 +195,32 @@ class WorkerPool:
                 "in the process that uses it."
             )
 
-    def _start(self, worker: PoolWorker) -> None:
+    def _start(self, worker: _Worker) -> None:
+        if worker.child is not None:
+            return
         if "MUJOCO_GL" not in self._environ:
             self._environ = environment_for(backend_for_children(), self._environ)
         worker.start(self._environ)
 
-    def _drawn(
-        self, drawing: Mapping[str, Any], indices: Sequence[int], call: int
-    ) -> Iterator[Frame]:
-        workers = self._workers[: self.limit]
+    def _order(self, worker: _Worker) -> None:
+        """Tell a worker what to draw, and start it if need be."""
+        self._start(worker)
+        assert worker.child is not None
+        runs = _runs(self._indices[position] for position in worker.owes)
+        order = json.dumps({"drawing": self._drawing, "runs": runs})
+        worker.patience.renew()
+        # One that has died is noticed when it is listened to.
+        with contextlib.suppress(OSError):
+            worker.child.orders.write(order.encode() + b"\n")
+
+    def _drawn(self, call: int, workers: Sequence[_Worker]) -> Iterator[Frame]:
+        count = len(self._indices)
         try:
             for first, worker in enumerate(workers):
-                positions = range(first, len(indices), len(workers))
-                worker.take(drawing, indices, positions)
-            for position in range(len(indices)):
+                worker.owes = range(first, count, len(workers))
+                if worker.owes:
+                    self._order(worker)
+            for position in range(count):
                 worker = workers[position % len(workers)]
                 while not worker.arrived:
                     if worker.error is not None:
@@ -204,13 +237,12 @@ class WorkerPool:
                 for worker in workers:
                     worker.leave()
 
-    def _wait_for_news(self, workers: Sequence[PoolWorker]) -> None:
+    def _wait_for_news(self, workers: Sequence[_Worker]) -> None:
         """Wait until a worker says something; end those that have not for too long."""
-        for worker in workers:
-            if worker.may_send and worker.child is None:
-                self._start(worker)
-                worker.begin()
         hungry = [worker for worker in workers if worker.may_send]
+        for worker in hungry:
+            if worker.child is None:
+                self._order(worker)
         seconds = min(worker.patience.begin_slice() for worker in hungry)
         heard = self._listen(hungry, seconds)
         for worker in hungry:
@@ -220,9 +252,7 @@ class WorkerPool:
             elif worker.patience.is_over:
                 self._end_hanging(worker)
 
-    def _listen(
-        self, workers: Sequence[PoolWorker], seconds: float
-    ) -> list[PoolWorker]:
+    def _listen(self, workers: Sequence[_Worker], seconds: float) -> list[_Worker]:
         """Take in what the workers send, waiting so long for it; return who sent."""
         with selectors.PollSelector() as selector:
             for worker in workers:
@@ -235,20 +265,26 @@ class WorkerPool:
             try:
                 self._take_in(worker)
             except EOFError:
-                assert worker.child is not None
-                worker.lose("died", worker.child.last_words())
+                self._lose(worker, "died", worker.child.last_words())
             except BaseException:
                 # Ctrl-C, in the midst of a message: what follows makes no sense.
                 worker.end()
                 raise
         return heard
 
-    def _take_in(self, worker: PoolWorker) -> None:
-        while worker.may_send and (message := worker.next_message()):
+    def _take_in(self, worker: _Worker) -> None:
+        assert worker.child is not None
+        while worker.may_send:
+            worker.child.forget_words()
+            message = next(worker.messages)
+            if message is None:
+                return
             kind, content = message
             if kind == FRAME:
                 self._has_drawn = True
-                worker.add(content)
+                frame = np.frombuffer(content, np.uint8).reshape(worker.shape)
+                worker.arrived.append(frame)
+                worker.owes = worker.owes[1:]
                 continue
             said = json.loads(content)
             if "log" in said:
@@ -259,7 +295,7 @@ class WorkerPool:
                 worker.shape = (*said["size"], 3)
                 self.gl_facts = said["gl"]
 
-    def _end_hanging(self, worker: PoolWorker) -> None:
+    def _end_hanging(self, worker: _Worker) -> None:
         assert worker.child is not None
         seconds = worker.patience.seconds
         logger.error(
@@ -274,7 +310,124 @@ class WorkerPool:
             "in the log"
         )
         # Where nothing was ever drawn, it is not for the sake of this frame.
-        worker.lose("hung", how, kind=Error if self._has_drawn else GLError)
+        self._lose(worker, "hung", how, kind=Error if self._has_drawn else GLError)
+
+    def _lose(
+        self, worker: _Worker, what: str, how: str, *, kind: type[Error] = Error
+    ) -> None:
+        """End a worker's process; the second that is lost at a frame is an error."""
+        worker.end()
+        position = worker.owes.start
+        if worker.lost_at == position:
+            source = self._drawing.get("trajectory", "the given states")
+            worker.error = kind(
+                f"A worker {what} while drawing frame {self._indices[position]} of "
+                f"{source}, which was the second try: {how}"
+            )
+        else:
+            logger.warning("A drawing worker %s and is replaced: %s", what, how)
+        worker.lost_at = position
+
+
+class _Worker:
+    """A worker's process, which may be a second one, and its part of a job.
+
+    Attributes:
+        child: the process; None where there is none now.
+        messages: what it sends.
+        shape: of its frames.
+        arrived: the frames that it has sent and that were not taken.
+        owes: the positions of those that are to come.
+        error: what there is instead of the next one.
+        lost_at: the position at which a process was lost.
+    """
+
+    def __init__(self) -> None:
+        self.child: Child | None = None
+        self.patience = Patience()
+        self.messages: Iterator[tuple[bytes, bytearray] | None] = iter(())
+        self.shape = (0, 0, 3)
+        self.arrived: collections.deque[Frame] = collections.deque()
+        self.owes = range(0)
+        self.error: Error | None = None
+        self.lost_at: int | None = None
+
+    @property
+    def may_send(self) -> bool:
+        """Whether there is something to come, and room for it."""
+        is_full = len(self.arrived) >= _MOST_BUFFERED
+        return bool(self.owes) and self.error is None and not is_full
+
+    def start(self, environ: Mapping[str, str]) -> None:
+        try:
+            # No directory of others is kept from being removed or unmounted.
+            self.child = Child("mjrec.rendering.worker", environ=environ, cwd="/")
+        except OSError as error:
+            raise Error(
+                f"No process that draws could be started: {sys.executable!r}: {error}."
+            ) from error
+        pipe = self.child.answers.fileno()
+        os.set_blocking(pipe, False)
+        # The system may grant no more than it has.
+        with contextlib.suppress(OSError):
+            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        self.messages = _messages(pipe)
+
+    def leave(self) -> None:
+        """Forget the job; a process that has more to send of it is ended."""
+        if self.owes and self.error is None:
+            self.end()
+        self.owes = range(0)
+        self.error = self.lost_at = None
+        self.arrived.clear()
+
+    def end(self) -> None:
+        """End the process, whatever it is at. Idempotent."""
+        child, self.child = self.child, None
+        if child is not None:
+            child.end()
+
+
+def _messages(pipe: int) -> Iterator[tuple[bytes, bytearray] | None]:
+    """Yield kind and content of what comes through a pipe, None where it has to wait.
+
+    Raises:
+        EOFError: the pipe has ended.
+    """
+    while True:
+        header = yield from _received(pipe, HEADER.size)
+        kind, size = HEADER.unpack(header)
+        content = yield from _received(pipe, size)
+        yield kind, content
+
+
+def _received(pipe: int, size: int) -> Generator[None, None, bytearray]:
+    content = bytearray(size)
+    missing = memoryview(content)
+    while missing:
+        try:
+            count = os.readv(pipe, [missing])
+        except BlockingIOError:
+            yield None
+            continue
+        if not count:
+            raise EOFError
+        missing = missing[count:]
+    return content
+
+
+def _runs(indices: Iterable[int]) -> list[tuple[int, int, int]]:
+    """Return first, step and count of each even run in `indices`."""
+    runs: list[tuple[int, int, int]] = []
+    for index in map(int, indices):
+        first, step, count = runs[-1] if runs else (0, 0, 0)
+        if count == 1:
+            runs[-1] = (first, index - first, 2)
+        elif count > 1 and index == first + step * count:
+            runs[-1] = (first, step, count + 1)
+        else:
+            runs.append((index, 0, 1))
+    return runs
 
 
 def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:

@@ -1,47 +1,51 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories as rendering takes them: with facts that are what they should be.
+"""Recordings as rendering takes them: with facts that are what they should be.
 
-A trajectory may come from anybody. What is relied on is checked here, once, so that
-everything behind it finds a rate where there should be one.
+A recording may come from anybody. Facts are checked here, once, so that everything
+behind it finds a rate where there should be one, and no path leads elsewhere.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidArgument
+from ..errors import InvalidArgument, UnreadableFile
 from ..formats.json_fields import (
+    base_name,
     boolean,
     field,
     integer,
     list_of,
     mapping,
     number,
+    one_of,
     optional,
+    rate,
     text,
     unreadable,
 )
+from ..formats.monitor_directory import (
+    ClipPart,
+    Infix,
+    clip_video_prefix,
+    episode_of,
+    infix_of,
+    video_prefix,
+)
 from ..formats.trajectory_file import open_trajectory
 from ..formats.trajectory_reader import TrajectoryReader
-from ..formats.video_names import is_second_name
+from ..formats.video_names import further_parts, is_second_name, with_part
 from ..frames import QUALITIES
 from ..rates import to_rate
 from .views import PlainCamera, plain_camera
 
-# Not all that `Fraction` takes: 1e20000000 keeps it busy for a minute.
-_RATE = re.compile(r"\d{1,12}(/\d{1,12})?", re.ASCII)
 # What the user has asked for is written as it was given: 29.97, or a fraction that a
-# float exactly is.
-_ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/\d{1,40})?", re.ASCII)
-_BASE_NAME = re.compile(r"[\w.-]{1,200}", re.ASCII)
-_RECORDINGS = ("deferred", "live")
-_MOST_STEPS = 10**12
-# Each may have a file of its own.
-_MOST_CAMERAS = 100
+# float exactly is. Not all that `Fraction` takes: 1e20000000 keeps it busy.
+_ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/0*[1-9]\d{0,39})?", re.ASCII)
 
 
 def open_for_rendering(path: Path) -> TrajectoryReader:
@@ -57,7 +61,7 @@ def open_for_rendering(path: Path) -> TrajectoryReader:
     reader = open_trajectory(path)
     try:
         with unreadable(path):
-            _check(reader.header.facts)
+            _check_all(reader.header.facts, _FACTS)
     except BaseException:
         reader.close()
         raise
@@ -65,70 +69,82 @@ def open_for_rendering(path: Path) -> TrajectoryReader:
 
 
 def model_file(directory: Path, facts: Mapping[str, Any]) -> Path | None:
-    """Return what comes first of a model; what it was made from may never come.
-
-    Args:
-        directory: of the recording.
-        facts: the recording's, checked.
-    """
+    """Return the file of a recording's model that has to be there for rendering."""
     model = facts.get("model") or {}
+    # The compiled one comes first; what it was made from may never come.
     name = model.get("mjb") or model.get("xml")
     return None if name is None else directory / name
 
 
-def _check(facts: Mapping[str, Any]) -> None:
-    for key in ("rate", "timestep"):
-        field(facts, key, optional(_rate), default=None)
-    field(facts, "stride", _stride, default=1)
-    field(facts, "kept", boolean, default=True)
-    field(facts, "candidate", boolean, default=False)
-    for key in ("refusal", "broken_reason", "reason"):
-        field(facts, key, optional(text), default=None)
-    for key in ("scene", "exception"):
-        field(facts, key, optional(mapping), default=None)
-    field(facts, "model", optional(_model), default=None)
-    field(facts, "video", optional(_video), default=None)
-    field(facts, "clip", optional(_clip), default=None)
+def video_facts(facts: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what a recording says of its video; nothing where it has none."""
+    return facts.get("video") or {}
 
 
-def _model(value: Any) -> Mapping[str, Any]:
-    model = mapping(value)
-    for key in ("mjb", "xml"):
-        field(model, key, optional(_base_name), default=None)
-    return model
+def video_path(recording: Path, facts: Mapping[str, Any]) -> Path:
+    """Return where the video of a trajectory, or of a part of a clip, belongs.
+
+    Raises:
+        UnreadableFile: the recording names none, or one that is not its own.
+    """
+    name = str(video_facts(facts).get("name"))
+    clip = ClipPart.parse(recording.name)
+    infix = clip.infix if clip else Infix.parse(infix_of(recording.name) or "")
+    # The name of a clip's video tells in which episode it began; no other file does.
+    episode = episode_of(name if clip else recording.name)
+    own: set[str] = set()
+    if infix is not None and episode is not None:
+        own.add(f"{video_prefix(infix, episode)}.mp4")
+        if clip is not None:
+            own.add(f"{clip_video_prefix(infix, episode, clip.first_step)}.mp4")
+    if name not in own:
+        raise UnreadableFile(
+            recording,
+            f"the video that it names, {name!r:.200}, is not that of its own episode",
+        )
+    return recording.with_name(name)
 
 
-def _video(value: Any) -> Mapping[str, Any]:
-    video = mapping(value)
-    # Whether it is that of its own episode, `video_path` looks at.
-    field(video, "name", text, default="")
-    field(video, "quality", _one_of(*QUALITIES), default="full")
-    field(video, "recording", _one_of(*_RECORDINGS), default="live")
-    field(video, "reason", optional(text), default=None)
-    field(video, "selection", optional(mapping), default=None)
-    for key in ("fps", "max_fps"):
-        field(video, key, optional(_asked_rate), default=None)
-    field(video, "cameras", optional(_cameras), default=None)
-    for key in ("tiled", "annotate"):
-        field(video, key, boolean, default=False)
-    field(video, "also_named", optional(_second_name), default=None)
-    return video
+def further_video_paths(recording: Path, facts: Mapping[str, Any]) -> list[Path]:
+    """Return where the videos of a recording's further cameras belong.
+
+    Raises:
+        UnreadableFile: as `video_path`.
+    """
+    video = video_facts(facts)
+    cameras = video.get("cameras") or ()
+    if video.get("tiled") or len(cameras) < 2:
+        return []
+    first = video_path(recording, facts)
+    return [
+        first.with_name(with_part(first.name, part)) for part in further_parts(cameras)
+    ]
 
 
-def _clip(value: Any) -> Mapping[str, Any]:
-    clip = mapping(value)
-    for key in ("first_step", "part", "steps_before"):
-        field(clip, key, _count, default=0)
-    field(clip, "reward_before", number, default=0.0)
-    field(clip, "reset_time", optional(number), default=None)
-    return clip
+def _asked_rate(value: Any) -> Fraction:
+    if not _ASKED_RATE.fullmatch(text(value)):
+        raise ValueError(f"{value!r:.80} is no rate")
+    try:
+        return to_rate(Fraction(value))
+    except InvalidArgument as error:
+        raise ValueError(str(error)) from error
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, float) or integer(value) < 0:
+        raise ValueError(f"{value!r:.80} is no number of steps")
+    return int(value)
+
+
+def _stride(value: Any) -> int:
+    if _count(value) < 1:
+        raise ValueError("it is zero")
+    return int(value)
 
 
 def _cameras(value: Any) -> tuple[PlainCamera | None, ...]:
     cameras = list_of(optional(plain_camera))(value)
-    if not 1 <= len(cameras) <= _MOST_CAMERAS:
-        raise ValueError(f"{len(cameras)} is no number of cameras")
-    if None in cameras[1:]:
+    if not cameras or None in cameras[1:]:
         raise ValueError("only the first can be what the environment itself shows")
     return cameras
 
@@ -139,55 +155,52 @@ def _second_name(value: Any) -> str:
     return str(value)
 
 
-def _rate(value: Any) -> Fraction:
-    if not _RATE.fullmatch(text(value)):
-        raise ValueError(f"{value!r:.80} is no fraction")
-    return _positive(value)
+def _object_of(**checks: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def check(value: Any) -> Mapping[str, Any]:
+        _check_all(mapping(value), checks)
+        return mapping(value)
+
+    return optional(check)
 
 
-def _asked_rate(value: Any) -> Fraction:
-    if not _ASKED_RATE.fullmatch(text(value)):
-        raise ValueError(f"{value!r:.80} is no rate")
-    try:
-        return to_rate(_positive(value))
-    except InvalidArgument as error:
-        raise ValueError(str(error)) from error
+def _check_all(
+    facts: Mapping[str, Any], checks: Mapping[str, Callable[[Any], Any]]
+) -> None:
+    for key, check in checks.items():
+        field(facts, key, check, default=None)
 
 
-def _positive(value: str) -> Fraction:
-    _, _, denominator = value.partition("/")
-    if denominator and not int(denominator):
-        raise ValueError(f"{value!r} divides by zero")
-    if not Fraction(value):
-        raise ValueError("it is zero")
-    return Fraction(value)
-
-
-def _base_name(value: Any) -> str:
-    if not _BASE_NAME.fullmatch(text(value)):
-        raise ValueError(f"{value!r:.80} is no file's name")
-    return str(value)
-
-
-def _stride(value: Any) -> int:
-    return _steps(value, least=1)
-
-
-def _count(value: Any) -> int:
-    return _steps(value, least=0)
-
-
-def _steps(value: Any, *, least: int) -> int:
-    steps = integer(value)
-    if isinstance(value, float) or not least <= steps <= _MOST_STEPS:
-        raise ValueError(f"{steps!r:.80} is no number of steps")
-    return steps
-
-
-def _one_of(*choices: str) -> Any:
-    def choice(value: Any) -> str:
-        if text(value) not in choices:
-            raise ValueError(f"{value!r:.80} is not one of {', '.join(choices)}")
-        return str(value)
-
-    return choice
+_FACTS: Mapping[str, Callable[[Any], Any]] = {
+    "rate": optional(rate),
+    "timestep": optional(rate),
+    "stride": _stride,
+    "kept": boolean,
+    "candidate": boolean,
+    "refusal": optional(text),
+    "broken_reason": optional(text),
+    "reason": optional(text),
+    "scene": optional(mapping),
+    "exception": optional(mapping),
+    "model": _object_of(mjb=optional(base_name), xml=optional(base_name)),
+    "video": _object_of(
+        # Whether it is that of its own episode, `video_path` looks at.
+        name=text,
+        quality=one_of(*QUALITIES),
+        recording=one_of("deferred", "live"),
+        reason=optional(text),
+        selection=optional(mapping),
+        fps=optional(_asked_rate),
+        max_fps=optional(_asked_rate),
+        cameras=optional(_cameras),
+        tiled=boolean,
+        annotate=boolean,
+        also_named=optional(_second_name),
+    ),
+    "clip": _object_of(
+        first_step=_count,
+        part=_count,
+        steps_before=_count,
+        reward_before=number,
+        reset_time=optional(number),
+    ),
+}

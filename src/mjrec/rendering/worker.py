@@ -6,7 +6,7 @@ On its standard input it is told one JSON object a line::
     {"drawing": {...}, "runs": [[1, 2, 250]]}
 
 `drawing` is what `open_drawing` takes; `runs` are the frames, as first number, step and
-count. What it says begins with a `pool_worker.HEADER`. It is the bytes of a frame,
+count. What it says begins with a `pool.HEADER`. It is the bytes of a frame,
 `(height, width, 3) uint8`, or a JSON object::
 
     {"size": [48, 64], "gl": {...}}         before the frames of a job
@@ -35,7 +35,7 @@ from ..carried_errors import carried
 from ..child_python import say_stacks_when_asked, take_standard_output
 from ..simulation.canvas import KeptCanvas
 from .drawing import open_drawing
-from .pool_worker import FRAME, HEADER, TEXT
+from .pool import FRAME, HEADER, TEXT
 
 _NICE = 10
 

@@ -28,10 +28,13 @@ from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
 from ..formats.json_fields import field, integer, list_of, rate, read_object
 from ..formats.video_metadata import metadata_path
 from ..frames import Frame
-from ..rendering.captions import Captions
 from ..rendering.pool import WorkerPool
 from ..rendering.recorded_facts import open_for_rendering
-from ..rendering.recorded_pictures import check_has_pictures, warn_of_other_pictures
+from ..rendering.recorded_frames import (
+    captions,
+    check_has_frames,
+    warn_of_other_frames,
+)
 from ..rendering.views import View, plain_camera
 from .video_stream import VideoStream, read_stream, stream_frames, video_kind
 
@@ -152,10 +155,10 @@ class _Shots:
 @contextlib.contextmanager
 def _of_trajectory(path: Path, count: int, view: View) -> Iterator[_Shots]:
     with open_for_rendering(path) as reader:
-        check_has_pictures(reader)
-        warn_of_other_pictures(reader)
+        check_has_frames(reader)
+        warn_of_other_frames(path.name, reader.header.facts)
         indices = _spread(reader.frame_count, count, path)
-        times = [caption.time for caption in Captions(reader, indices)]
+        times = [caption.time for caption in captions(reader, indices)]
     workers = WorkerPool(1)
     try:
         yield _Shots(workers.frames(path, indices, view), times)

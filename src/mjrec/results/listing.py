@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from ..formats.json_fields import read_object
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.manifest import Manifest, read_manifest, write_manifest
 from ..formats.monitor_directory import (
+    ClipPart,
     Infix,
     episode_of,
     infix_of,
@@ -34,7 +35,7 @@ from ..formats.monitor_directory import (
     trajectory_prefix,
     video_prefix,
 )
-from ..formats.pending_videos import forget_failure, reason_of
+from ..formats.pending_videos import failure_path, reason_of
 from ..formats.stats_file import StatsFile, read_stats_file, write_stats_file
 from ..formats.video_metadata import is_done, metadata_path
 from ..formats.video_names import tiled_name
@@ -53,13 +54,13 @@ class Listing:
 
     Attributes:
         manifest: as it is now.
-        stats: the statistics, as they are now.
+        stats: the statistics, as they are now; None where they cannot be had.
         is_new_manifest: it had to be written.
         is_new_stats: they had to be written.
     """
 
     manifest: Manifest
-    stats: StatsFile
+    stats: StatsFile | None
     is_new_manifest: bool
     is_new_stats: bool
 
@@ -130,16 +131,16 @@ def write_listing(
         old = results.manifest
         if run is None:
             run = Run() if files.journal is None else Run.read(files.journal)
-        stats = results.stats() if stats is None else stats
+        stats = _stats_of(results) if stats is None else stats
         name = f"{stats_prefix(infix)}.stats.json" if old is None else old.stats
-        is_new_stats = _saved(directory / name) != stats
-        if is_new_stats:
+        is_new_stats = stats is not None and _saved(directory / name) != stats
+        if stats is not None and is_new_stats:
             write_stats_file(directory / name, stats)
         manifest = _manifest(directory, infix, files, results, run, stats_name=name)
         is_new = old is None or _as_read(manifest) != old
         if is_new:
             write_manifest(directory / manifest_name(infix), manifest)
-        _forget_failures(directory, files)
+        _forget_failures(directory, files, manifest)
     return Listing(manifest, stats, is_new, is_new_stats)
 
 
@@ -169,6 +170,16 @@ def _files_of(directory: Path, infix: Infix) -> MonitorFiles:
     return MonitorFiles(str(infix), (*paths, *in_flight))
 
 
+def _stats_of(results: MonitorResults) -> StatsFile | None:
+    """Return the statistics; None where they are gone, and the journal too."""
+    try:
+        return results.stats()
+    except UnreadableFile:
+        if results.files.journal is not None:
+            raise
+        return None
+
+
 def _saved(path: Path) -> StatsFile | None:
     try:
         return read_stats_file(path)
@@ -194,69 +205,74 @@ def _manifest(
     old = results.details
     finished, broken = _videos(directory, files)
     pending = _pending(directory, infix, files, run, old)
-    listed = {name for pair in finished for name in pair} | set(broken)
-    chosen = _chosen(run, old)
-    keep = _keep(run, old)
-    if keep is not None and keep.get("decided") is not True and "recorded" not in keep:
-        # Its process was killed before it chose: what is there are candidates.
-        numbers = [*map(episode_of, listed), *(e.get("episode_id") for e in pending)]
-        chosen |= {number for number in numbers if number is not None}
-    first = run.facts.get("first_episode_id", old.get("first_episode_id"))
-    following = max(run.last_episode_id, files.last_episode_id) + 1
-    faults = [f for f in old.get("faults") or () if f not in run.faults]
-    surroundings = run.surroundings or old.get("surroundings")
+    if run.facts or not old:
+        names = [*(video for video, _ in finished), *broken]
+        details = _details(run, files, old, pending, names)
+    else:
+        details = {**old}
     return Manifest(
         stats=stats_name,
         videos=tuple(finished),
         env_info=run.facts.get("env_info")
         or results.env_info
         or {"gym_version": GYM_VERSION, "env_id": None},
-        mjrec={
-            "format_version": _FORMAT_VERSION,
-            "schedule": {
-                "name": f"keep:{keep['rule']}"
-                if keep is not None and "rule" in keep
-                else run.facts.get("schedule", (old.get("schedule") or {}).get("name")),
-                "recorded": sorted(chosen)
-                if keep is None
-                else keep.get("recorded", sorted(chosen)),
-            },
-            **({} if keep is None else {"keep": _without(keep, "recorded")}),
-            "first_episode_id": 0 if first is None else first,
-            "next_episode_id": max(following, old.get("next_episode_id") or 0),
-            "pending": pending,
-            "broken": broken,
-            "faults": [*faults, *run.faults],
-            "versions": run.facts.get("versions", old.get("versions", {})),
-            "surroundings": surroundings,
-            **({"recovered": True} if run.recovered else {}),
-        },
+        mjrec={**details, "pending": pending, "broken": broken},
     )
 
 
-def _chosen(run: Run, old: Mapping[str, Any]) -> set[int]:
-    listed = (old.get("schedule") or {}).get("recorded") if not run.facts else ()
-    return run.chosen | {n for n in listed or () if type(n) is int}
+def _details(
+    run: Run,
+    files: MonitorFiles,
+    old: Mapping[str, Any],
+    pending: Sequence[Mapping[str, Any]],
+    names: Sequence[str],
+) -> dict[str, Any]:
+    """Return what gym's manifests do not say, but for the videos.
+
+    Args:
+        run: as its journal tells it.
+        files: of the monitor.
+        old: what the manifest that is there says.
+        pending: the videos that are pending.
+        names: of those that are there, or broken.
+    """
+    keep = _keep(run)
+    name = run.facts.get("schedule")
+    chosen = set(run.chosen)
+    if keep is not None:
+        name = f"keep:{keep.get('rule')}"
+        # A process that was killed had not chosen: what is there are candidates.
+        numbers = [*map(episode_of, names), *(e.get("episode_id") for e in pending)]
+        chosen.update(number for number in numbers if number is not None)
+        chosen = set(keep.pop("recorded", chosen))
+    following = max(run.last_episode_id, files.last_episode_id) + 1
+    faults = [fault for fault in old.get("faults") or () if fault not in run.faults]
+    return {
+        "format_version": _FORMAT_VERSION,
+        "schedule": {"name": name, "recorded": sorted(chosen)},
+        **({} if keep is None else {"keep": keep}),
+        "first_episode_id": run.facts.get("first_episode_id", 0),
+        "next_episode_id": max(following, old.get("next_episode_id") or 0),
+        "faults": [*faults, *run.faults],
+        "versions": run.facts.get("versions", {}),
+        "surroundings": run.surroundings or old.get("surroundings"),
+        **({"recovered": True} if run.recovered else {}),
+    }
 
 
-def _keep(run: Run, old: Mapping[str, Any]) -> Mapping[str, Any] | None:
+def _keep(run: Run) -> dict[str, Any] | None:
     """Return what is said of the videos that are kept; None where all are."""
     if run.keep is not None:
-        return run.keep
-    begun = run.facts.get("keep") if run.facts else old.get("keep")
-    if begun is None:
+        return dict(run.keep)
+    if run.facts.get("keep") is None:
         return None
     return {
         "decided": False,
         "chosen": sorted(run.chosen),
         "finished": None,
         "most_bytes_held": None,
-        **begun,
+        **run.facts["keep"],
     }
-
-
-def _without(values: Mapping[str, Any], key: str) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if name != key}
 
 
 def _videos(
@@ -308,7 +324,7 @@ def _pending(
     keep = run.keep or {}
     is_final = keep.get("decided") is True
     wanted = set(keep.get("recorded", ())) if is_final else run.deferred - run.dropped
-    entries = [
+    entries: list[Mapping[str, Any]] = [
         {
             "episode_id": number,
             "trajectory": trajectory_prefix(infix, number),
@@ -318,7 +334,7 @@ def _pending(
         if number in files.trajectories
     ]
     clips = [
-        dict(clip)
+        {key: clip[key] for key in ("episode_id", "clip", "video")}
         for clip in run.clips.values()
         if clip.get("clip") in files.clip_parts
     ]
@@ -326,19 +342,39 @@ def _pending(
     if not run.facts:
         # The journal is gone, or its beginning.
         entries += [e for e in old.get("pending") or () if e not in entries]
-    waiting = [
-        entry for entry in entries if not is_done(directory / str(entry["video"]))
+    return [
+        _with_reason(directory, entry)
+        for entry in entries
+        if not _names_video(entry) or not is_done(directory / entry["video"])
     ]
-    return [_with_reason(directory, entry) for entry in waiting]
+
+
+def _names_video(entry: Mapping[str, Any]) -> bool:
+    """Tell whether an entry names a video of this directory; it may be anybody's."""
+    name = entry.get("video")
+    return isinstance(name, str) and episode_of(name) is not None
 
 
 def _with_reason(directory: Path, entry: Mapping[str, Any]) -> Mapping[str, Any]:
-    reason = reason_of(directory / str(entry["video"]))
-    return entry if reason is None else {**entry, "reason": reason}
+    if not _names_video(entry):
+        return entry
+    reason = reason_of(directory / entry["video"])
+    clip = str(entry.get("clip"))
+    if reason is None and ClipPart.parse(clip) is not None:
+        reason = reason_of(directory / clip)
+    said = {key: value for key, value in entry.items() if key != "reason"}
+    return said if reason is None else {**said, "reason": reason}
 
 
-def _forget_failures(directory: Path, files: MonitorFiles) -> None:
+def _forget_failures(directory: Path, files: MonitorFiles, manifest: Manifest) -> None:
+    """Remove what was said of videos that are not pending any more."""
+    pending = (manifest.mjrec or {}).get("pending") or ()
+    said = {
+        failure_path(directory / str(entry[key])).name
+        for entry in pending
+        for key in ("video", "clip")
+        if key in entry and _names_video(entry)
+    }
     for path in files.failures:
-        video = path.with_name(path.name.replace(".failed.json", ".mp4"))
-        if is_done(video):
-            forget_failure(video)
+        if path.name not in said:
+            path.unlink(missing_ok=True)

@@ -68,12 +68,22 @@ def _in_journal(path: Path) -> object:
 
 
 def _in_lock(path: Path) -> object:
+    return locked_run(path).get("env_info")
+
+
+def locked_run(path: Path) -> Mapping[str, Any]:
+    """Return what the lock of a monitor says of its run.
+
+    Raises:
+        OSError, ValueError: it cannot be read.
+    """
     # Empty for a moment after it was made. A link is nobody's lock.
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
-        return json_object(os.read(descriptor, _LONGEST_LOCK)).get("env_info")
+        run = json_object(os.read(descriptor, _LONGEST_LOCK)).get("run")
     finally:
         os.close(descriptor)
+    return run if isinstance(run, Mapping) else {}
 
 
 def _in_log(path: Path) -> object:

@@ -79,6 +79,7 @@ class Run:
                 self._add(number, facts.get("chosen"), facts.get("recording"))
             case "clip", {"episode_id": int(number), "video": str(video)}:
                 self._add(number, ".step" not in video, None)
+                self._add(facts.get("last_episode_id", -1), False, None)
                 if _is_base_name(video):
                     self.clips[video] = facts
             case "dropped", int(number):

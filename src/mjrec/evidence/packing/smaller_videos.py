@@ -21,7 +21,7 @@ from ...formats.json_fields import read_object, unreadable
 from ...formats.video_metadata import metadata_path
 from ...rendering.pool import WorkerPool
 from ...rendering.progress import Progress
-from ...rendering.videos import render_video
+from ...rendering.render_video import render_video
 from ...rendering.views import View
 from .contents import VideoFiles
 
@@ -128,7 +128,7 @@ def _draw(
 ) -> None:
     out = folder / video.video.name
     render_video(
-        video.trajectory,
+        [video.trajectory],
         workers=workers,
         view=_view(video, scale),
         out=out,

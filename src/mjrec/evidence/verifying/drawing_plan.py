@@ -28,14 +28,16 @@ from ...formats.trajectory_reader import TrajectoryReader
 from ...formats.video_metadata import StepRuns
 from ...formats.video_names import view_of
 from ...frames import grid_shape
-from ...rendering.captions import Captions
-from ...rendering.recorded_facts import open_for_rendering
-from ...rendering.recorded_pictures import ChosenFrames, check_has_pictures
-from ...rendering.videos import (
+from ...rendering.recorded_facts import (
     further_video_paths,
-    is_annotated,
-    usual_fps,
+    open_for_rendering,
     video_path,
+)
+from ...rendering.recorded_frames import (
+    ChosenFrames,
+    captions,
+    check_has_frames,
+    usual_fps,
 )
 from ...rendering.views import PlainCamera, View, plain_camera
 from .live_pictures import told_live, why_others_are_shown
@@ -175,7 +177,7 @@ def _seen(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> _Seen:
         )
     views = _original_views(path, facts)
     try:
-        check_has_pictures(reader)
+        check_has_frames(reader)
     except NoPictures as error:
         if video.name in views and _is_live(facts):
             reason = recorded.get("reason") or facts.get("refusal")
@@ -194,7 +196,7 @@ def _seen(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> _Seen:
         view=_sized(video, reader, camera, tiles),
         cameras=tiles,
         chosen=chosen,
-        is_annotated=is_annotated(facts),
+        is_annotated=bool(recorded.get("annotate", False)),
         fps=usual_fps(facts, chosen),
     )
 
@@ -302,7 +304,7 @@ def _captions(reader: TrajectoryReader, seen: _Seen) -> Sequence[Caption] | None
         check_annotation()
     except MissingDependency as error:
         raise NotDrawable(str(error).removesuffix(".")) from error
-    return list(Captions(reader, seen.chosen.indices))
+    return list(captions(reader, seen.chosen.indices))
 
 
 def _mujoco(facts: Mapping[str, Any]) -> str | None:

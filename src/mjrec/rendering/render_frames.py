@@ -18,11 +18,7 @@ from ..errors import InvalidArgument
 from ..frames import Frame
 from .pool import WorkerPool
 from .recorded_facts import open_for_rendering
-from .recorded_pictures import (
-    check_has_pictures,
-    chosen_frames,
-    warn_of_other_pictures,
-)
+from .recorded_frames import check_has_frames, chosen_frames, warn_of_other_frames
 from .views import View, plain_camera
 
 if TYPE_CHECKING:
@@ -90,12 +86,13 @@ def render(
         quality=quality,
     )
     with open_for_rendering(path) as reader:
-        check_has_pictures(reader)
-        warn_of_other_pictures(reader)
-        chosen = chosen_frames(reader.frame_count, reader.header.facts, max_fps)
+        facts = reader.header.facts
+        check_has_frames(reader)
+        warn_of_other_frames(path.name, facts)
+        chosen = chosen_frames(reader.frame_count, facts, max_fps)
     is_trusted = bool(getattr(trajectory, "trust_models", False))
     pool = WorkerPool(workers, trust_models=is_trusted)
-    return _Pictures(pool, lambda: pool.frames(path, chosen.indices, view))
+    return _Frames(pool, lambda: pool.frames(path, chosen.indices, view))
 
 
 def render_states(
@@ -161,7 +158,7 @@ def render_states(
         save_states(directory, model, rows)
         return pool.frames_of(drawing, range(len(rows)))
 
-    return _Pictures(pool, begin, directory=directory)
+    return _Frames(pool, begin, directory=directory)
 
 
 def _path(trajectory: Any) -> Path:
@@ -174,7 +171,7 @@ def _path(trajectory: Any) -> Path:
     return Path(path)
 
 
-class _Pictures:
+class _Frames:
     """An iterator that takes its workers and its files with it when it ends."""
 
     def __init__(

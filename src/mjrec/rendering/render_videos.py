@@ -16,15 +16,13 @@ from ..engines.work import Engine
 from ..errors import InvalidArgument, UnreadableFile
 from ..formats.in_flight import is_in_flight, list_paths, read_list
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
-from ..formats.trajectory_file import find_trajectory
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_all_models
-from .again import Variant, render_again
-from .finishing import finish_pending
-from .on_engine import finish_on_engine, given_engine, render_again_on_engine
-from .outcomes import Outcome
-from .pending import EpisodeKey, RecordingKey, key_of, recordings
+from .engine_jobs import do_on_engine, given_engine
+from .finish import bring_up_to_date, do_jobs
+from .jobs import Outcome, Variant, VideoJob
 from .progress import Progress
+from .recordings import RecordingKey, key_of, parts_of, recordings
 from .shared_pool import check_workers
 from .views import View, plain_camera
 
@@ -179,7 +177,8 @@ def render_videos(
         engine=engine,
         on_progress=on_progress,
     )
-    return RenderedVideos.of(outcomes, _directory_of(Path(target)))
+    path = Path(target)
+    return RenderedVideos.of(outcomes, path if path.is_dir() else path.parent)
 
 
 def iter_rendered_videos(
@@ -215,44 +214,43 @@ def iter_rendered_videos(
     check_workers(workers)
     if variant.annotate:
         check_annotation()
-    elsewhere = given_engine(engine, workers)
+    given = given_engine(engine, workers)
     directory, keys = _recordings_of(target, episode)
-    tell = on_progress or (lambda _: None)
-    if variant == Variant() and out is None:
+    is_pending = variant == Variant() and out is None
+    if is_pending:
         _check_can_be_pending(target)
-        outcomes = (
-            finish_pending(
-                directory, keys, workers=workers, strict=strict, on_progress=tell
-            )
-            if elsewhere is None
-            else finish_on_engine(
-                elsewhere, directory, keys, strict=strict, on_progress=tell
-            )
-        )
-        if target.is_dir() and episode is None:
-            outcomes = itertools.chain(outcomes, _unreadable_lists(directory))
+        jobs = [VideoJob.finishing(directory, key, strict=strict) for key in keys]
     else:
-        paths = _trajectories(target, keys)
-        outcomes = (
-            render_again(
-                paths,
-                variant,
-                workers=workers or usable_cpus(),
-                out=out,
+        workers = workers or usable_cpus()
+        jobs = [
+            VideoJob(
+                directory=path.parent,
+                recording=path.name,
                 strict=strict,
-                on_progress=tell,
+                variant=variant,
+                video=video,
             )
-            if elsewhere is None
-            else render_again_on_engine(
-                elsewhere, paths, variant, out=out, strict=strict, on_progress=tell
+            for path, video in _videos_of_variant(
+                _trajectories(target, keys), variant, out
             )
-        )
+        ]
+    tell = on_progress or (lambda _: None)
+    outcomes = (
+        do_jobs(jobs, directory, workers=workers, on_progress=tell)
+        if given is None
+        else do_on_engine(given, jobs, on_progress=tell)
+    )
+    if is_pending:
+        outcomes = itertools.chain(outcomes, _afterwards(directory, target, episode))
     return _trusting(outcomes) if trust_models else outcomes
 
 
-def _unreadable_lists(directory: Path) -> Iterator[Outcome]:
-    """Yield what nobody knows the recordings of."""
-    for path in list_paths(directory):
+def _afterwards(
+    directory: Path, target: Path, episode: int | None
+) -> Iterator[Outcome]:
+    """Bring the directory up to date, and yield what nobody knows the recordings of."""
+    bring_up_to_date(directory)
+    for path in list_paths(directory) if target.is_dir() and episode is None else ():
         try:
             read_list(path)
         except UnreadableFile as error:
@@ -261,13 +259,35 @@ def _unreadable_lists(directory: Path) -> Iterator[Outcome]:
                 yield Outcome(name=path.name, directory=directory, failure=reason)
 
 
+def _videos_of_variant(
+    trajectories: Sequence[Path], variant: Variant, out: Path | None
+) -> Iterator[tuple[Path, Path]]:
+    """Yield trajectories, each with the video that shows it another way.
+
+    Raises:
+        InvalidArgument: nothing would be other, or `out` is the name of an original, or
+            stands for several.
+    """
+    if out is not None:
+        if len(trajectories) > 1:
+            raise InvalidArgument(
+                f"{out} is one file, and several episodes were asked for: choose one."
+            )
+        # By whatever ending: the metadata would have the original's name.
+        name = out.with_suffix(".mp4").name
+        key = key_of(name)
+        if key is not None and name == key.video_name:
+            raise InvalidArgument(
+                f"{out} is the name of a recorded video, which shows what its "
+                "recording saw. Choose another name."
+            )
+    for path in trajectories:
+        yield path, out or path.with_name(variant.name_for(path))
+
+
 def _trusting(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
     with trusting_all_models():
         yield from outcomes
-
-
-def _directory_of(target: Path) -> Path:
-    return target if target.is_dir() else target.parent
 
 
 def _recordings_of(
@@ -290,12 +310,9 @@ def _recordings_of(
     keys = recordings(target)
     if episode is None:
         return target, keys
-    of_episodes = [key for key in keys if isinstance(key, EpisodeKey)]
-    chosen: list[RecordingKey] = [
-        key for key in of_episodes if key.episode_id == episode
-    ]
+    chosen = [key for key in keys if key.number == episode and not key.is_clip]
     if not chosen:
-        numbers = sorted({key.episode_id for key in of_episodes})
+        numbers = sorted({key.number for key in keys if not key.is_clip})
         listed = ", ".join(map(str, numbers[:_SHOWN])) or "none"
         raise InvalidArgument(
             f"{target} has no recorded states of episode {episode}. It has those of "
@@ -322,12 +339,9 @@ def _trajectories(target: Path, keys: Iterable[RecordingKey]) -> list[Path]:
     if not target.is_dir() and target.suffix == ".h5":
         # Whatever its name is otherwise.
         return [target]
-    found = (
-        find_trajectory(_directory_of(target), key.infix, key.episode_id)
-        for key in keys
-        if isinstance(key, EpisodeKey)
-    )
-    trajectories = [path for path in found if path is not None]
+    directory = target if target.is_dir() else target.parent
+    episodes = (key for key in keys if not key.is_clip)
+    trajectories = [path for key in episodes for path in parts_of(directory, key)]
     if not trajectories:
         raise InvalidArgument(
             f"There are no recorded states of {target}, from which it could be "

@@ -20,7 +20,7 @@ from trajectories_by_hand import write_log
 
 import mjrec
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
-from mjrec.rendering.recorded_pictures import chosen_frames
+from mjrec.rendering.recorded_frames import chosen_frames
 
 SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS
 SIZE: dict[str, Any] = {"height": HEIGHT, "width": WIDTH}
@@ -111,26 +111,37 @@ def test_a_recording_that_is_left_early(ride: Ride) -> None:
     assert children() == before
 
 
+WRONG = [
+    ({"camera": "top"}, UnknownName, r"no camera 'top'.*side, rider"),
+    ({"camera": 1.5}, InvalidArgument, "camera is a name"),
+    ({"camera": {"distance": "far"}}, InvalidArgument, "distance is a number"),
+    ({"width": 0}, InvalidArgument, "width must be"),
+    ({"quality": "low"}, UnknownName, "no quality 'low'"),
+    ({"workers": 0}, InvalidArgument, "workers must be"),
+]
+
+
 @pytest.mark.parametrize(
     ("arguments", "kind", "message"),
-    [
-        ({"camera": "top"}, UnknownName, r"no camera 'top'.*side, rider"),
-        ({"camera": 1.5}, InvalidArgument, "camera is a name"),
-        ({"camera": {"distance": "far"}}, InvalidArgument, "distance is a number"),
-        ({"width": 0}, InvalidArgument, "width must be"),
-        ({"max_fps": 0}, InvalidArgument, "positive"),
-        ({"quality": "low"}, UnknownName, "no quality 'low'"),
-        ({"workers": 0}, InvalidArgument, "workers must be"),
-    ],
+    [*WRONG, ({"max_fps": 0}, InvalidArgument, "positive")],
 )
 def test_arguments_are_checked_by_the_call(
-    ride: Ride, arguments: dict[str, Any], kind: type[Exception], message: str
+    ride: Ride,
+    temporary: Path,
+    arguments: dict[str, Any],
+    kind: type[Exception],
+    message: str,
 ) -> None:
-    """Not by the first picture; and nothing is left running."""
+    """Not by the first frame; nothing is left running, and no file."""
     before = children()
     with pytest.raises(kind, match=message):
         mjrec.render(ride.path, **arguments)
+    if "max_fps" not in arguments:
+        model, _ = start()
+        with pytest.raises(kind, match=message):
+            mjrec.render_states(model, np.zeros((2, 3)), SPEC, **{**SIZE, **arguments})
     assert children() == before
+    assert list(temporary.iterdir()) == []
 
 
 def test_what_is_no_recording(tmp_path: Path) -> None:
@@ -162,10 +173,7 @@ def test_pictures_are_chosen_by_rate(
     """Every n-th of those that were recorded, and the last."""
     facts = {"rate": "20", "stride": 2}
     assert chosen_frames(count, facts, max_fps).indices == chosen
-
-
-def test_a_rate_that_is_not_known() -> None:
-    """The process was killed before its second step."""
+    # The process was killed before its second step.
     with pytest.raises(InvalidArgument, match="Leave max_fps out"):
         chosen_frames(2, {}, 30)
     assert chosen_frames(1, {}, 30).indices == [0]
@@ -203,24 +211,12 @@ def test_a_state_leaves_nothing_behind() -> None:
     assert not np.array_equal(at_start, rest[0])
 
 
-def test_states_of_a_rollout_are_taken_run_by_run() -> None:
-    """All runs at once are refused with what to do."""
-    model, data = start()
-    initial = np.zeros((2, mujoco.mj_stateSize(model, int(SPEC))))
-    initial[1, 1] = 4
-    states, _ = mujoco.rollout.rollout(model, data, initial, nstep=3)
-
-    with pytest.raises(InvalidArgument, match=r"\(n, 3\).*\(2, 3, 3\).*rollout"):
-        mjrec.render_states(model, states, SPEC, **SIZE)
-    for run in states:
-        assert len(list(mjrec.render_states(model, run, SPEC, **SIZE))) == 3
-
-
 @pytest.mark.parametrize(
     ("states", "spec", "message"),
     [
         (np.zeros((4, 5)), SPEC, r"\(n, 3\).*mj_stateSize.*\(4, 5\)"),
         (np.zeros(3), SPEC, r"\(n, 3\).*\(3,\)"),
+        (np.zeros((2, 3, 3)), SPEC, r"\(n, 3\).*\(2, 3, 3\).*rollout"),
         (np.array([["a", "b", "c"]]), SPEC, "numbers"),
         (np.zeros((4, 3)), 1 << 30, "mjtState"),
         (np.zeros((4, 3)), "full", "mjtState"),
@@ -229,30 +225,10 @@ def test_states_of_a_rollout_are_taken_run_by_run() -> None:
 def test_states_that_are_none_of_the_models(
     temporary: Path, states: Any, spec: Any, message: str
 ) -> None:
-    """Before anything is started or written."""
+    """Before anything is started or written. No states are no frames."""
     model, _ = start()
     with pytest.raises(InvalidArgument, match=message):
         mjrec.render_states(model, states, spec, **SIZE)
-    assert list(temporary.iterdir()) == []
-
-
-def test_a_view_of_states_that_cannot_be(temporary: Path) -> None:
-    """The call says so, and leaves no file."""
-    model, _ = start()
-    for arguments, message in (
-        ({"camera": "top"}, "no camera 'top'"),
-        ({"quality": "low"}, "no quality"),
-        ({"workers": 0}, "workers must be"),
-        ({"height": 0}, "height must be"),
-    ):
-        with pytest.raises(InvalidArgument, match=message):
-            mjrec.render_states(model, np.zeros((2, 3)), SPEC, **{**SIZE, **arguments})
-    assert list(temporary.iterdir()) == []
-
-
-def test_no_states_are_no_pictures(temporary: Path) -> None:
-    """As empty as what was given."""
-    model, _ = start()
     assert list(mjrec.render_states(model, np.zeros((0, 3)), SPEC, **SIZE)) == []
     assert list(temporary.iterdir()) == []
 

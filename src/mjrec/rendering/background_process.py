@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that finishes episodes beside a simulation.
+"""A process that finishes recordings beside a simulation.
 
-`python -m mjrec.rendering.render_server DIRECTORY --workers N|auto [--strict]`. On its
-standard input it is told the base name of one ended trajectory a line, or of the first
-log of a clip, `that was all` where it is waited for, and `a video is expected`. On its
-standard output it says one JSON object a line::
+`python -m mjrec.rendering.background_process DIRECTORY --workers N|auto [--strict]`. On
+its standard input it is told the base name of one ended trajectory a line, or of the
+first part of a clip; `that was all` where it is waited for, and `a video is expected`.
+On its standard output it says one JSON object a line::
 
     {"progress": {"videos_done": 0, "videos": 2, "frames_done": 40, "frames": 2002}}
-    {"done": "<trajectory>", "name": "<video or trajectory>", "failure": null}
+    {"done": "<recording>", "name": "<video or trajectory>", "failure": null}
     {"log": [30, "..."]}                                for the simulation's log
     {"pulse": 12.5}                                     it is at work
 
 What libraries print goes to the standard error.
 
-It ends at once, leaving the rest as it is, when its standard input ends: then nobody
-waits for it any more.
+It ends at once, leaving the rest as it is, when its standard input ends: then it is of
+no use to anybody any more.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from ..child_python import LineWriter, say_stacks_when_asked, take_standard_output
 from ..patience import patience_s
-from .finishing import EpisodeFinisher
-from .pending import RecordingKey, key_of
+from .background import ALL_SAID, EXPECTED
+from .finish import Finisher
+from .jobs import VideoJob
 from .progress import Progress
-from .render_service import ALL_SAID, EXPECTED
+from .recordings import key_of
 
 _NICE = 10
 _SECONDS_BETWEEN_REPORTS = 0.2
@@ -45,6 +46,8 @@ _SECONDS_BETWEEN_LOOKS = 0.05
 _SECONDS_TO_LEAVE = 2.0
 _READ_SIZE = 1 << 16
 _LONGEST_BETWEEN_PULSES = 5.0
+
+_Say = Callable[..., None]
 
 
 class _Stopped(BaseException):
@@ -65,16 +68,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Beside a simulation a single worker, too, has one CPU to itself and no more: the
     # threads of Mesa's rasteriser would get in the way of the steps.
     os.environ.setdefault("LP_NUM_THREADS", "1")
-    answers = _Answers(take_standard_output())
-    logging.getLogger().addHandler(_ToSimulation(answers))
+    answers = LineWriter(take_standard_output())
+
+    def say(**answer: Any) -> None:
+        answers.write(json.dumps(answer).encode() + b"\n")
+
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: say(  # type: ignore[method-assign] # one of its own
+        log=[record.levelno, handler.format(record)]
+    )
+    logging.getLogger().addHandler(handler)
     names: queue.SimpleQueue[str] = queue.SimpleQueue()
-    for target, argument in ((_read, names), (_beat, answers)):
-        threading.Thread(target=target, args=[argument], daemon=True).start()
+    threading.Thread(target=_read, args=[names], daemon=True).start()
+    threading.Thread(target=_beat, args=[answers, say], daemon=True).start()
     try:
-        finisher = EpisodeFinisher(
-            arguments.directory, workers=workers, strict=arguments.strict
-        )
-        _Service(finisher, names, answers).run()
+        with Finisher(arguments.directory, workers=workers) as finisher:
+            _Work(arguments.directory, finisher, names, say, arguments.strict).do()
     except _Stopped:
         return 0
 
@@ -101,7 +110,7 @@ def _read(names: queue.SimpleQueue[str]) -> None:
     os._exit(1)
 
 
-def _beat(answers: _Answers) -> None:
+def _beat(answers: LineWriter, say: _Say) -> None:
     """Say that the main thread is at work, to a simulation that waits for it.
 
     Whatever that thread waits for itself, it looks at again every second. Blocked for
@@ -113,42 +122,49 @@ def _beat(answers: _Answers) -> None:
     while True:
         now = time.clock_gettime(clock)
         if now > before and not answers.is_behind:
-            answers.say(pulse=now)
+            say(pulse=now)
         before = now
         time.sleep(seconds)
 
 
-class _Service:
+class _Work:
     """Does what it is told, and tells what came of it."""
 
     def __init__(
         self,
-        finisher: EpisodeFinisher,
-        names: queue.SimpleQueue[str],
-        answers: _Answers,
+        directory: Path,
+        finisher: Finisher,
+        told: queue.SimpleQueue[str],
+        say: _Say,
+        strict: bool,
     ) -> None:
-        self._told = names
-        self._answers = answers
+        self._directory = directory
+        self._finisher = finisher
+        self._told = told
+        self._say = say
+        self._strict = strict
         self._all_said = False
         self._last_report = 0.0
-        # By which names they were given.
-        self._names: dict[RecordingKey, str] = {}
-        self._finisher = finisher
+        # By which names the jobs were given.
+        self._names: dict[str, str] = {}
         finisher.on_progress = self._look_up
 
-    def run(self) -> NoReturn:
+    def do(self) -> NoReturn:
         """Work until the end of this process."""
-        with self._finisher as finisher:
-            while True:
-                self._take_in()
-                if not finisher:
-                    finisher.rest()
-                    self._take_in(self._told.get())
-                elif finisher.is_ready() or self._all_said:
-                    self._finish_next()
-                else:
-                    # The simulation is still writing the model.
-                    time.sleep(_SECONDS_BETWEEN_LOOKS)
+        finisher = self._finisher
+        while True:
+            self._take_in()
+            if not finisher:
+                finisher.rest()
+                self._take_in(self._told.get())
+            elif finisher.is_ready() or self._all_said:
+                job, outcome = finisher.do_next()
+                self._report()
+                name = self._names.pop(job.name)
+                self._say(done=name, name=outcome.name, failure=outcome.failure)
+            else:
+                # The simulation is still writing the model.
+                time.sleep(_SECONDS_BETWEEN_LOOKS)
 
     def _take_in(self, *names: str) -> None:
         """Take what was said."""
@@ -157,19 +173,18 @@ class _Service:
             told.append(self._told.get())
         for name in told:
             self._all_said = name == ALL_SAID
-            key = key_of(name)
             if name == EXPECTED:
                 self._finisher.start_workers()
-            elif key is not None and self._finisher.add(key):
-                self._names[key] = name
-            elif not self._all_said:
-                self._answers.say(done=name, name=name, failure=None)
+            elif not self._all_said and not self._add(name):
+                self._say(done=name, name=name, failure=None)
 
-    def _finish_next(self) -> None:
-        key, outcome = self._finisher.finish_next()
-        self._report()
-        name = self._names.pop(key)
-        self._answers.say(done=name, name=outcome.name, failure=outcome.failure)
+    def _add(self, name: str) -> bool:
+        key = key_of(name)
+        if key is None:
+            return False
+        job = VideoJob.finishing(self._directory, key, strict=self._strict)
+        self._names[job.name] = name
+        return self._finisher.add(job)
 
     def _look_up(self, progress: Progress) -> None:
         """Listen and report, in the midst of work."""
@@ -181,25 +196,7 @@ class _Service:
             self._report()
 
     def _report(self) -> None:
-        self._answers.say(progress=vars(self._finisher.progress))
-
-
-class _Answers(LineWriter):
-    """What is said to the simulation, one JSON object a line."""
-
-    def say(self, **answer: Any) -> None:
-        self.write(json.dumps(answer).encode() + b"\n")
-
-
-class _ToSimulation(logging.Handler):
-    """Lets the simulation's process log what is worth a warning here."""
-
-    def __init__(self, answers: _Answers) -> None:
-        super().__init__(logging.WARNING)
-        self._answers = answers
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._answers.say(log=[record.levelno, self.format(record)])
+        self._say(progress=vars(self._finisher.progress))
 
 
 if __name__ == "__main__":

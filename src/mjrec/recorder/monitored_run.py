@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all recordings of one run share: episodes and clips, deferred and live."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..annotation import Caption
+from ..formats.monitor_directory import (
+    Infix,
+    clip_video_prefix,
+    trajectory_prefix,
+    video_prefix,
+)
+from ..formats.span_writer import SpanLogs
+from ..formats.video_names import second_name_of
+from ..machine import machine_fingerprint
+from ..simulation.state_source import EpisodeStart
+from .episode_videos import EpisodeVideos
+from .faults import Faults, What
+from .finisher import Finisher
+from .opening import OpenDirectory
+from .options import LIVE, RecorderOptions
+from .run_journal import RunJournal
+from .stats_recorder import StatsRecorder
+from .subject import EpisodePictures, Subject, check_refusal
+from .trajectory_recorder import Pace
+from .versions import versions
+from .video_recorder import VideoRecorder
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BegunEpisode:
+    """What is known of an episode when it begins.
+
+    Attributes:
+        episode_id: its number.
+        type: `"t"` for training, `"e"` for evaluation.
+        start_time: wall clock just before the reset, in seconds since the epoch.
+        seed: as given to `reset`.
+        options: as given to `reset`.
+        random_state: of the environment's generator before the reset, for JSON; None
+            where it is not known or not needed.
+        reset_clock: the simulated time of the reset, where it is written on frames.
+    """
+
+    episode_id: int
+    type: str
+    start_time: float
+    seed: Any
+    options: Any
+    random_state: Any = None
+    reset_clock: float | None = None
+
+
+class MonitoredRun:
+    """What all recordings of one run share, and what files say of them.
+
+    Args:
+        place: the open directory.
+        subject: what is recorded.
+        options: what was asked for.
+        stats: counts steps and rewards.
+        journal: of the run.
+        faults: what could not be recorded.
+        finisher: takes over recordings that have ended.
+        videos: watches for finished videos.
+        selection: `selection` of a video that is chosen after its episode's end; empty
+            where it is chosen before.
+
+    Attributes:
+        subject, options, stats, journal, finisher, videos, selection: as given.
+        directory: the monitor directory.
+        infix: what its files have in the middle.
+        logs: of the episodes' rows.
+        clip_logs: of the clips'.
+        pace: how simulated time becomes frames.
+    """
+
+    def __init__(
+        self,
+        place: OpenDirectory,
+        *,
+        subject: Subject,
+        options: RecorderOptions,
+        stats: StatsRecorder,
+        journal: RunJournal,
+        faults: Faults,
+        finisher: Finisher,
+        videos: EpisodeVideos,
+        selection: Mapping[str, Any],
+    ) -> None:
+        self.directory: Path = place.path
+        self.infix: Infix = place.infix
+        self.subject = subject
+        self.options = options
+        self.stats = stats
+        self.journal = journal
+        self.finisher = finisher
+        self.videos = videos
+        self.selection = selection
+        numbers = itertools.count()
+        self.logs, self.clip_logs = (
+            SpanLogs(
+                place.path,
+                place.infix,
+                numbers=numbers,
+                tail_bytes=options.tail_bytes,
+            )
+            for _ in range(2)
+        )
+        self.pace = Pace(
+            clock=subject.clock, declared=subject.declared, max_fps=options.max_fps
+        )
+        self._faults = faults
+        self._episode: BegunEpisode | None = None
+        # Why videos are drawn live, as far as it was said.
+        self._said: set[str] = set()
+
+    @property
+    def episode(self) -> BegunEpisode:
+        """The running episode."""
+        assert self._episode is not None, "there was no reset"
+        return self._episode
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was an episode yet."""
+        return self._episode is not None
+
+    def begin(self, episode: BegunEpisode) -> None:
+        """Take note of an episode that begins."""
+        self._episode = episode
+
+    def tolerates(self, what: What, error: BaseException) -> bool:
+        """Note what of the running episode is lost; tell whether to go on."""
+        number = None if self._episode is None else self._episode.episode_id
+        return self._faults.tolerates(what, error, episode_id=number)
+
+    def caption(self) -> Caption:
+        """Return what is written on the frame of this moment."""
+        began, now = self.episode.reset_clock, self.subject.clock()
+        return Caption(
+            episode_id=self.episode.episode_id,
+            step=self.stats.steps or 0,
+            time=None if began is None or now is None else now - began,
+            reward=self.stats.rewards or 0.0,
+        )
+
+    def can_be_deferred(self, start: EpisodeStart) -> bool:
+        """Tell whether frames can be made from the states that begin with `start`.
+
+        Why not is said once.
+
+        Raises:
+            PicturesDiffer, NoPictures: as `check_refusal`.
+        """
+        refusal = start.refusal
+        if refusal is None:
+            return True
+        check_refusal(self.subject, refusal)
+        if refusal not in self._said:
+            self._said.add(refusal)
+            logger.warning(
+                "The videos of %s are drawn live: %s.", self.subject.env_id, refusal
+            )
+        return False
+
+    def trajectory_name(self) -> str:
+        """Return what the running episode's trajectory is called."""
+        return trajectory_prefix(self.infix, self.episode.episode_id)
+
+    def video_path(self, episode_id: int) -> Path:
+        """Return where an episode's video will be, without the ending."""
+        return self.directory / video_prefix(self.infix, episode_id)
+
+    def clip_path(self, steps: int | None) -> Path:
+        """Return where the video of a clip that begins now will be, without the ending.
+
+        Args:
+            steps: how many were taken when a step began it; None where it begins with
+                the episode.
+        """
+        number = self.episode.episode_id
+        return self.directory / clip_video_prefix(self.infix, number, steps)
+
+    def promise(
+        self, path: Path, recording: str, *, second_name: Mapping[str, str]
+    ) -> dict[str, Any]:
+        """Return what a trajectory, or a clip, says of its video.
+
+        Args:
+            path: where it will be, without the ending.
+            recording: when it is drawn, `DEFERRED` or `LIVE`.
+            second_name: as of `second_name`.
+        """
+        options, subject = self.options, self.subject
+        promise: dict[str, Any] = {
+            "name": f"{path.name}.mp4",
+            "quality": options.quality,
+            "fps": None if options.fps is None else str(options.fps),
+            "max_fps": None if options.max_fps is None else str(options.max_fps),
+            "recording": recording,
+            "reason": subject.rendering.reason if recording == LIVE else None,
+        }
+        if subject.cameras:
+            promise["cameras"] = list(subject.cameras)
+            promise["tiled"] = options.tiled
+        if options.annotate:
+            promise["annotate"] = True
+        if self.selection:
+            promise["selection"] = self.selection
+        return {**promise, **second_name}
+
+    def second_name(self, what: str, number: int) -> dict[str, str]:
+        """Return what a video is called besides, for its metadata.
+
+        Args:
+            what: it begins with, "episode" or "step".
+            number: of that.
+        """
+        prefix = self.options.name_prefix
+        if prefix is None:
+            return {}
+        return {"also_named": f"{prefix}-{what}-{number}.mp4"}
+
+    def recording_facts(self, start: EpisodeStart | None) -> dict[str, Any]:
+        """Return what any recording of states says of the running episode.
+
+        Args:
+            start: of the states; None where there are none.
+        """
+        episode = self.episode
+        return {
+            "episode_id": episode.episode_id,
+            "infix": str(self.infix),
+            "env_id": self.subject.env_id,
+            "type": episode.type,
+            "start_time": episode.start_time,
+            "seed": episode.seed,
+            "options": episode.options,
+            "environment": self.subject.environment,
+            "versions": dict(versions()),
+            "machine": dict(machine_fingerprint()),
+            "model": None if start is None else start.model,
+            "scene": None if start is None else start.scene,
+            "refusal": None if start is None else start.refusal,
+        }
+
+    def live_facts(self) -> dict[str, Any]:
+        """Return what the metadata of a live video says of the running episode."""
+        reason = self.subject.rendering.reason
+        episode = self.episode
+        return {
+            "episode_id": episode.episode_id,
+            **({} if reason is None else {"recording_reason": reason}),
+            "type": episode.type,
+            "env_id": self.subject.env_id,
+            "seed": episode.seed,
+            "options": episode.options,
+            "recording": LIVE,
+            "versions": dict(versions()),
+            "machine": dict(machine_fingerprint()),
+            **({"selection": self.selection} if self.selection else {}),
+        }
+
+    def live_recorders(
+        self, path: Path, *, second_name: Mapping[str, str], enabled: bool = True
+    ) -> tuple[VideoRecorder, ...]:
+        """Return what draws the first camera's video, and the others'.
+
+        Args:
+            path: of the first one, without its ending.
+            second_name: as of `second_name`.
+            enabled: False makes one that records nothing.
+        """
+        first = self._live_recorder(path, self.subject.pictures, enabled=enabled)
+        if first.path is None:
+            return (first,)
+        first.metadata.update(second_name)
+        others = [
+            self._live_recorder(path.with_name(f"{path.name}.{name}"), pictures)
+            for name, pictures in self.subject.further_pictures.items()
+        ]
+        for other in others:
+            assert other.path is not None
+            first_name, name = Path(first.path).name, Path(other.path).name
+            other.metadata["first_video"] = first_name
+            for second in second_name.values():
+                called = second_name_of(name, second, first=first_name)
+                other.metadata["also_named"] = called
+        return (first, *others)
+
+    def _live_recorder(
+        self, base_path: Path, pictures: EpisodePictures, *, enabled: bool = True
+    ) -> VideoRecorder:
+        options = self.options
+        return VideoRecorder(
+            pictures,
+            base_path=base_path,
+            metadata=self.live_facts() if enabled else None,
+            enabled=enabled,
+            fps=options.fps,
+            max_fps=options.max_fps,
+            frame_hashes=True,
+            clock=self.subject.clock,
+            declared=self.subject.declared,
+            facts=pictures.facts,
+            strict=options.strict,
+            caption=self.caption if options.annotate else None,
+        )

@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recordings of a directory, and what is left to do about each.
+
+A recording is an episode or a clip, a video that is counted in steps. Its rows are one
+part or more: an episode has one, and a clip that goes on across resets one for each
+episode. An episode's part may become a file and stay; those of a clip are dropped when
+its video is there.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DirectoryNotWritable, UnreadableFile
+from ..formats.frame_hashes import frame_hash_path
+from ..formats.in_flight import recordings_in_flight
+from ..formats.locks import Lock, is_locked, try_lock
+from ..formats.monitor_directory import (
+    ClipPart,
+    Infix,
+    clip_lock_name,
+    clip_part_name,
+    episode_of,
+    infix_of,
+    iter_monitor_files,
+    lock_name,
+    names_in,
+    trajectory_prefix,
+    video_lock_name,
+    video_prefix,
+)
+from ..formats.trajectory_file import find_trajectory
+from ..formats.trajectory_reader import added_up
+from ..formats.video_metadata import is_done, metadata_path
+from .recorded_facts import (
+    further_video_paths,
+    model_file,
+    open_for_rendering,
+    video_facts,
+    video_path,
+)
+from .recorded_frames import ChosenFrames, chosen_frames, recorded_rate
+
+_UNFINISHED = re.compile(r"[0-9a-f]{8}\.part", re.ASCII)
+_CLIP_VIDEO = re.compile(r".*\.video[0-9]{6,18}\.step(?P<step>[0-9]{6,18})\.mp4")
+
+
+@dataclass(frozen=True)
+class RecordingKey:
+    """Which recording of a directory.
+
+    Attributes:
+        infix: of its monitor.
+        number: the episode's; of a clip, how many steps the monitor had recorded when
+            it began.
+        is_clip: whether it is a clip.
+    """
+
+    infix: Infix
+    number: int
+    is_clip: bool = False
+
+    @property
+    def name(self) -> str:
+        """The base name of the trajectory without extension; that of the first part."""
+        if self.is_clip:
+            return clip_part_name(self.infix, self.number, 0)
+        return trajectory_prefix(self.infix, self.number)
+
+    @property
+    def video_name(self) -> str:
+        """The base name of an episode's video. In which a clip began, only rows say."""
+        return f"{video_prefix(self.infix, self.number)}.mp4"
+
+    @property
+    def told_name(self) -> str:
+        """What it is called where nothing is known of it."""
+        return self.name if self.is_clip else self.video_name
+
+    @property
+    def lock_name(self) -> str:
+        """The name of the file that is locked by the process that works on it."""
+        name_of = clip_lock_name if self.is_clip else video_lock_name
+        return name_of(self.infix, self.number)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PendingRecording:
+    """A recording that is left to do.
+
+    Attributes:
+        key: which one.
+        parts: its rows, by the names of their files, in order.
+        video: what is to be rendered; None where nothing is.
+        further_videos: what is to be rendered besides, of further cameras.
+        frame_count: how many frames are to be rendered, of all of these.
+        is_log: its rows are in a log still.
+        is_kept: the trajectory stays once the video is there.
+        model_file: what has to be there for rendering, if it is known.
+    """
+
+    key: RecordingKey
+    parts: tuple[Path, ...]
+    video: Path | None
+    further_videos: tuple[Path, ...]
+    frame_count: int
+    is_log: bool
+    is_kept: bool
+    model_file: Path | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """What the parts of a recording say, all together.
+
+    Attributes:
+        parts: the files, in order.
+        facts: of each part.
+        frame_counts: of each part.
+        frame_steps: the step of each frame; the frames themselves are counted for a
+            clip, because its resets have one and are no steps.
+        step_count: of all parts.
+        reward: the sum over all steps.
+    """
+
+    parts: tuple[Path, ...]
+    facts: tuple[Mapping[str, Any], ...]
+    frame_counts: tuple[int, ...]
+    frame_steps: NDArray[np.int64]
+    step_count: int
+    reward: float
+
+    @property
+    def is_clip(self) -> bool:
+        """Whether it is a clip."""
+        return ClipPart.parse(self.parts[0].name) is not None
+
+    @property
+    def timing(self) -> Mapping[str, Any]:
+        """The facts of the first part that has measured the time of a step."""
+        known = (facts for facts in self.facts if facts.get("timestep") is not None)
+        return next(known, self.facts[0])
+
+    def chosen(self, max_fps: float | Fraction | None = None) -> ChosenFrames:
+        """Return which of the frames are wanted, counted over all parts.
+
+        Of an episode only wanted frames are recorded, of a clip all: which of them are
+        0, n, 2n ... does not begin anew with each part.
+        """
+        if self.is_clip and recorded_rate(self.timing) is not None:
+            max_fps = max_fps or video_facts(self.facts[0]).get("max_fps")
+        max_fps = Fraction(max_fps) if isinstance(max_fps, str) else max_fps
+        return chosen_frames(sum(self.frame_counts), self.timing, max_fps)
+
+
+def read_recording(parts: Sequence[Path]) -> Recorded:
+    """Read what the parts of a recording say.
+
+    Raises:
+        UnreadableFile: one is missing or damaged.
+    """
+    facts: list[Mapping[str, Any]] = []
+    frame_counts: list[int] = []
+    rewards: list[NDArray[np.float64]] = []
+    for number, path in enumerate(parts):
+        clip = ClipPart.parse(path.name)
+        if clip is not None and clip.number != number:
+            raise UnreadableFile(path, f"part {number} of its video is not there")
+        with open_for_rendering(path) as reader:
+            facts.append(reader.header.facts)
+            frame_counts.append(reader.frame_count)
+            rewards.append(reader.rewards)
+            steps = reader.frame_steps
+    if clip is not None:
+        steps = np.arange(sum(frame_counts))
+    all_rewards = np.concatenate(rewards)
+    return Recorded(
+        parts=tuple(parts),
+        facts=tuple(facts),
+        frame_counts=tuple(frame_counts),
+        frame_steps=steps,
+        step_count=len(all_rewards),
+        reward=added_up(all_rewards),
+    )
+
+
+def key_of(name: str) -> RecordingKey | None:
+    """Return that of the recording that a file is of; None for other files.
+
+    A clip's video that began with an episode is called as that episode's.
+    """
+    if (part := ClipPart.parse(name)) is not None:
+        return RecordingKey(part.infix, part.first_step, is_clip=True)
+    infix, number = Infix.parse(infix_of(name) or ""), episode_of(name)
+    if infix is None or number is None:
+        return None
+    clip = _CLIP_VIDEO.fullmatch(name)
+    if clip is not None:
+        return RecordingKey(infix, int(clip["step"]), is_clip=True)
+    return RecordingKey(infix, number)
+
+
+def recordings(directory: Path) -> list[RecordingKey]:
+    """Return the episodes with a trajectory, then the clips in flight, in order."""
+    finished = (path for path in iter_monitor_files(directory) if path.suffix == ".h5")
+    in_flight = (recording.path for recording in recordings_in_flight(directory))
+    keys = {key_of(path.name) for path in (*finished, *in_flight)} - {None}
+    return sorted(
+        (key for key in keys if key is not None),
+        key=lambda key: (
+            *(key.is_clip, key.infix.monitor_id, key.infix.uid),
+            key.number,
+        ),
+    )
+
+
+def recorded_episodes(directory: Path) -> list[RecordingKey]:
+    """Return the episodes that have a trajectory, monitor by monitor, in order."""
+    return [key for key in recordings(directory) if not key.is_clip]
+
+
+def parts_of(directory: Path, key: RecordingKey) -> list[Path]:
+    """Return the rows of a recording, by the names of their files, in order."""
+    if not key.is_clip:
+        path = find_trajectory(directory, key.infix, key.number)
+        return [] if path is None else [path]
+    # In which they are in the logs, too.
+    in_flight = (each.path for each in recordings_in_flight(directory, key.infix))
+    return [path for path in in_flight if key_of(path.name) == key]
+
+
+def may_be_left(directory: Path, key: RecordingKey) -> bool:
+    """Tell whether anything may be left to do about a recording, opening no file.
+
+    Where it is not, `look_at` returns None.
+    """
+    if key.is_clip:
+        return True
+    parts = parts_of(directory, key)
+    is_done_already = is_done(directory / key.video_name)
+    return bool(parts) and not (parts[0].is_file() and is_done_already)
+
+
+def look_at(directory: Path, key: RecordingKey) -> PendingRecording | None:
+    """Return what is left to do about a recording; None where it is nothing.
+
+    One that is still running, or of which its monitor has not decided yet whether it
+    gets a video, is left to its monitor: its log does not say how it ended, or calls it
+    a candidate, and the monitor's lock is held.
+
+    Raises:
+        UnreadableFile: its rows are missing or damaged, or of a newer format, or say
+            what cannot be.
+        OSError: its monitor's lock cannot be looked at.
+    """
+    # Most of a directory is done, and need not be opened.
+    if not may_be_left(directory, key):
+        return None
+    # Asked first: a part that comes later is of a monitor that is open.
+    is_open = is_locked(directory / lock_name(key.infix))
+    parts = parts_of(directory, key)
+    if not parts:
+        return None
+    is_log = key.is_clip or not parts[0].is_file()
+    recorded = read_recording(parts)
+    first, facts, last = parts[0], recorded.facts[0], recorded.facts[-1]
+    if is_log and is_open and ("complete" not in last or last.get("candidate", False)):
+        return None
+    video: Path | None = None
+    further: list[Path] = []
+    if key.is_clip or video_facts(facts).get("recording") == "deferred":
+        video, further = video_path(first, facts), further_video_paths(first, facts)
+    if video is not None and is_done(video):
+        video, further = None, []
+    if video is None and not is_log:
+        return None
+    frames = 0 if video is None else len(recorded.chosen().indices)
+    return PendingRecording(
+        key=key,
+        parts=tuple(parts),
+        video=video,
+        further_videos=tuple(further),
+        frame_count=frames * (1 + len(further)),
+        is_log=is_log,
+        is_kept=not key.is_clip and facts.get("kept", True),
+        model_file=model_file(directory, last),
+    )
+
+
+def claim(directory: Path, key: RecordingKey) -> Lock | None:
+    """Return the lock of a recording, or None where another process has it.
+
+    Raises:
+        DirectoryNotWritable: there can be no lock in the directory.
+    """
+    try:
+        return try_lock(directory / key.lock_name, f"{os.getpid()}\n")
+    except OSError as error:
+        raise DirectoryNotWritable(directory, error.strerror) from error
+
+
+def remove_unfinished(video: Path) -> None:
+    """Remove what a renderer that was killed has left of a deferred video.
+
+    To be called by the process that holds the recording's lock: no other is at it.
+    """
+    finals = (video, frame_hash_path(video), metadata_path(video))
+    begins = tuple(f".{final.name}." for final in finals)
+    # Many names, of whole directories, are compared once for each video.
+    for name in names_in(video.parent):
+        if name.startswith(begins) and any(
+            name.startswith(begin) and _UNFINISHED.fullmatch(name, len(begin))
+            for begin in begins
+        ):
+            video.with_name(name).unlink(missing_ok=True)

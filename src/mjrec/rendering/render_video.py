@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The videos of one recording: its frames, drawn by workers, in a file for each camera.
+
+The frames come in order, whichever worker drew them, so a file does not depend on the
+number of workers. The metadata comes last: where it is, the video is there and whole.
+The video of the first camera comes last of all: where it is, all are.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from ..annotation import Caption, check_annotation
+from ..errors import EncoderError, NoPictures
+from ..formats.second_names import give_second_names, take_second_names
+from ..formats.unfinished_video import VideoFile
+from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
+from ..formats.video_names import second_name_of
+from ..formats.video_sink import VideoSink
+from ..frames import Frame, grid_shape
+from ..machine import machine_fingerprint
+from ..rates import to_rate
+from ..recorder.endings import KILLED
+from ..recorder.versions import versions
+from .pool import WorkerPool
+from .recorded_facts import (
+    further_video_paths,
+    open_for_rendering,
+    video_facts,
+    video_path,
+)
+from .recorded_frames import (
+    ChosenFrames,
+    captions,
+    usual_fps,
+    warn_of_other_frames,
+)
+from .recordings import Recorded, read_recording
+from .views import PlainCamera, View, plain_camera
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """One of the videos of a recording.
+
+    Attributes:
+        path: the file.
+        view: how it is drawn.
+        facts: what its metadata says that others' does not.
+        cameras: all of them, where they are in one video.
+    """
+
+    path: Path
+    view: View
+    facts: Mapping[str, Any]
+    cameras: tuple[PlainCamera | None, ...] | None = None
+
+
+def render_video(
+    parts: Sequence[Path],
+    *,
+    workers: WorkerPool,
+    view: View | None = None,
+    max_fps: float | Fraction | None = None,
+    fps: float | Fraction | None = None,
+    annotate: bool | None = None,
+    out: Path | None = None,
+    strict: bool = False,
+    on_frame: Callable[[], object] = lambda: None,
+) -> VideoFile | None:
+    """Render the video of a recording, with its frame hashes and its metadata.
+
+    Where several cameras were recorded, so many videos, or one of all side by side. All
+    files have temporary names until they are whole. Those that are there are replaced.
+    If it fails or is interrupted, nothing is left. An encoder that is killed or hangs
+    is given a second try.
+
+    Args:
+        parts: the trajectory of an episode, finished or not; or the parts of a clip.
+        workers: draw the frames.
+        view: from where, how large and how well; as recorded, if None. With a camera,
+            there is one video, of what that one shows.
+        max_fps: the most frames per second of simulated time: frames 0, n, 2n ... of
+            those recorded, with the smallest n that fits, and the last.
+        fps: frames per second of the file. If None, a second of the video is as much
+            simulated time as when the episode was recorded.
+        annotate: whether episode, step, time and return are written on the frames; as
+            recorded, if None.
+        out: the video, of the first camera or of all side by side; as the recording
+            says, beside it, if None.
+        strict: whether a video that shows nothing is an error; else it is a warning.
+        on_frame: called after every frame, once for each of every video.
+
+    Returns:
+        What was written, of the first camera; None where the recording broke before
+        there was a frame, which the metadata now says.
+
+    Raises:
+        NoPictures: it has no frames.
+        UnreadableFile: it is damaged.
+        MissingDependency: frames are to be written on, and there is no Pillow.
+        BlankVideo: `strict`, and a video shows nothing. All are there and stay.
+        FileNotWritten: the disk is full.
+        Error: its frames cannot be drawn or encoded.
+    """
+    recorded = read_recording(parts)
+    facts, view = recorded.facts[0], view or View()
+    if not sum(recorded.frame_counts):
+        _note_that_it_broke(recorded, out)
+        return None
+    warn_of_other_frames(parts[0].name, facts)
+    chosen = recorded.chosen(max_fps)
+    runs = list(_runs(recorded, chosen.indices))
+    if annotate is None:
+        annotate = bool(video_facts(facts).get("annotate", False))
+    if annotate:
+        check_annotation()
+    rate = _fps(recorded, chosen) if fps is None else to_rate(fps)
+    stride = facts.get("stride", 1) * chosen.every
+    timestep = recorded.timing.get("timestep")
+    said = {
+        **_metadata(recorded),
+        **timing_facts(
+            StepRuns(recorded.frame_steps[chosen.indices].tolist(), stride=stride),
+            fps=rate,
+            timestep=None if timestep is None else Fraction(timestep),
+            stride=stride,
+        ),
+        "pictures": "scene",
+        "quality": view.quality or video_facts(facts).get("quality", "full"),
+    }
+    shots = _shots(parts[0], facts, view, out)
+    if out is None:
+        # They would go on leading to what is replaced now.
+        take_second_names(shots[-1].path)
+    sinks: list[VideoSink] = []
+    try:
+        for shot in shots:
+            sink = _film(
+                shot,
+                rate,
+                functools.partial(_drawn, workers, shot, runs, annotate=annotate),
+                on_frame,
+            )
+            sinks.append(sink)
+            sink.describe({**said, **shot.facts, **workers.gl_facts})
+    except BaseException:
+        for sink in sinks:
+            sink.discard()
+        raise
+    if out is None:
+        give_second_names(shots[-1].path)
+    suspects = [sink for sink in sinks if sink.blank.suspicion() is not None]
+    for number, sink in reversed(list(enumerate(suspects))):
+        # With `strict` the first is an error, when all others have been warned of.
+        sink.blank.judge(sink.path, strict=strict and number == 0)
+    return sinks[-1].file
+
+
+def _note_that_it_broke(recorded: Recorded, out: Path | None) -> None:
+    """Write the metadata of a video that there will never be.
+
+    Raises:
+        NoPictures: nothing says that there will not.
+    """
+    path, facts = recorded.parts[0], recorded.facts[0]
+    reason = facts.get("broken_reason")
+    if recorded.is_clip:
+        reason = "the process was killed before its first frame"
+    if reason is None or out is not None or not video_facts(facts):
+        refusal = facts.get("refusal")
+        why = f": {refusal}" if refusal else ""
+        raise NoPictures(
+            f"{path} holds states, and nothing that pictures can be made of{why}."
+        )
+    broken = {"broken_reason": reason, "empty": True, "broken": True}
+    write_metadata(video_path(path, facts), {**_metadata(recorded), **broken})
+
+
+def _runs(
+    recorded: Recorded, indices: Sequence[int]
+) -> Iterator[tuple[Path, list[int]]]:
+    """Yield the parts, each with the numbers of those of its frames that are wanted."""
+    begin = 0
+    for path, count in zip(recorded.parts, recorded.frame_counts, strict=True):
+        own = [index - begin for index in indices if begin <= index < begin + count]
+        begin += count
+        if own:
+            yield path, own
+
+
+def _drawn(
+    workers: WorkerPool,
+    shot: _Shot,
+    runs: Sequence[tuple[Path, Sequence[int]]],
+    *,
+    annotate: bool,
+) -> Iterator[tuple[Frame, Caption | None]]:
+    """Yield the frames of all parts, with what is written on them."""
+    tiles = {} if shot.cameras is None else {"cameras": shot.cameras}
+    for path, indices in runs:
+        frames = workers.frames(path, indices, shot.view, **tiles)
+        if annotate:
+            with open_for_rendering(path) as reader:
+                yield from zip(frames, captions(reader, indices), strict=True)
+        else:
+            yield from zip(frames, itertools.repeat(None))
+
+
+def _fps(recorded: Recorded, chosen: ChosenFrames) -> Fraction:
+    asked = video_facts(recorded.facts[0]).get("fps")
+    if recorded.is_clip and asked is not None:
+        # All frames are recorded: `max_fps` has no part in the rate that was asked for.
+        return Fraction(asked)
+    return usual_fps(recorded.timing, chosen)
+
+
+def _metadata(recorded: Recorded) -> dict[str, Any]:
+    """Return what the metadata says of what was recorded."""
+    first, last = recorded.facts[0], recorded.facts[-1]
+    keys = ("episode_id", "type", "env_id", "seed", "options", "versions")
+    complete = bool(last.get("complete"))
+    said = {
+        "content_type": "video/mp4",
+        **{key: first.get(key) for key in keys},
+        "recording": "deferred",
+        "rendered_with": dict(versions()),
+        # Software rasterisers round as their CPU does.
+        "machine": dict(machine_fingerprint()),
+        "complete": complete,
+        "length": last.get("length", recorded.step_count),
+        "reward": last.get("reward", recorded.reward),
+    }
+    if recorded.is_clip:
+        said["first_step"] = (first.get("clip") or {}).get("first_step")
+        said["last_episode_id"] = last.get("last_episode_id", last.get("episode_id"))
+        if any("final_frame" in facts for facts in recorded.facts):
+            said["final_frame"] = "missing"
+    elif complete:
+        said |= {key: last.get(key) for key in ("terminated", "truncated")}
+    if not complete:
+        # A process that was killed could not say why it ended.
+        said["reason"] = last.get("reason", KILLED)
+        if "exception" in last:
+            said["exception"] = last["exception"]
+    if (selection := video_facts(first).get("selection")) is not None:
+        said["selection"] = selection
+    if (broken := last.get("broken_reason")) is not None:
+        said |= {"broken_reason": broken, "broken": True}
+    return said
+
+
+def _shots(
+    recording: Path, facts: Mapping[str, Any], view: View, out: Path | None
+) -> list[_Shot]:
+    """Return the videos that are to be rendered, the first camera's last."""
+    video = video_facts(facts)
+    label = (facts.get("scene") or {}).get("label")
+    further = list(video.get("cameras") or ())[1:]
+    first = video_path(recording, facts) if out is None else out
+    if view.camera is not None:
+        return [_Shot(first, view, {"camera": plain_camera(view.camera)})]
+
+    def second_name(path: Path) -> dict[str, str]:
+        second = None if out is not None else video.get("also_named")
+        name = second and second_name_of(path.name, second, first=first.name)
+        return {"also_named": name} if name else {}
+
+    if video.get("tiled") and further:
+        # The first one is as recorded, which is more than its name.
+        tiles = (None, *map(plain_camera, further))
+        rows, columns = grid_shape(len(tiles))
+        said = {"camera": [label, *further], "tiled": True, **second_name(first)}
+        return [_Shot(first, view, {**said, "rows": rows, "columns": columns}, tiles)]
+    paths = further_video_paths(recording, facts) if out is None else []
+    shots = [
+        _Shot(
+            path,
+            replace(view, camera=plain_camera(camera)),
+            {"camera": camera, "first_video": first.name, **second_name(path)},
+        )
+        for path, camera in zip(paths, further, strict=False)
+    ]
+    said = {"camera": label, **second_name(first)}
+    if shots:
+        said["further_videos"] = [shot.path.name for shot in shots]
+    return [*shots, _Shot(first, view, said)]
+
+
+def _film(
+    shot: _Shot,
+    fps: Fraction,
+    draw: Callable[[], Iterable[tuple[Frame, Caption | None]]],
+    on_frame: Callable[[], object],
+) -> VideoSink:
+    """Write a video, a second time where the encoder was ended from outside.
+
+    Returns:
+        What has written it; its metadata is still missing.
+    """
+    most = 0
+
+    def film() -> VideoSink:
+        nonlocal most
+        sink = VideoSink(shot.path, fps=fps)
+        try:
+            for number, (frame, caption) in enumerate(draw(), 1):
+                sink.write(frame, caption)
+                if number > most:
+                    most = number
+                    on_frame()
+            sink.finish()
+        except BaseException:
+            # Half a video is of no use: all of it can be rendered again.
+            sink.discard()
+            raise
+        return sink
+
+    try:
+        return film()
+    except EncoderError as error:
+        # Killed, for lack of memory or for hanging.
+        if (error.returncode or 0) >= 0:
+            raise
+        logger.warning("The video %s is begun anew: %s", shot.path.name, error)
+    return film()

@@ -1,0 +1,539 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings are finished beside a simulation, by a process of its own."""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from parts import parametrize
+from processes import children
+from recordings import frames_of, in_flight
+from trajectories_by_hand import write_log
+from waiting import wait_until
+
+from mjrec import Error, InvalidArgument, Monitor
+from mjrec.formats.in_flight import find_recording, is_in_flight
+from mjrec.formats.monitor_directory import Infix
+from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.rendering.background import Background
+from mjrec.rendering.progress import Progress
+
+# A program around it, with the directory at argv[1].
+PROGRAM = """
+import pathlib, sys
+from mjrec.formats.in_flight import recordings_in_flight
+from mjrec.rendering.background import Background
+directory = pathlib.Path(sys.argv[1])
+background = Background(directory, workers=1)
+for recording in recordings_in_flight(directory):
+    background.submit(recording.path)
+"""
+
+Start = Callable[..., Background]
+
+
+@pytest.fixture(scope="module")
+def _recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two short episodes of a simulation, as yet without videos."""
+    directory = tmp_path_factory.mktemp("recorded")
+    env = gymnasium.make(
+        "InvertedPendulum-v5", width=40, height=32, max_episode_steps=3
+    )
+    monitor = Monitor(env, directory, lambda _: True, workers=0, quality="draft")
+    for seed in (0, 1):
+        monitor.reset(seed=seed)
+        for _ in range(3):
+            monitor.step(env.action_space.sample())
+    monitor.close(wait=False)
+    return directory
+
+
+@pytest.fixture
+def recorded(_recorded: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(_recorded, tmp_path / "recorded"))
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Make backgrounds that are given recordings, and are stopped at the end."""
+    made = []
+
+    def make(directory: Path = tmp_path, *logs: Path, workers: Any = 1) -> Background:
+        made.append(Background(directory, workers=workers))
+        for log in logs:
+            made[-1].submit(log)
+        return made[-1]
+
+    yield make
+    for background in made:
+        background.stop()
+
+
+@pytest.fixture
+def others() -> set[int]:
+    """The processes that were there before."""
+    return children()
+
+
+def patched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    """Let the process run other code first."""
+    lines = "".join(f"    {line}\n" for line in code.splitlines())
+    guarded = f"import sys\nif sys.argv[0] == '-m':\n{lines}"
+    (tmp_path / "sitecustomize.py").write_text(guarded)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def is_finished(log: Path) -> bool:
+    """Tell whether it is there, and its rows are not."""
+    return log.exists() and find_recording(log) is None
+
+
+def has_ended(pid: int) -> bool:
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+    return stat.rpartition(")")[2].split()[0] == "Z"
+
+
+def workers_of(process: int) -> set[int]:
+    """Return the processes that draw for it."""
+    commands = {pid: Path(f"/proc/{pid}/cmdline") for pid in children(process)}
+    return {p for p, path in commands.items() if b".worker" in path.read_bytes()}
+
+
+# What it does
+
+
+def test_one_process_does_all(
+    tmp_path: Path, others: set[int], start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also what comes after a wait; without anything to do there is none."""
+    background = start()
+    background.wait()
+    assert children() == others
+    for round_ in range(2):
+        logs = [write_log(tmp_path, 10 * round_ + k, video=None) for k in range(3)]
+        for log in logs:
+            background.submit(log)
+        background.wait()
+        assert all(map(is_finished, logs))
+        assert (list(background.waiting), background.failures) == ([], {})
+        [process] = children() - others
+        # Ctrl-C in the terminal does not reach it, and it gives way to others.
+        assert os.getsid(process) == process
+        assert os.getpriority(os.PRIO_PROCESS, process) == 10
+    background.stop()
+    assert children() == others
+
+
+def test_videos_are_rendered(recorded: Path, start: Start) -> None:
+    """By workers of their own, and every frame is shown to be drawn."""
+    logs = in_flight(recorded)
+    background = start(recorded, *logs, workers=None)
+    seen: list[Progress] = []
+    background.wait(seen.append)
+    assert background.failures == {}
+    videos = sorted(recorded.glob("*.mp4"))
+    assert [len(frames_of(video)) for video in videos] == [4, 4]
+    assert all(map(is_finished, logs))
+    assert seen[-1] == Progress(videos_done=2, videos=2, frames_done=8, frames=8)
+    background.stop()
+    assert not list(recorded.glob(".*"))
+
+
+def test_a_video_that_is_expected_finds_its_workers(
+    recorded: Path,
+    others: set[int],
+    start: Start,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They start while its episode runs, stay, and a single one, too, uses one CPU."""
+    monkeypatch.delenv("LP_NUM_THREADS", raising=False)
+    background = start(recorded, workers=1)
+    background.expect()
+    [process] = children() - others
+    wait_until(lambda: workers_of(process))
+    [worker] = workers_of(process)
+    environ = Path(f"/proc/{worker}/environ").read_bytes()
+    assert b"LP_NUM_THREADS=1" in environ.split(b"\0")
+    for log in in_flight(recorded):
+        background.expect()
+        background.submit(log)
+        background.wait()
+        assert workers_of(process) == {worker}
+    assert background.failures == {}
+    assert len(list(recorded.glob("*.mp4"))) == 2
+
+
+def test_submitting_never_waits(others: set[int], tmp_path: Path, start: Start) -> None:
+    """Not even while nobody reads, with more names than a pipe holds."""
+    log = write_log(tmp_path, video=None)
+    background = start(tmp_path, log)
+    [process] = children() - others
+    os.kill(process, signal.SIGSTOP)
+    for number in range(1, 3000):
+        background.submit(tmp_path / f"{log.stem[:-6]}{number:06d}.h5")
+    os.kill(process, signal.SIGCONT)
+    background.wait()
+    assert list(background.waiting) == []
+    assert is_finished(log)
+
+
+def test_what_fails_is_told_and_stops_nothing_else(
+    tmp_path: Path, start: Start
+) -> None:
+    """By the name of the video, also where nobody waits; the trajectory stays."""
+    bad, good = write_log(tmp_path, 0), write_log(tmp_path, 1, video=None)
+    min(tmp_path.glob("*.log")).unlink()
+    background = start(tmp_path, bad, good)
+    wait_until(lambda: is_finished(good))
+    background.stop()
+    [(name, reason)] = background.failures.items()
+    assert name == "openaigym.video.0.7.video000000.mp4"
+    assert "Cannot read" in reason
+    assert in_flight(tmp_path) == [bad]
+
+
+def test_a_model_that_is_still_being_written_is_waited_for(
+    recorded: Path, start: Start
+) -> None:
+    """It is compressed beside the simulation; once nobody writes, it is an error."""
+    [model] = recorded.glob("*.mjb.gz")
+    hidden = model.rename(model.with_name("hidden"))
+    first, second = in_flight(recorded)
+    later = write_log(recorded, video=None)
+    background = start(recorded, first, later)
+    wait_until(lambda: is_finished(later))
+    assert not list(recorded.glob("*.mp4"))
+    hidden.rename(model)
+    background.wait()
+    assert background.failures == {}
+    for each in recorded.glob("*.model.*"):
+        each.unlink()
+    background.submit(second)
+    background.wait()
+    [reason] = background.failures.values()
+    assert "model" in reason
+    assert len(list(recorded.glob("*.mp4"))) == 1
+
+
+def test_several_monitors_share_one(tmp_path: Path, start: Start) -> None:
+    """Each knows its own failures, ends nothing, and all are waited for at once."""
+    background = start()
+    shares = {}
+    for number in (0, 1):
+        infix = Infix(number, "7")
+        write_log(tmp_path, infix=infix)
+        shares[number] = background.share()
+        for log in in_flight(tmp_path)[number:]:
+            shares[number].submit(log)
+    for rows in tmp_path.glob("*.log"):
+        rows.unlink()
+    with background.waiting_at_the_end(lambda _: None):
+        for share in shares.values():
+            share.wait()
+            share.stop()
+        assert background.waiting
+    for number, share in shares.items():
+        assert list(share.failures) == [f"openaigym.video.{number}.7.video000000.mp4"]
+
+
+@pytest.mark.parametrize("workers", [0, -1, True, 1.5, "2"])
+def test_workers_are_a_number_of_processes(workers: Any, tmp_path: Path) -> None:
+    """At least one."""
+    with pytest.raises(InvalidArgument, match="workers"):
+        Background(tmp_path, workers=workers)
+
+
+# How it ends
+
+
+def test_stopping_leaves_what_is_not_done(
+    recorded: Path, others: set[int], start: Start, stuck_encoder: Path
+) -> None:
+    """At once, in the midst of a video; no process and no temporary file stays."""
+    logs = in_flight(recorded)
+    background = start(recorded, *logs)
+    wait_until(stuck_encoder.exists)
+    began = time.monotonic()
+    background.stop()
+    assert time.monotonic() - began < 3
+    background.stop()
+    assert children() == others
+    assert not list(recorded.glob("*.meta.json"))
+    assert not list(recorded.glob(".*"))
+    late = write_log(recorded, video=None)
+    background.submit(late)
+    background.wait()
+    assert is_in_flight(late)
+    assert background.failures == {}
+    assert all(log.exists() or is_in_flight(log) for log in logs)
+
+
+def test_a_wait_can_be_interrupted(recorded: Path, start: Start) -> None:
+    """Ctrl-C while it waits; another wait goes on, with what came in between."""
+    background = start(recorded, in_flight(recorded)[0])
+
+    def interrupt(progress: Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        background.wait(interrupt)
+    late = write_log(recorded, video=None)
+    background.submit(late)
+    background.wait()
+    assert background.failures == {}
+    assert len(list(recorded.glob("*.mp4"))) == 1
+    assert is_finished(late)
+
+
+@parametrize("signum", [signal.SIGKILL, signal.SIGSEGV])
+def test_another_process_goes_on_for_a_dead_one(
+    others: set[int],
+    signum: signal.Signals,
+    recorded: Path,
+    start: Start,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Nothing is missing, nothing is left of the first one, and it is told how it died.
+
+    It dies once in the midst of a video, and once before anything has begun.
+    """
+    background = start(recorded, *in_flight(recorded))
+    [process] = children() - others
+    if signum == signal.SIGKILL:
+        wait_until(lambda: list(recorded.glob(".*.mp4.*.part")))
+    os.kill(process, signum)
+    background.wait()
+    assert background.failures == {}
+    assert [len(frames_of(video)) for video in recorded.glob("*.mp4")] == [4, 4]
+    assert signum.name in caplog.text
+    background.stop()
+    assert not list(recorded.glob(".*"))
+    assert children() == others
+
+
+def test_the_second_death_is_one_clear_failure(
+    others: set[int], tmp_path: Path, start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is told how they died; nothing waits for ever, and all stays pending."""
+    logs = [write_log(tmp_path, k, model={"mjb": "none"}) for k in range(3)]
+    background = start(tmp_path, *logs[:2])
+    for _ in range(2):
+        [process] = children() - others
+        os.kill(process, signal.SIGKILL)
+        wait_until(functools.partial(has_ended, process))
+        background.submit(logs[2])
+    background.wait()
+    assert list(background.failures) == [log.name for log in logs]
+    assert "killed by SIGKILL" in background.failures[logs[2].name]
+    assert caplog.text.count("SIGKILL") == 2
+    background.submit(write_log(tmp_path, 3))
+    background.wait()
+    assert len(background.failures) == 4
+    assert children() == others
+
+
+@pytest.mark.parametrize(
+    ("python", "reason"),
+    [("/bin/false", "ended with status 1"), ("/no/python", "could not be started")],
+)
+def test_one_that_cannot_start_says_why(
+    python: str,
+    reason: str,
+    tmp_path: Path,
+    start: Start,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its last words are part of the failure."""
+    monkeypatch.setattr(sys, "executable", python)
+    log = write_log(tmp_path)
+    background = start(tmp_path, log)
+    background.wait()
+    assert reason in background.failures[log.name]
+
+
+HANGING = """
+import subprocess, threading
+def wait_for_a_disk_that_does_not_answer(*a, **k):
+    child = subprocess.Popen(['sleep', '60'], start_new_session=True)
+    open({pids!r}, 'a').write(f'{{child.pid}}\\n')
+    threading.Lock().acquire() and threading.Event().wait()
+import mjrec.rendering.finish as f
+f.finish_trajectory = wait_for_a_disk_that_does_not_answer
+"""
+SLOW = """
+import time
+import mjrec.rendering.finish as f
+finish = f.finish_trajectory
+def slowly(log):
+    for _ in range(40):
+        time.sleep(0.1)
+    return finish(log)
+f.finish_trajectory = slowly
+"""
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("hangs", [True, False])
+def test_one_that_hangs_is_ended(
+    hangs: bool,
+    others: set[int],
+    tmp_path: Path,
+    start: Start,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With its children; the log has its threads' stacks, and another one tries.
+
+    One that is at work does not hang, however long it takes for one thing.
+    """
+    pids = tmp_path / "pids"
+    code = HANGING.format(pids=str(pids)) if hangs else SLOW
+    patched(tmp_path, monkeypatch, code)
+    monkeypatch.setenv("MJREC_PATIENCE", "0.7")
+    log = write_log(tmp_path, video=None)
+    background = start(tmp_path, log)
+    background.wait()
+    if not hangs:
+        assert background.failures == {}
+        assert is_finished(log)
+        return
+    assert "hung for 2.1 seconds" in background.failures[log.name]
+    assert "in wait_for_a_disk_that_does_not_answer" in caplog.text
+    assert caplog.text.count("What its threads were at") == 2
+    assert is_in_flight(log)
+    started = [int(pid) for pid in pids.read_text().split()]
+    assert len(started) == 2
+    wait_until(lambda: all(map(has_ended, started)))
+    assert children() == others
+
+
+# What it leaves alone
+
+LOUD = """
+import logging, os
+os.write(1, b'early words\\n[1]\\n')
+import mjrec.rendering.finish as f
+add = f.Finisher.add
+def tell(*a, **k):
+    print('late words', flush=True)
+    os.write(1, b'half a line')
+    logging.getLogger('mjrec').warning('100% slow')
+    return add(*a, **k)
+f.Finisher.add = tell
+"""
+
+
+def test_what_libraries_print_disturbs_nobody(
+    tmp_path: Path,
+    start: Start,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Before it has begun or in the midst of its work; warnings are logged here."""
+    patched(tmp_path, monkeypatch, LOUD)
+    log = write_log(tmp_path, video=None)
+    background = start(tmp_path, log)
+    background.wait()
+    assert background.failures == {}
+    assert is_finished(log)
+    assert "early words" in caplog.text
+    assert "late words" not in caplog.text
+    assert "100% slow" in caplog.text
+
+
+def test_a_forked_child_leaves_it_alone(tmp_path: Path, start: Start) -> None:
+    """It cannot use it, and its end is not that of the process."""
+    log = write_log(tmp_path, video=None)
+    background = start(tmp_path, log)
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            background.submit(log)
+        except Error:
+            background.wait()
+            background.stop()
+            status = 0
+        os._exit(status)
+    assert os.waitpid(child, 0)[1] == 0
+    background.wait()
+    assert background.failures == {}
+    assert is_finished(log)
+
+
+def test_it_ends_with_its_parent(tmp_path: Path) -> None:
+    """However that ends, and though it has forked a child that lives on."""
+    log = write_log(tmp_path, model={"mjb": "none"})
+    code = (
+        "import os, time\nif os.fork() == 0:\n    time.sleep(60)\n    os._exit(0)\n"
+        "print(background._process.child.pid, flush=True)\ntime.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", PROGRAM + code, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    ) as program:
+        assert program.stdout is not None
+        process = int(program.stdout.readline())
+        program.kill()
+        program.wait()
+        wait_until(lambda: has_ended(process))
+        # The child, which has nothing to do with it.
+        os.killpg(program.pid, signal.SIGKILL)
+    with open_trajectory(log) as reader:
+        assert reader.step_count == 4
+
+
+@parametrize("way", ["script", "stdin", "daemonic"])
+def test_any_program_can_have_one(way: str, tmp_path: Path) -> None:
+    """A script without a guard, `python -`, a daemonic process; once each.
+
+    It gets no thread, and no library that draws or writes HDF5.
+    """
+    log = write_log(tmp_path, video=None)
+    code = PROGRAM + (
+        "import threading\n"
+        "heavy = {'mujoco', 'OpenGL', 'h5py', 'multiprocessing'} & set(sys.modules)\n"
+        "print(threading.active_count(), heavy)\n"
+        "background.wait()\nprint('waited', background.failures)\n"
+    )
+    if way == "daemonic":
+        context = multiprocessing.get_context("spawn")
+        process = context.Process(target=_serve, args=(log,), daemon=True)
+        process.start()
+        process.join()
+        assert process.exitcode == 0
+    else:
+        script = tmp_path / "script.py"
+        script.write_text(code)
+        answer = subprocess.run(
+            [sys.executable, "-" if way == "stdin" else str(script), str(tmp_path)],
+            input=code if way == "stdin" else None,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert answer.stdout == "1 set()\nwaited {}\n"
+    assert is_finished(log)
+
+
+def _serve(log: Path) -> None:
+    background = Background(log.parent, workers=1)
+    background.submit(log)
+    background.wait()

@@ -1,0 +1,449 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is pending in a directory is found, shared out, and done once."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from trajectories_by_hand import (
+    INFIX,
+    Painter,
+    add_row,
+    grey,
+    new_logs,
+    write_finished,
+    write_log,
+    write_pending_manifest,
+)
+
+from mjrec import GLError, UnreadableFile, load_results
+from mjrec.formats.in_flight import add_facts, is_in_flight
+from mjrec.formats.locks import Lock
+from mjrec.formats.monitor_directory import (
+    Infix,
+    lock_name,
+    trajectory_prefix,
+    video_lock_name,
+)
+from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.rendering import finish as module
+from mjrec.rendering.finish import Finisher, note_failure
+from mjrec.rendering.jobs import Outcome, VideoJob
+from mjrec.rendering.progress import Progress
+from mjrec.rendering.recorded_facts import open_for_rendering
+from mjrec.rendering.recordings import (
+    RecordingKey,
+    claim,
+    key_of,
+    look_at,
+    may_be_left,
+    recorded_episodes,
+    recordings,
+)
+from mjrec.results.listing import write_listing, write_listings
+
+pytestmark = pytest.mark.usefixtures("painter")
+
+KEY = RecordingKey(INFIX, 0)
+VIDEO = "openaigym.video.0.7.video000000"
+ENDS = ("framehash", "meta.json", "mp4")
+
+
+def finish(directory: Path, **options: Any) -> list[Outcome]:
+    options = {"workers": 1, **options}
+    return list(module.finish(directory, recordings(directory), **options))
+
+
+def manifest_in(directory: Path) -> dict[str, Any]:
+    [path] = directory.glob("*.manifest.json")
+    content: dict[str, Any] = json.loads(path.read_text())
+    return content
+
+
+# What is pending
+
+
+def test_episodes_are_in_their_order(tmp_path: Path) -> None:
+    """By the monitors' numbers, and then by their own; each once."""
+    for infix in (Infix(10, "a"), Infix(2, "a")):
+        for episode_id in (1, 0):
+            write_log(tmp_path, episode_id, infix=infix)
+    write_log(tmp_path, 5, infix=Infix(2, "a")).write_bytes(b"")
+    found = [(key.infix.monitor_id, key.number) for key in recorded_episodes(tmp_path)]
+    assert found == [(2, 0), (2, 1), (2, 5), (10, 0), (10, 1)]
+
+
+@pytest.mark.parametrize(
+    "key",
+    [RecordingKey(INFIX, 12), RecordingKey(Infix(3, "a.b"), 4000, is_clip=True)],
+)
+def test_a_recording_is_told_by_a_name(key: RecordingKey) -> None:
+    """Which says all of it."""
+    assert key_of(key.told_name) == key
+
+
+@pytest.mark.parametrize("write", [write_log, write_finished])
+def test_a_deferred_video_is_pending_until_it_and_its_metadata_are_there(
+    write: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Whether or not the trajectory has its final form."""
+    trajectory = write(tmp_path)
+    pending = look_at(tmp_path, KEY)
+    assert pending is not None
+    assert pending.parts == (trajectory,)
+    assert pending.video == tmp_path / f"{VIDEO}.mp4"
+    assert pending.frame_count == 5
+    for _ in range(2):
+        [outcome] = finish(tmp_path)
+        assert outcome.is_video
+        assert look_at(tmp_path, KEY) is None
+        assert not may_be_left(tmp_path, KEY)
+        (tmp_path / f"{VIDEO}.meta.json").unlink()
+
+
+@pytest.mark.parametrize("video", [None, "live"])
+def test_a_log_without_a_deferred_video_gets_its_final_form_only(
+    video: str | None,
+    tmp_path: Path,
+    painter: Painter,
+    names: Callable[[Path], list[str]],
+) -> None:
+    """What was drawn live, or not wanted, is not drawn."""
+    log = write_log(tmp_path, video=video)
+    [outcome] = finish(tmp_path)
+    assert (outcome.is_trajectory, outcome.name) == (True, log.name)
+    assert names(tmp_path) == [log.name]
+    assert painter.asked == []
+    assert finish(tmp_path) == []
+
+
+@pytest.mark.parametrize(("facts", "ended"), [({"candidate": True}, True), ({}, False)])
+def test_what_an_open_monitor_has_not_ended_is_its_own(
+    facts: dict[str, Any], ended: bool, tmp_path: Path
+) -> None:
+    """Running or undecided, it may still be deleted; that of a dead one is pending."""
+    log = write_log(tmp_path, ended=ended, **facts)
+    write_log(tmp_path, 1)
+    lock = Lock(tmp_path / lock_name(INFIX), "")
+    # What has ended is not its own.
+    assert [outcome.name[-5:] for outcome in finish(tmp_path)] == ["1.mp4"]
+    assert is_in_flight(log)
+    if ended:
+        add_facts(log, {"candidate": False})
+        assert look_at(tmp_path, KEY) is not None
+        add_facts(log, {"candidate": True})
+    lock.release()
+    [outcome] = finish(tmp_path)
+    assert outcome.is_video
+
+
+def test_a_trajectory_that_is_not_kept_goes_with_its_video_only(
+    tmp_path: Path, names: Callable[[Path], list[str]]
+) -> None:
+    """While that fails it stays: nobody could ever render it."""
+    write_log(tmp_path, kept=False)
+    log = write_log(tmp_path, 1, kept=False, frames=False)
+    assert [bool(outcome.failure) for outcome in finish(tmp_path)] == [False, True]
+    assert is_in_flight(log)
+    others = ("states", "failed")
+    assert [n for n in names(tmp_path) if not any(o in n for o in others)] == [
+        f"{VIDEO}.{end}" for end in ENDS
+    ]
+
+
+# Who does it
+
+
+def test_what_another_process_has_is_left_to_it(
+    tmp_path: Path, painter: Painter
+) -> None:
+    """It is told, and not done twice; the lock file of a dead one is nobody's."""
+    write_finished(tmp_path)
+    lock = claim(tmp_path, KEY)
+    assert lock is not None
+    assert claim(tmp_path, KEY) is None
+    [outcome] = finish(tmp_path)
+    assert outcome.is_elsewhere
+    assert painter.asked == []
+    lock.release()
+    (tmp_path / video_lock_name(INFIX, 0)).write_text("4711")
+    write_pending_manifest(tmp_path, 0)
+    [outcome] = finish(tmp_path, workers=None)
+    assert outcome.is_video
+    # No lock stays: of the episode, of the manifest, of the CPUs.
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_what_was_done_meanwhile_is_not_done_again(
+    tmp_path: Path, painter: Painter
+) -> None:
+    """Two look at the same directory; the slower finds nothing left."""
+    write_finished(tmp_path)
+    with Finisher(tmp_path, workers=1) as slower:
+        slower.add(VideoJob.finishing(tmp_path, KEY))
+        finish(tmp_path)
+        _, outcome = slower.do_next()
+    assert outcome.is_trajectory
+    assert len(painter.asked) == 1
+
+
+def test_what_a_killed_renderer_left_goes_with_the_next_try(tmp_path: Path) -> None:
+    """Only that of the same video."""
+    write_finished(tmp_path, 0)
+    others = [
+        f".{VIDEO}.side.mp4.0123abcd.part",
+        ".openaigym.video.0.7.video000001.mp4",
+    ]
+    left = [f".{VIDEO}.{end}.0123abcd.part" for end in ENDS]
+    for name in [*others, *left]:
+        (tmp_path / name).touch()
+    assert [outcome.failure for outcome in finish(tmp_path)] == [None]
+    assert all((tmp_path / name).exists() for name in others)
+    assert not any((tmp_path / name).exists() for name in left)
+
+
+def test_a_log_beside_its_finished_trajectory_goes(tmp_path: Path) -> None:
+    """A process died between making one and removing the other."""
+    log = write_log(tmp_path)
+    rows = {path: path.read_bytes() for path in tmp_path.glob("*.states.*")}
+    finish(tmp_path)
+    for path, content in rows.items():
+        path.write_bytes(content)
+    assert finish(tmp_path) == []
+    assert not any(path.exists() for path in rows)
+    with open_trajectory(log) as reader:
+        assert reader.step_count == 4
+
+
+def test_one_whose_model_is_still_being_written_waits(tmp_path: Path) -> None:
+    """Another one comes first."""
+    jobs = [VideoJob.finishing(tmp_path, RecordingKey(INFIX, n)) for n in (0, 1)]
+    write_finished(tmp_path, 0, model={"mjb": "m.mjb.gz", "xml": None})
+    write_finished(tmp_path, 1)
+    with Finisher(tmp_path, workers=1) as finisher:
+        finisher.add(jobs[0])
+        assert not finisher.is_ready()
+        finisher.add(jobs[1])
+        assert finisher.is_ready()
+        assert finisher.do_next()[0] == jobs[1]
+        (tmp_path / "m.mjb.gz").write_bytes(b"")
+        assert finisher.is_ready()
+
+
+# What fails
+
+
+def test_what_cannot_be_rendered_stops_nothing_else(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, painter: Painter
+) -> None:
+    """It is told with its reason, and stays pending."""
+    write_finished(tmp_path, 0).write_bytes(b"not HDF5 at all")
+    write_finished(tmp_path, 1, frames=False, refusal="a plugin draws")
+    write_finished(tmp_path, 2)
+    write_finished(tmp_path, 3)
+    painter.breaks_at = lambda path, *_: [][1] if "000002" in path.name else None
+    first, second, third, fourth = finish(tmp_path)
+    assert "Cannot read" in str(first.failure)
+    assert "a plugin draws" in str(second.failure)
+    assert str(third.failure).startswith("IndexError: ")
+    assert "Traceback" in caplog.text
+    assert fourth.is_video
+    assert len(finish(tmp_path)) == 3
+
+
+def test_without_gl_every_video_fails_at_once(tmp_path: Path, painter: Painter) -> None:
+    """One try is enough; trajectories get their final form all the same."""
+
+    def fail(*_: object) -> None:
+        raise GLError("nothing renders here")
+
+    painter.breaks_at = fail
+    logs = [write_log(tmp_path, episode_id) for episode_id in range(3)]
+    outcomes = finish(tmp_path)
+    assert [outcome.failure for outcome in outcomes] == ["nothing renders here"] * 3
+    assert len(painter.asked) == 1
+    assert [log.exists() for log in logs] == [True] * 3
+
+
+def test_progress_counts_videos_and_frames(tmp_path: Path) -> None:
+    """Those that fail count as done; trajectories without a video do not count."""
+    write_finished(tmp_path, 0)
+    write_finished(tmp_path, 1, frames=False)
+    write_log(tmp_path, 2, video=None)
+    seen: list[Progress] = []
+    finish(tmp_path, on_progress=seen.append)
+    assert seen[-1] == Progress(videos_done=2, videos=2, frames_done=5, frames=5)
+    drawn = [progress.frames_done for progress in seen]
+    assert drawn == sorted(drawn)
+    assert {0, 1, 2, 3, 4, 5} == set(drawn)
+
+
+# The manifest
+
+
+def test_the_manifest_of_a_closed_monitor_gets_the_videos(tmp_path: Path) -> None:
+    """In the order of the episodes; what is not there yet stays pending."""
+    for episode_id in (0, 1):
+        write_finished(tmp_path, episode_id)
+    write_finished(tmp_path, 3, frames=False, broken_reason="a marker")
+    write_pending_manifest(tmp_path, 1, 0, 2, 3, schedule={"name": "cubic"})
+    (tmp_path / "openaigym.episode_batch.0.7.stats.json").write_text(
+        '{"initial_reset_timestamp": 1, "timestamps": [2], "episode_lengths": [4], '
+        '"episode_rewards": [2.0], "episode_types": ["t"]}'
+    )
+    finish(tmp_path)
+    manifest = manifest_in(tmp_path)
+    assert manifest["videos"] == [
+        [f"openaigym.video.0.7.video{k:06d}.{end}" for end in ("mp4", "meta.json")]
+        for k in (0, 1)
+    ]
+    assert [entry["episode_id"] for entry in manifest["mjrec"]["pending"]] == [2]
+    assert manifest["mjrec"]["broken"] == ["openaigym.video.0.7.video000003.meta.json"]
+    assert manifest["mjrec"]["schedule"] == {"name": "cubic"}
+    assert manifest["env_info"] == {"gym_version": "mjrec-1", "env_id": "Grey-v0"}
+    results = load_results(tmp_path)
+    assert results is not None
+    assert len(results["videos"]) == 2
+
+
+def test_the_manifest_of_an_open_monitor_is_left_to_it(tmp_path: Path) -> None:
+    """What a race leaves, a later run repairs, though there is nothing to render."""
+    write_finished(tmp_path)
+    path = write_pending_manifest(tmp_path, 0)
+    before = path.read_bytes()
+    lock = Lock(tmp_path / lock_name(INFIX), "")
+    finish(tmp_path)
+    assert path.read_bytes() == before
+    lock.release()
+    assert finish(tmp_path) == []
+    assert len(manifest_in(tmp_path)["videos"]) == 1
+
+
+def test_other_manifests_are_not_rewritten(tmp_path: Path) -> None:
+    """Neither gym's own, nor one in which nothing is new."""
+    gyms = tmp_path / "openaigym.manifest.0.1.manifest.json"
+    gyms.write_text('{"stats": "s.json", "videos": [], "env_info": {}, "more": 1}')
+    paths = (gyms, write_pending_manifest(tmp_path, 3))
+    before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in paths]
+    write_listings(tmp_path)
+    assert [(path.read_bytes(), path.stat().st_mtime_ns) for path in paths] == before
+
+
+@pytest.mark.parametrize("name", ["../elsewhere/x.mp4", "/x.mp4", "", 7, None])
+def test_a_manifest_names_no_video_elsewhere(name: Any, tmp_path: Path) -> None:
+    """Such an entry stays as it is."""
+    path = write_pending_manifest(tmp_path, 0)
+    content = json.loads(path.read_text())
+    content["mjrec"]["pending"][0]["video"] = name
+    path.write_text(json.dumps(content))
+    write_listing(tmp_path, INFIX)
+    assert manifest_in(tmp_path) == content
+
+
+def test_the_manifest_says_why_a_video_is_still_pending(tmp_path: Path) -> None:
+    """What became of the latest try; a try that succeeds takes it away."""
+    write_log(tmp_path, 0)
+    write_pending_manifest(tmp_path, 0)
+    [rows] = tmp_path.glob("*.log")
+    hidden = rows.rename(tmp_path / "hidden")
+    [outcome] = finish(tmp_path)
+    [entry] = manifest_in(tmp_path)["mjrec"]["pending"]
+    assert entry["reason"] == outcome.failure
+    assert "Cannot read" in entry["reason"]
+    hidden.rename(rows)
+    assert [outcome.failure for outcome in finish(tmp_path)] == [None]
+    assert manifest_in(tmp_path)["mjrec"]["pending"] == []
+
+
+def test_a_long_reason_is_cut_in_its_middle(tmp_path: Path) -> None:
+    """Where it begins and ends is what matters."""
+    write_pending_manifest(tmp_path, 0)
+    reason = "It failed. " + 10**4 * "x" + " No space left."
+    note_failure(tmp_path, f"{VIDEO}.mp4", reason)
+    write_listing(tmp_path, INFIX)
+    [entry] = manifest_in(tmp_path)["mjrec"]["pending"]
+    assert len(entry["reason"]) <= 1000
+    assert re.fullmatch(
+        r"It failed\. x+ \[\.\.\.\] x+ No space left\.", entry["reason"]
+    )
+
+
+# Facts, which may be anybody's
+
+FACTS: dict[str, Any] = {"name": "x.mp4", "recording": "deferred"}
+
+
+def write_saying(directory: Path, **facts: Any) -> Path:
+    """Write a log of two frames that says these facts, of any kind."""
+    usual = write_finished(directory, 1)
+    with open_trajectory(usual) as reader:
+        header = reader.header
+    usual.unlink()
+    header = dataclasses.replace(header, facts={**header.facts, **facts})
+    logs = new_logs(directory)
+    span = logs.begin(trajectory_prefix(INFIX, 1), header)
+    for step in range(2):
+        add_row(span, step, snapshot=grey(step))
+    logs.close()
+    return usual
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("rate", value) for value in ("1e20000000", "abc", "0", "1/0", 20)),
+        ("timestep", "nan"),
+        *(("stride", value) for value in (0, "2", 2.0, None)),
+        *(("kept", 1), ("candidate", "yes"), ("scene", "all"), ("refusal", 5)),
+        *(("model", value) for value in ([], {"mjb": "x" * 300}, {"xml": "../x.zip"})),
+        ("video", "x"),
+        *(
+            ("video", {**FACTS, **value})
+            for value in (
+                *({"name": 5}, {"quality": "best"}, {"recording": None}),
+                *({"fps": "1e20000000"}, {"fps": "0.00001"}, {"max_fps": 30}),
+                *({"cameras": "side"}, {"cameras": []}, {"cameras": ["a", None]}),
+                *({"cameras": [1.5, "a"]}, {"cameras": [{"lookat": "x"}, "a"]}),
+                *({"tiled": 1}, {"annotate": "yes"}, {"also_named": 1}),
+                {"also_named": "../a-episode-1.mp4"},
+                {"also_named": "openaigym-step-1.mp4"},
+            )
+        ),
+    ],
+)
+def test_a_fact_that_cannot_be_is_named(key: str, value: Any, tmp_path: Path) -> None:
+    """With its file, at once; and the next recording is rendered."""
+    path = write_saying(tmp_path, **{key: value})
+    write_finished(tmp_path, 2)
+    start = time.monotonic()
+    with pytest.raises(UnreadableFile, match=key) as caught:
+        open_for_rendering(path)
+    assert caught.value.path == path
+    assert time.monotonic() - start < 5
+    first, second = finish(tmp_path)
+    assert key in str(first.failure)
+    assert second.is_video
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [
+        {"rate": None, "timestep": None, "video": None, "scene": None, "model": None},
+        {"rate": "30000/1001", "stride": 3},
+        {"video": {**FACTS, "fps": "29.97", "max_fps": "5/2"}},
+        {"video": {**FACTS, "fps": "8435894437147607/281474976710656"}},
+    ],
+)
+def test_what_recorders_write_is_accepted(
+    facts: dict[str, Any], tmp_path: Path
+) -> None:
+    """Also what is not known yet in a recording that broke off."""
+    with open_for_rendering(write_saying(tmp_path, **facts)) as reader:
+        assert reader.frame_count == 2

@@ -1,0 +1,486 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording becomes videos with everything that belongs to them."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+from recordings import frames_of
+from rides import record as record_ride
+from trajectories_by_hand import (
+    INFIX,
+    Painter,
+    add_row,
+    grey,
+    new_logs,
+    write_finished,
+    write_log,
+    write_pending_manifest,
+)
+
+from mjrec import (
+    BlankVideo,
+    InvalidFrame,
+    Monitor,
+    NoPictures,
+    UnreadableFile,
+    recover,
+    render_videos,
+)
+from mjrec.annotation import Caption, annotated
+from mjrec.formats.frame_hashes import frame_hash_path
+from mjrec.formats.monitor_directory import trajectory_prefix
+from mjrec.formats.trajectory import StateComponent
+from mjrec.formats.trajectory_file import open_trajectory
+from mjrec.formats.unfinished_video import VideoFile
+from mjrec.formats.video_metadata import is_done, metadata_path
+from mjrec.rendering.finish import Finisher, bring_up_to_date, finish
+from mjrec.rendering.jobs import VideoJob
+from mjrec.rendering.recorded_facts import video_path
+from mjrec.rendering.recorded_frames import captions
+from mjrec.rendering.recordings import RecordingKey, look_at
+from mjrec.rendering.render_video import render_video
+from mjrec.rendering.views import View
+
+STEM = "openaigym.video.0.7.video000000"
+ENDS = ("framehash", "meta.json", "mp4")
+KEY = RecordingKey(INFIX, 0)
+
+
+def render(trajectory: Path, painter: Painter | None = None, **options: Any) -> Path:
+    """Render the video of an episode, and return it."""
+    file = render_video([trajectory], workers=painter or Painter(), **options)
+    assert isinstance(file, VideoFile)
+    return file.path
+
+
+def metadata_of(video: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(metadata_path(video).read_text())
+    return content
+
+
+def shown(video: Path) -> list[int]:
+    """Return which frames a video shows."""
+    return [round((float(frame.mean()) - 10) / 20) for frame in frames_of(video)]
+
+
+def rate_of(video: Path) -> Fraction:
+    with av.open(str(video)) as container:
+        rate = container.streams.video[0].average_rate
+        assert rate is not None
+        return rate
+
+
+# One camera
+
+
+@pytest.mark.parametrize("write", [write_log, write_finished])
+def test_every_frame_is_in_the_video(
+    write: Callable[..., Path], tmp_path: Path, names: Callable[[Path], list[str]]
+) -> None:
+    """In order, at the rate of the steps; hashes and metadata are beside it."""
+    trajectory = write(tmp_path, steps=5)
+    before, counted = names(tmp_path), list[None]()
+    video = render(trajectory, on_frame=lambda: counted.append(None))
+    assert shown(video) == [0, 1, 2, 3, 4, 5]
+    assert len(counted) == 6
+    assert rate_of(video) == 20
+    assert names(tmp_path) == [*before, *(f"{STEM}.{end}" for end in ENDS)]
+
+
+def test_metadata_says_what_a_live_video_says(
+    tmp_path: Path, corridor: Any, play: Callable[..., None]
+) -> None:
+    """With the same keys, and a few of its own: of episode, workers and file."""
+    with Monitor(corridor, tmp_path / "live", lambda _: True) as monitor:
+        play(monitor, 1)
+    [live_file] = (tmp_path / "live").glob("*.meta.json")
+    live = json.loads(live_file.read_text())
+    metadata = metadata_of(render(write_finished(tmp_path, steps=4)))
+    assert set(live) - {"recording_reason"} <= set(metadata)
+    assert set(metadata) - set(live) <= {"rendered_with", "camera", "gl_renderer"}
+    expected = {
+        "episode_id": 0,
+        "complete": True,
+        "truncated": True,
+        "length": 4,
+        "reward": 2.0,
+        "seed": 5,
+        "recording": "deferred",
+        "pictures": "scene",
+        "camera": "side",
+        "quality": "full",
+        "gl_renderer": "a painter",
+        "fps": "20",
+        "timestep": "1/20",
+        "playback_speed": 1.0,
+        "stride": 1,
+        "frame_count": 5,
+        "frame_steps": [[0, 4]],
+        "height": 16,
+        "versions": {"mjrec": "0"},
+    }
+    assert {key: metadata[key] for key in expected} == expected
+    assert "reason" not in metadata
+    assert "numpy" in metadata["rendered_with"]
+
+
+def test_the_rate_asked_for_counts(tmp_path: Path) -> None:
+    """At the recording or now; it is written into the file and selects nothing."""
+    trajectory = write_log(tmp_path, fps="5/2")
+    for asked, expected in ((None, Fraction(5, 2)), (50, 50)):
+        video = render(trajectory, fps=asked)
+        assert rate_of(video) == expected
+        assert shown(video) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("stride", "max_fps", "steps", "fps"),
+    [
+        (1, 20, [[0, 5]], 20),
+        (1, 19, [[0, 4], [5, 5]], 10),
+        (1, 1, [[0, 0], [5, 5]], 1),
+        (2, None, [[0, 4], [5, 5]], 10),
+    ],
+)
+def test_max_fps_leaves_frames_out(
+    stride: int, max_fps: float, steps: list[list[int]], fps: int, tmp_path: Path
+) -> None:
+    """At the recording or now: playback stays real time."""
+    video = render(write_finished(tmp_path, steps=5, stride=stride), max_fps=max_fps)
+    metadata = metadata_of(video)
+    assert metadata["frame_steps"] == steps
+    assert metadata["playback_speed"] == 1.0
+    assert rate_of(video) == fps
+
+
+def test_another_view_is_asked_of_the_workers_and_told(tmp_path: Path) -> None:
+    """The metadata has the camera and the quality that were asked for."""
+    painter, out = Painter(), tmp_path / "front.mp4"
+    view = View(camera="front", quality="draft")
+    assert render(write_finished(tmp_path), painter, view=view, out=out) == out
+    assert painter.asked[0][2] == view
+    metadata = metadata_of(out)
+    assert (metadata["camera"], metadata["quality"]) == ("front", "draft")
+    assert not (tmp_path / f"{STEM}.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        (
+            {"ended": False},
+            {"complete": False, "reason": "killed", "length": 4, "reward": 2.0},
+        ),
+        ({"broken_reason": "a marker"}, {"broken": True, "broken_reason": "a marker"}),
+    ],
+)
+def test_what_broke_off_says_so(
+    facts: dict[str, Any], said: dict[str, Any], tmp_path: Path
+) -> None:
+    """The frames before are a video."""
+    metadata = metadata_of(render(write_log(tmp_path, **facts)))
+    assert {key: metadata[key] for key in said} == said
+
+
+def test_without_a_frame_there_is_metadata_or_an_error(
+    tmp_path: Path, names: Callable[[Path], list[str]]
+) -> None:
+    """Where the recording says that it broke, there is nothing to wait for any more."""
+    broken = write_log(tmp_path, frames=False, broken_reason="a marker")
+    assert render_video([broken], workers=Painter()) is None
+    metadata = metadata_of(tmp_path / f"{STEM}.mp4")
+    assert (metadata["empty"], metadata["broken"]) == (True, True)
+    refused = write_log(tmp_path, 1, frames=False, refusal="a plugin draws")
+    before = names(tmp_path)
+    with pytest.raises(NoPictures, match="a plugin draws"):
+        render(refused)
+    assert names(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("../x.mp4", "/x.mp4", "x.mp4", f"{STEM}.meta.json", STEM[:-1] + "1.mp4"),
+        *(f"{STEM}.side.mp4", 5, None),
+    ],
+)
+def test_a_trajectory_writes_no_video_but_its_own(name: Any, tmp_path: Path) -> None:
+    """What a file says it is to be called may come from anybody."""
+    trajectory = write_log(tmp_path, video=None)
+    with pytest.raises(UnreadableFile, match="own episode"):
+        video_path(trajectory, {"video": {"name": name}})
+
+
+def test_a_failure_leaves_what_was_there(tmp_path: Path) -> None:
+    """The video of before stays, with its metadata, and nothing half-done."""
+    trajectory = write_finished(tmp_path)
+    render(trajectory)
+    files = {path: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    class Failing(Painter):
+        def frames(self, *arguments: Any, **more: Any) -> Any:
+            yield from list(super().frames(*arguments, **more))[:2]
+            yield None
+
+    with pytest.raises(KeyboardInterrupt):
+        render(trajectory, on_frame=interrupt)
+    with pytest.raises(InvalidFrame):
+        render(trajectory, Failing())
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == files
+
+
+def test_a_video_that_shows_nothing_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In its metadata and in the log; with `strict` it is an error, and is kept."""
+    trajectory, plain = write_finished(tmp_path), Painter(plain=True)
+    assert metadata_of(render(trajectory, plain))["suspect_constant"] is True
+    assert f"{STEM}.mp4 may show nothing: all 5 frames are of a single" in caplog.text
+    with pytest.raises(BlankVideo, match="single colour"):
+        render(trajectory, plain, strict=True)
+    assert len(frames_of(tmp_path / f"{STEM}.mp4")) == 5
+    sound = metadata_of(render(trajectory, strict=True))
+    assert not {"suspect_black", "suspect_constant"} & set(sound)
+
+
+# Several cameras
+
+FIRST, SIDE, SECOND = (f"{STEM}{part}.mp4" for part in ("", ".side", ".camera3"))
+
+
+def write_with_cameras(directory: Path, **more: Any) -> Path:
+    """Write a trajectory whose video is promised with three cameras, and more facts."""
+    cameras = [None, "side", {"distance": 2.0}]
+    return write_finished(directory, cameras=cameras, scene={"label": "eye"}, **more)
+
+
+@pytest.fixture(autouse=True)
+def facts_of_the_video(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `write_log` write what a recorder says of several cameras."""
+    import trajectories_by_hand
+
+    usual = trajectories_by_hand.TrajectoryHeader
+    keys = ("cameras", "tiled", "annotate", "also_named", "selection")
+
+    def header(*, facts: dict[str, Any], **rest: Any) -> Any:
+        own = {key: facts.pop(key) for key in keys if key in facts}
+        video = facts["video"] and {**facts["video"], **own}
+        return usual(facts={**facts, "video": video}, **rest)
+
+    monkeypatch.setattr(trajectories_by_hand, "TrajectoryHeader", header)
+
+
+def test_each_camera_has_a_video(
+    tmp_path: Path, names: Callable[[Path], list[str]]
+) -> None:
+    """With metadata and hashes of its own; the first one's, by which they are, last."""
+    trajectory, painter = write_with_cameras(tmp_path), Painter()
+    assert render(trajectory, painter).name == FIRST
+    made = [name[:-3] + end for name in (FIRST, SIDE, SECOND) for end in ENDS]
+    assert names(tmp_path) == sorted([trajectory.name, *made])
+    views = [view.camera for _, _, view in painter.asked]
+    assert views == ["side", {"distance": 2.0}, None]
+    first, side, second = (metadata_of(tmp_path / n) for n in (FIRST, SIDE, SECOND))
+    assert first["camera"] == "eye"
+    assert first["further_videos"] == [SIDE, SECOND]
+    assert (side["camera"], second["camera"]) == ("side", {"distance": 2.0})
+    assert side["first_video"] == FIRST
+    assert side["frame_count"] == first["frame_count"] == 5
+    assert side["file_sha256"] != first["file_sha256"]
+
+
+def test_all_side_by_side_are_one_video(tmp_path: Path) -> None:
+    """The workers are asked for the grid; the first camera is as it was recorded."""
+    painter = Painter()
+    metadata = metadata_of(render(write_with_cameras(tmp_path, tiled=True), painter))
+    assert painter.tiles == [(None, "side", {"distance": 2.0})]
+    assert [path.name for path in tmp_path.glob("*.mp4")] == [FIRST]
+    assert metadata["camera"] == ["eye", "side", {"distance": 2.0}]
+    assert (metadata["tiled"], metadata["rows"], metadata["columns"]) == (True, 2, 2)
+
+
+@pytest.mark.parametrize("camera", [None, "side", {"distance": 2.0}])
+def test_an_interruption_leaves_no_cameras_video(
+    camera: Any, tmp_path: Path, names: Callable[[Path], list[str]]
+) -> None:
+    """Whichever it comes in."""
+    trajectory, painter = write_with_cameras(tmp_path), Painter()
+
+    def interrupt(_: Path, view: View, index: int) -> None:
+        if index == 2 and view.camera == camera:
+            raise KeyboardInterrupt
+
+    painter.breaks_at = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        render(trajectory, painter)
+    assert names(tmp_path) == [trajectory.name]
+
+
+def test_blank_videos_stop_no_other(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With `strict`, the first is an error when all are there."""
+    trajectory = write_with_cameras(tmp_path, annotate=True)
+    with pytest.raises(BlankVideo) as caught:
+        render(trajectory, Painter(plain=True), strict=True)
+    assert caught.value.path.name == SIDE
+    assert is_done(tmp_path / FIRST)
+    # However much is written on them.
+    for name in (FIRST, SIDE, SECOND):
+        assert metadata_of(tmp_path / name)["suspect_constant"] is True
+    assert f"{FIRST} may show nothing" in caplog.text
+
+
+def test_second_names_are_given_at_the_end(tmp_path: Path) -> None:
+    """Of every camera; again where they are missing or lead to what is replaced."""
+    trajectory = write_with_cameras(tmp_path, also_named="rl-video-episode-0.mp4")
+    second = tmp_path / "rl-video-episode-0.side.mp4"
+    for rerendered in (True, True, False):
+        if rerendered:
+            render(trajectory)
+        else:
+            second.unlink()
+        list(finish(tmp_path, [KEY], workers=1))
+        assert (tmp_path / "rl-video-episode-0.mp4").samefile(tmp_path / FIRST)
+        assert second.samefile(tmp_path / SIDE)
+        assert metadata_path(second).samefile(metadata_path(tmp_path / SIDE))
+        assert metadata_of(tmp_path / SIDE)["also_named"] == second.name
+
+
+def test_the_rule_of_the_choice_is_told(tmp_path: Path) -> None:
+    """Also of a video that is rendered another way: it is no typical episode."""
+    trajectory = write_with_cameras(tmp_path, selection={"rule": "worst:3"})
+    out = tmp_path / "x.mp4"
+    render(trajectory)
+    render(trajectory, view=View(camera="top"), out=out)
+    for video in (tmp_path / FIRST, tmp_path / SIDE, out):
+        assert metadata_of(video)["selection"] == {"rule": "worst:3"}
+
+
+def test_all_videos_of_an_episode_are_counted_and_listed(
+    tmp_path: Path, painter: Painter
+) -> None:
+    """When the first is there, and it is then not pending any more."""
+    write_with_cameras(tmp_path)
+    manifest, seen = write_pending_manifest(tmp_path, 0), []
+    job = VideoJob.finishing(tmp_path, KEY)
+    with Finisher(tmp_path, workers=1, on_progress=seen.append) as finisher:
+        assert finisher.add(job)
+        assert (finisher.progress.videos, finisher.progress.frames) == (3, 15)
+        _, outcome = finisher.do_next()
+    assert outcome.further_videos == (SIDE, SECOND)
+    assert [progress.frames_done for progress in seen] == [0, *range(1, 16), 15]
+    assert seen[-1].videos_done == 3
+    assert look_at(tmp_path, KEY) is None
+    bring_up_to_date(tmp_path)
+    for _ in range(2):
+        content = json.loads(manifest.read_text())
+        listed = [video for video, _ in content["videos"]]
+        assert sorted(listed) == sorted([FIRST, SIDE, SECOND])
+        assert content["mjrec"]["pending"] == []
+        # So it is where the monitor left none.
+        manifest.unlink()
+        recover(tmp_path)
+    (tmp_path / FIRST).unlink()
+    (tmp_path / SIDE).write_text("half")
+    list(finish(tmp_path, [KEY], workers=1))
+    assert len(frames_of(tmp_path / SIDE)) == 5
+
+
+def test_rendering_again_replaces_no_recorded_video(
+    tmp_path: Path, painter: Painter
+) -> None:
+    """A camera that was recorded too has its file already."""
+    trajectory = write_with_cameras(tmp_path)
+    render(trajectory)
+    before = (tmp_path / SIDE).read_bytes()
+    for out in (None, tmp_path / SIDE):
+        rendered = render_videos(trajectory, camera="side", out=out)
+        assert f"{SIDE} is a recorded video" in rendered.failures[SIDE]
+    assert (tmp_path / SIDE).read_bytes() == before
+    rendered = render_videos(trajectory, camera="side", quality="draft")
+    assert list(rendered.videos) == [f"{STEM}.side.draft.mp4"]
+
+
+def test_an_unknown_camera_is_named_with_those_there_are(tmp_path: Path) -> None:
+    """And no video is left; by a real worker."""
+    name = "openaigym.video.0.1.video000000.mp4"
+    video = {"name": name, "recording": "deferred", "cameras": ["rider", "backside"]}
+    record_ride(tmp_path, facts={"video": video})
+    rendered = render_videos(tmp_path, workers=1)
+    assert "side, rider" in rendered.failures[name]
+    [said] = tmp_path.glob("*video*")
+    assert said.name == name.replace(".mp4", ".failed.json")
+
+
+# Captions
+
+
+def test_captions_are_on_the_frames_that_are_hashed(tmp_path: Path) -> None:
+    """Hash by hash what the function gives, and the metadata says so."""
+    size, painter = (64, 96), Painter((64, 96))
+    trajectory = write_with_cameras(tmp_path, annotate=True)
+    render(trajectory, painter)
+    view = View(camera="side")
+    expected = [
+        hashlib.sha256(
+            annotated(
+                frame,
+                Caption(episode_id=0, step=step, time=step / 20, reward=step / 2),
+            ).tobytes()
+        ).hexdigest()
+        for step, frame in enumerate(Painter(size).frames(trajectory, range(5), view))
+    ]
+    lines = frame_hash_path(tmp_path / SIDE).read_text().splitlines()
+    hashes = [line.split(",")[-1].strip() for line in lines if line[0] != "#"]
+    assert hashes == expected
+    assert "pillow" in metadata_of(tmp_path / SIDE)["annotated"]
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.parametrize(
+    ("asked", "name"),
+    [(None, "5fps"), (False, "5fps.plain"), (True, "5fps.annotated")],
+)
+def test_captions_are_as_recorded_or_as_asked_for(
+    recorded: bool, asked: bool | None, name: str, tmp_path: Path, painter: Painter
+) -> None:
+    """And the name of the file says what is other."""
+    write_with_cameras(tmp_path, annotate=recorded)
+    [video] = render_videos(tmp_path, fps=5, annotate=asked).videos
+    assert video == f"{STEM}.{name}.mp4"
+    written = recorded if asked is None else asked
+    assert ("annotated" in metadata_of(tmp_path / video)) is written
+
+
+def test_captions_tell_time_by_what_is_known(tmp_path: Path) -> None:
+    """The simulation's own clock from the reset on, else steps of a known length."""
+    with open_trajectory(record_ride(tmp_path).path) as reader:
+        assert [c.time for c in captions(reader, [0, 1])] == [None, None]
+    with open_trajectory(write_log(tmp_path, 1, steps=3, stride=2)) as reader:
+        said = [(c.step, c.time) for c in captions(reader, [0, 1, 2])]
+        assert said == [(0, 0.0), (2, 0.1), (3, 0.15)]
+        clock = dataclasses.replace(
+            reader.header, state=(StateComponent("time", 0, 1),)
+        )
+    logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
+    span = logs.begin(name, clock)
+    for step, (time, reward) in enumerate([(7.0, 0), (7.5, 0.25), (9.0, -1)]):
+        add_row(span, step, reward=reward, state=time, snapshot=grey(step))
+    logs.close()
+    with open_trajectory(logs.path_of(name)) as reader:
+        shown_captions = list(captions(reader, [0, 1, 2]))
+    assert [c.time for c in shown_captions] == [0.0, 0.5, 2.0]
+    assert [c.reward for c in shown_captions] == [0.0, 0.25, -0.75]

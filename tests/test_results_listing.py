@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Statistics and manifest follow from the journal, whoever computes them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from recordings import events_of, manifest_of, stats_of
+
+import mjrec
+from mjrec.formats.monitor_directory import Infix
+from mjrec.results.listing import write_listing
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    "deferred": {"video_callable": lambda episode: episode % 2 == 0},
+    "not waited for": {"video_callable": lambda episode: True, "workers": 0},
+    "live": {"video_callable": lambda episode: episode < 2, "render": "live"},
+    "clips": {"step_trigger": lambda step: step == 3, "video_length": 4, "workers": 0},
+    "live clips": {"video_length": 4, "render": "live"},
+    "kept": {"keep": "best:1", "trajectory_callable": True, "workers": 0},
+    "failures": {"keep": "failures", "workers": 0},
+    "states only": {"video_callable": False, "trajectory_callable": True},
+    "counted": {"video_callable": False},
+}
+
+
+def record(directory: Path, options: dict[str, Any]) -> None:
+    """Record three episodes, of which the last is closed early."""
+    env = gymnasium.make(
+        "InvertedPendulum-v5", render_mode="rgb_array", width=32, height=32
+    )
+    with mjrec.Monitor(env, directory, **options) as monitor:
+        monitor.action_space.seed(1)
+        for seed in range(3):
+            monitor.reset(seed=seed)
+            done = False
+            while not done and monitor.episode_id < 3:
+                action = monitor.action_space.sample()
+                _, _, terminated, truncated, _ = monitor.step(action)
+                done = terminated or truncated
+        monitor.step(monitor.action_space.sample())
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+def test_another_process_computes_the_same(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    """Nothing is new for it; and made from nothing, both files are the same again."""
+    record(tmp_path, options)
+    manifest, stats = manifest_of(tmp_path), stats_of(tmp_path)
+    [path] = tmp_path.glob("*.manifest.json")
+    infix = Infix.parse(path.name.split(".manifest.")[1])
+    assert infix is not None
+    listing = write_listing(tmp_path, infix)
+    assert listing is not None
+    assert (listing.is_new_manifest, listing.is_new_stats) == (False, False)
+    for written in (path, *tmp_path.glob("*.stats.json")):
+        written.unlink()
+    write_listing(tmp_path, infix)
+    assert manifest_of(tmp_path) == manifest
+    first = stats.pop("initial_reset_timestamp")
+    anew = stats_of(tmp_path)
+    # The moment before the first reset stands in no episode.
+    assert anew.pop("initial_reset_timestamp") >= first
+    assert anew == stats
+
+
+def test_an_episode_that_was_cut_is_in_the_journal(
+    tmp_path: Path, make_corridor: Callable[..., Any]
+) -> None:
+    """With its reason, and whether it was chosen; it is no part of the statistics."""
+    env = mjrec.Monitor(make_corridor(), tmp_path, allow_early_reset=True)
+    env.reset()
+    env.step(0)
+    env.reset()
+    env.close()
+    [first, second] = events_of(tmp_path, "cut")
+    assert first == {
+        "episode_id": 0,
+        "reason": "reset",
+        "chosen": True,
+        "recording": "live",
+    }
+    assert (second["episode_id"], second["reason"]) == (1, "close")
+    assert manifest_of(tmp_path)["mjrec"]["schedule"]["recorded"] == [0, 1]
+    assert stats_of(tmp_path)["timestamps"] == []
+
+
+def test_manifests_of_open_monitors_are_left_to_them(
+    tmp_path: Path, make_corridor: Callable[..., Any]
+) -> None:
+    """Nobody else has their lock."""
+    with mjrec.Monitor(make_corridor(), tmp_path) as env:
+        env.reset()
+        infix = Infix.parse(env.infix)
+        assert infix is not None
+        assert write_listing(tmp_path, infix) is None
+        assert not list(tmp_path.glob("*.manifest.json"))
+
+
+def test_a_reason_goes_with_the_video_that_comes(tmp_path: Path) -> None:
+    """It stands in the manifest as long as the video is pending, and no longer."""
+    record(tmp_path, OPTIONS["not waited for"])
+    [video, *_] = [e["video"] for e in manifest_of(tmp_path)["mjrec"]["pending"]]
+    said = tmp_path / video.replace(".mp4", ".failed.json")
+    said.write_text(json.dumps({"reason": "no paint"}))
+    [path] = tmp_path.glob("*.manifest.json")
+    infix = Infix.parse(path.name.split(".manifest.")[1])
+    assert infix is not None
+    write_listing(tmp_path, infix)
+    [entry] = [e for e in manifest_of(tmp_path)["mjrec"]["pending"] if "reason" in e]
+    assert (entry["video"], entry["reason"]) == (video, "no paint")
+    assert not mjrec.render_videos(tmp_path).failures
+    assert not said.exists()
+    assert manifest_of(tmp_path)["mjrec"]["pending"] == []
