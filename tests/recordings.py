@@ -68,7 +68,7 @@ def frames_of(path: str | Path | None) -> list[Any]:
 
 def videos_in(directory: Path) -> list[int]:
     """Return the numbers of the episodes that have a video."""
-    names = (path.name for path in directory.glob("*.mp4"))
+    names = (path.name for path in directory.glob("openaigym.*.mp4"))
     return sorted(int(re.findall(r"video(\d{6})\.mp4", name)[0]) for name in names)
 
 

@@ -8,7 +8,6 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,12 @@ import numpy as np
 import pytest
 from full_disk import file_size_limit
 from parts import parametrize
+from recorded_states import assert_same, trajectories
 from recordings import in_flight, manifest_of
 
 import mjrec
 from mjrec.commands import main
 from mjrec.formats.in_flight import add_facts, drop_recording
-from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
 from mjrec.rendering.recordings import key_of, look_at, recordings
 
@@ -57,6 +56,35 @@ def reacher() -> Any:
     from dm_control import suite
 
     return suite.load("reacher", "easy", {"random": 3, "time_limit": 0.08})
+
+
+def growing() -> Any:
+    """Return a composer task that compiles another model at each reset."""
+    from dm_control import composer
+
+    class Growing(composer.Task):  # type: ignore[misc]  # no stubs
+        def __init__(self) -> None:
+            self.root_entity = composer.Arena()
+            world = self.root_entity.mjcf_model.worldbody
+            world.add("light", pos=(0, 0, 3))
+            world.add("camera", pos=(0, -3, 0.5), xyaxes=(1, 0, 0, 0, 0, 1))
+            self.set_timesteps(control_timestep=0.02, physics_timestep=0.002)
+            pole = world.add("body", pos=(0, 0, 0.5))
+            hinge = pole.add("joint", type="hinge", axis=(0, 1, 0))
+            self.box = pole.add("geom", type="box", size=(0.1, 0.1, 0.3))
+            actuator = self.root_entity.mjcf_model.actuator
+            for gear in (1, 2):
+                actuator.add("motor", joint=hinge, gear=(gear, *[0] * 5))
+
+        root_entity = None
+
+        def initialize_episode_mjcf(self, random_state: Any) -> None:
+            self.box.size = random_state.uniform(0.1, 0.5, 3)
+
+        def get_reward(self, physics: Any) -> float:
+            return 1.0
+
+    return composer.Environment(Growing(), time_limit=0.08, random_state=3)
 
 
 def hop(env: Any, steps: int) -> None:
@@ -107,12 +135,19 @@ def hashes(directory: Path) -> dict[str, list[str]]:
     }
 
 
-def told(directory: Path) -> Iterator[dict[str, Any]]:
-    """Yield the metadata of each video."""
-    for path in sorted(directory.glob("openaigym.*.meta.json")):
-        yield json.loads(path.read_text())
+def metadata_in(directory: Path) -> list[dict[str, Any]]:
+    """Return the metadata of each video."""
+    paths = sorted(directory.glob("openaigym.*.meta.json"))
+    return [json.loads(path.read_text()) for path in paths]
 
 
+def metadata_of(directory: Path, video: str) -> dict[str, Any]:
+    content = (directory / video).with_suffix(".meta.json").read_text()
+    return dict(json.loads(content))
+
+
+# One that begins with the second step.
+CLIP: dict[str, Any] = {"step_trigger": lambda step: step == 1, "workers": 0}
 SAME = (
     *("episode_id", "first_step", "last_episode_id", "length", "reward", "complete"),
     *("fps", "timestep", "stride", "frame_count", "frame_steps", "seed", "type"),
@@ -124,7 +159,7 @@ def check_same(live: Path, deferred: Path) -> None:
     """Check that both show the same, and say the same of it."""
     assert hashes(live)
     assert hashes(live) == hashes(deferred)
-    for one, other in zip(told(live), told(deferred), strict=True):
+    for one, other in zip(metadata_in(live), metadata_in(deferred), strict=True):
         assert (one["recording"], other["recording"]) == ("live", "deferred")
         assert {key: one.get(key) for key in SAME} == {
             key: other.get(key) for key in SAME
@@ -148,20 +183,28 @@ def test_pictures_are_those_that_were_drawn_live(
     assert not parts(tmp_path / "deferred")
 
 
+# Takes more than five seconds: the same run live and deferred.
 @pytest.mark.dm_control
-@parametrize("annotate", [False, True])
-def test_resets_that_change_the_model_are_seen(annotate: bool, tmp_path: Path) -> None:
-    """Of a task whose target lies elsewhere in each episode."""
+@parametrize(
+    ("make", "annotate"),
+    [(reacher, False), (growing, False), (reacher, True), (growing, True)],
+    default=2,
+)
+def test_resets_that_change_or_compile_the_model_are_seen(
+    make: Any, annotate: bool, tmp_path: Path
+) -> None:
+    """A target lies elsewhere in each episode, or the model is another one."""
     options: dict[str, Any] = {
-        "step_trigger": lambda step: step == 1,
+        **CLIP,
+        "workers": 1,
         "video_length": 9,
         "height": 48,
         "width": 256,
         "annotate": annotate,
-        "env_id": "dm_control/reacher-easy",
+        "env_id": "dm_control/some-task",
     }
     for render in ("live", "deferred"):
-        record(tmp_path / render, reacher(), 14, render=render, **options)
+        record(tmp_path / render, make(), 14, render=render, **options)
     check_same(tmp_path / "live", tmp_path / "deferred")
 
 
@@ -178,101 +221,82 @@ def test_trajectories_and_clips_run_beside_each_other(tmp_path: Path) -> None:
     record(tmp_path / "both", hopper(), 14, **clips, **evaluation)
     record(tmp_path / "plain", hopper(), 14, video_callable=False, **evaluation)
     check_same(tmp_path / "live", tmp_path / "both")
-    recorded = sorted((tmp_path / "both").glob("*.h5"))
-    plain = sorted((tmp_path / "plain").glob("*.h5"))
-    assert len(recorded) == len(plain) == 3
+    recorded, plain = trajectories(tmp_path / "both"), trajectories(tmp_path / "plain")
+    assert len(recorded) == 3
     for one, other in zip(recorded, plain, strict=True):
-        with open_trajectory(one) as first, open_trajectory(other) as second:
-            assert first.states(0, 4).tobytes() == second.states(0, 4).tobytes()
-            assert len(first.model_changes) == len(second.model_changes) > 0
+        assert_same(one, other)
 
 
-@pytest.mark.thorough
-def test_clips_wait_for_who_renders_them(tmp_path: Path) -> None:
+@parametrize(
+    ("options", "part", "frames"),
+    [
+        # Two steps, a reset and three steps, a reset and a step, and the first frame.
+        ({"camera": ["track", -1]}, "step", 9),
+        # One that begins with an episode has its name.
+        ({"step_trigger": None, "video_callable": lambda e: e == 1}, "episode", 7),
+    ],
+)
+def test_clips_wait_to_be_rendered(
+    options: dict[str, Any], part: str, frames: int, tmp_path: Path
+) -> None:
     """Pending, with a log for each episode; afterwards there is the video alone."""
-    record(
-        tmp_path,
-        hopper(3),
-        8,
-        step_trigger=lambda step: step == 1,
-        video_length=6,
-        workers=0,
-        name_prefix="rl-video",
-        camera=["track", -1],
-    )
+    steps: dict[str, Any] = {**CLIP, "video_length": 6, "name_prefix": "rl-video"}
+    record(tmp_path, hopper(3), 8, **{**steps, **options})
     [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
-    assert parts(tmp_path) == [f"000000001.part{n:06d}" for n in range(3)]
+    assert [name[-6:] for name in parts(tmp_path)] == [
+        f"{n:06d}" for n in range(len(parts(tmp_path)))
+    ]
+    assert recordings(tmp_path) == [key_of(entry["clip"])]
     assert main(["render", str(tmp_path)]) == 0
     assert not parts(tmp_path)
     manifest = manifest_of(tmp_path)
     assert not manifest["mjrec"]["pending"]
-    further = entry["video"].replace(".mp4", ".-1.mp4")
-    assert {name for name, _ in manifest["videos"]} == {entry["video"], further}
-    assert (tmp_path / "rl-video-step-1.mp4").samefile(tmp_path / entry["video"])
-    [about] = [each for each in told(tmp_path) if "further_videos" in each]
-    # Two steps, a reset and three steps, a reset and a step, and what was there first.
-    assert about["frame_count"] == 9
+    listed = [name for name, _ in manifest["videos"]]
+    assert entry["video"] in listed
+    assert len(listed) == len(options.get("camera", [0]))
+    assert (tmp_path / f"rl-video-{part}-1.mp4").samefile(tmp_path / entry["video"])
+    assert metadata_of(tmp_path, entry["video"])["frame_count"] == frames
     assert not finish(tmp_path)
 
 
-@pytest.mark.thorough
-def test_clip_that_begins_with_an_episode_has_its_name(tmp_path: Path) -> None:
-    """`video_length` with a schedule; so do Gymnasium's names."""
-    record(
-        tmp_path,
-        hopper(3),
-        7,
-        video_callable=lambda episode: episode == 1,
-        video_length=4,
-        workers=0,
-        name_prefix="rl-video",
-    )
-    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
-    assert entry["episode_id"] == 1
-    assert entry["video"].endswith(".video000001.mp4")
-    [outcome] = finish(tmp_path)
-    assert (outcome.name, outcome.frame_count) == (entry["video"], 6)
-    assert (tmp_path / "rl-video-episode-1.mp4").exists()
-
-
-def test_running_clip_is_its_monitors_business(tmp_path: Path) -> None:
-    """Nobody renders one that may go on, be it between two episodes."""
-    monitor = mjrec.Monitor(
-        hopper(), tmp_path, step_trigger=lambda step: step == 2, workers=0
-    )
-    with monitor:
+def test_a_running_clip_is_not_rendered(tmp_path: Path) -> None:
+    """It may go on, also between two episodes; its video's name finds it."""
+    with mjrec.Monitor(hopper(), tmp_path, **CLIP) as monitor:
         hop(monitor, 4)
         [key] = recordings(tmp_path)
         assert look_at(tmp_path, key) is None
     assert look_at(tmp_path, key) is not None
+    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
+    assert key_of(entry["video"]) == key_of(entry["clip"]) == key
 
 
 # Takes more than five seconds: a process is killed, and its clips are drawn.
-def test_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> None:
+def test_a_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> None:
     """With all that was there; and it is in the manifest then."""
     script = (
-        "import os, signal, sys\n"
+        "import os, sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "import mjrec\n"
         "from test_deferred_clips import hop, hopper\n"
         f"env = mjrec.Monitor(hopper(), {str(tmp_path)!r}, video_length=99,\n"
         "    step_trigger=lambda step: step == 2, workers=0)\n"
         "hop(env, 13)\n"
-        "os.kill(os.getpid(), signal.SIGKILL)\n"
+        "os.kill(os.getpid(), 9)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], check=False, capture_output=True, text=True
     )
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert mjrec.recover(tmp_path)
-    manifest = manifest_of(tmp_path)["mjrec"]
-    [entry] = manifest["pending"]
-    assert (entry["episode_id"], manifest["next_episode_id"]) == (0, 3)
+    details = manifest_of(tmp_path)["mjrec"]
+    [entry] = details["pending"]
+    # The next run does not use the number of the clip's last episode again.
+    assert (entry["episode_id"], details["next_episode_id"]) == (0, 3)
     assert main(["render", str(tmp_path)]) == 0
-    [about] = told(tmp_path)
+    [about] = metadata_in(tmp_path)
     assert (about["complete"], about["reason"]) == (False, "killed")
     # Three steps of the first episode, five of the second and three of the third, each
-    # with the picture that it began with here.
+    # with the frame that it began with here.
     assert (about["frame_count"], about["length"]) == (14, 11)
     assert about["last_episode_id"] == 2
     assert [name for name, _ in manifest_of(tmp_path)["videos"]] == [entry["video"]]
@@ -280,17 +304,13 @@ def test_killed_process_leaves_a_clip_that_can_be_rendered(tmp_path: Path) -> No
 
 
 @pytest.mark.thorough
-def test_clip_ends_where_its_pictures_would_lie(
+def test_a_clip_ends_where_its_frames_would_lie(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """What was taken before stays, and the next clip is another one."""
     env = hopper()
     with mjrec.Monitor(
-        env,
-        tmp_path,
-        step_trigger=lambda step: step == 1,
-        video_length=4,
-        mode="evaluation",
+        env, tmp_path, **{**CLIP, "workers": 1}, video_length=4, mode="evaluation"
     ) as monitor:
         hop(monitor, 3)
         simulated: Any = env.unwrapped
@@ -298,7 +318,7 @@ def test_clip_ends_where_its_pictures_would_lie(
         monitor.step(np.zeros(3))
         monitor.step(np.zeros(3))
     assert "ends early" in caplog.text
-    [about] = [each for each in told(tmp_path) if "first_step" in each]
+    [about] = [each for each in metadata_in(tmp_path) if "first_step" in each]
     assert about["broken"]
     assert "another model" in about["broken_reason"]
     assert (about["frame_count"], about["length"]) == (3, 4)
@@ -307,15 +327,11 @@ def test_clip_ends_where_its_pictures_would_lie(
     assert not manifest["mjrec"]["pending"]
 
 
-def test_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
+def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
     """With `on_error="warn"`: what had room is rendered, and the manifest tells."""
+    begins: dict[str, Any] = {**CLIP, "step_trigger": lambda step: step == 2}
     monitor = mjrec.Monitor(
-        hopper(),
-        tmp_path,
-        step_trigger=lambda step: step == 2,
-        video_length=9,
-        on_error="warn",
-        workers=0,
+        hopper(), tmp_path, **begins, video_length=9, on_error="warn"
     )
     hop(monitor, 5)
     with file_size_limit(1000):
@@ -323,46 +339,34 @@ def test_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
     hop(monitor, 3)
     monitor.close()
     assert monitor.get_total_steps() == 13
-    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
-    faults = manifest_of(tmp_path)["mjrec"]["faults"]
-    assert "video" in {fault["what"] for fault in faults}
+    details = manifest_of(tmp_path)["mjrec"]
+    assert "video" in {fault["what"] for fault in details["faults"]}
     [outcome] = finish(tmp_path)
-    assert (outcome.name, outcome.failure) == (entry["video"], None)
+    assert (outcome.name, outcome.failure) == (details["pending"][0]["video"], None)
     assert outcome.frame_count == 4
-    [about] = told(tmp_path)
+    [about] = metadata_in(tmp_path)
     assert "states" in about["broken_reason"]
 
 
-def test_a_part_that_is_missing_is_told(tmp_path: Path) -> None:
-    """What is there stays, and so does the entry in the manifest, with the reason."""
-    record(
-        tmp_path,
-        hopper(3),
-        8,
-        step_trigger=lambda step: step == 1,
-        video_length=6,
-        workers=0,
-    )
+def test_a_missing_part_is_reported(tmp_path: Path) -> None:
+    """What is there stays, and so does the entry in the manifest; a file says why."""
+    record(tmp_path, hopper(3), 8, **CLIP, video_length=6)
     [second] = [p for p in in_flight(tmp_path) if p.name.endswith("part000001")]
     drop_recording(second)
     [outcome] = finish(tmp_path)
     assert "part 1" in str(outcome.failure)
     assert len(parts(tmp_path)) == 2
-    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
-    assert "part 1" in entry["reason"]
+    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
+    [path] = tmp_path.glob("*.failed.json")
+    assert "part 1" in json.loads(path.read_text())["reason"]
 
 
 def test_clips_belong_to_their_monitor(tmp_path: Path) -> None:
     """`force` removes their logs, and a resumed run has other ones."""
-    options: dict[str, Any] = {
-        "step_trigger": lambda step: step == 1,
-        "video_length": 3,
-        "workers": 0,
-    }
     for number in range(2):
-        record(tmp_path, hopper(), 5, resume=number > 0, **options)
+        record(tmp_path, hopper(), 5, resume=number > 0, **CLIP, video_length=3)
     assert len({key.infix for key in recordings(tmp_path)}) == 2
-    record(tmp_path, hopper(), 5, force=True, **options)
+    record(tmp_path, hopper(), 5, force=True, **CLIP, video_length=3)
     assert len(recordings(tmp_path)) == 1
 
 
@@ -372,41 +376,26 @@ def test_clips_belong_to_their_monitor(tmp_path: Path) -> None:
         "../there.mp4",
         "openaigym.video.9.9.video000000.mp4",
         "openaigym.video.{infix}.video000000.step000002.mp4",
-        None,
+        "",
     ],
 )
-def test_no_other_video_is_written_over(name: str | None, tmp_path: Path) -> None:
+def test_no_other_video_is_written_over(name: str, tmp_path: Path) -> None:
     """Logs may be anybody's: the name of a video has to be that of its own clip."""
-    record(tmp_path, hopper(), 3, step_trigger=lambda step: step == 1, workers=0)
+    record(tmp_path, hopper(), 3, **CLIP)
     [key] = recordings(tmp_path)
     [log] = in_flight(tmp_path)
-    named = None if name is None else name.format(infix=key.infix)
-    add_facts(log, {"video": {"recording": "deferred", "name": named or ""}})
-    before = sorted(tmp_path.iterdir())
+    named = name.format(infix=key.infix)
+    add_facts(log, {"video": {"recording": "deferred", "name": named}})
+    before = set(tmp_path.iterdir())
     [outcome] = finish(tmp_path)
     assert "not that of its own" in str(outcome.failure)
-    said = [*tmp_path.glob("openaigym.clip.*.failed.json")]
-    assert len(said) == 1
-    assert sorted(tmp_path.iterdir()) == sorted(before + said)
-
-
-def test_a_video_is_found_by_its_own_name(tmp_path: Path) -> None:
-    """Whoever has read the manifest knows no other."""
-    record(tmp_path, hopper(), 3, step_trigger=lambda step: step == 1, workers=0)
-    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
-    assert [key_of(entry["video"])] == recordings(tmp_path) == [key_of(entry["clip"])]
+    [new] = set(tmp_path.iterdir()) - before
+    assert new.match("openaigym.clip.*.failed.json")
 
 
 def test_a_clip_is_written_at_the_rate_that_was_asked_for(tmp_path: Path) -> None:
     """`fps` is that of the file, whichever frames `max_fps` leaves."""
-    record(
-        *(tmp_path, hopper(), 9),
-        step_trigger=lambda step: step == 1,
-        video_length=6,
-        workers=0,
-        fps=12,
-        max_fps=62.5,
-    )
+    record(tmp_path, hopper(), 9, **CLIP, video_length=6, fps=12, max_fps=62.5)
     assert not finish(tmp_path)[0].failure
-    [about] = told(tmp_path)
+    [about] = metadata_in(tmp_path)
     assert (about["frame_count"], about["fps"]) == (5, "12")

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monitors that record states and leave the pictures to other processes."""
+"""Monitors that record states and leave the frames to other processes."""
 
 from __future__ import annotations
 
 import contextlib
+import copy
 import gc
 import hashlib
-import json
+import itertools
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -36,7 +38,7 @@ def make(env_id: str = "InvertedPendulum-v5", **arguments: Any) -> Any:
 
 
 def steps(env: Any, count: int, *, seed: int = 0) -> None:
-    """Reset and take so many steps, or fewer if the episode ends."""
+    """Reset and take N steps, or fewer if the episode ends."""
     env.reset(seed=seed)
     env.action_space.seed(seed)
     for _ in range(count):
@@ -46,88 +48,145 @@ def steps(env: Any, count: int, *, seed: int = 0) -> None:
 
 def monitored(env: Any, directory: Path, *positional: Any, **options: Any) -> Any:
     """Return a monitor that takes a reset for the end of an episode."""
+    options = {"workers": 1, **options}
     return mjrec.Monitor(env, directory, *positional, allow_early_reset=True, **options)
 
 
-@pytest.fixture
-def pendulum() -> Iterator[Any]:
-    """An environment without a render mode."""
-    env = make()
-    yield env
-    env.close()
+def render(directory: Path, **environment: str) -> None:
+    """Render what is pending, as a user does."""
+    command = [sys.executable, "-m", "mjrec", "render", str(directory)]
+    done = subprocess.run(
+        command, env={**os.environ, **environment}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def pending_in(directory: Path) -> list[int]:
+    entries = manifest_of(directory)["mjrec"]["pending"]
+    return [entry["episode_id"] for entry in entries]
+
+
+def trajectory_in(directory: Path) -> mjrec.Trajectory:
+    """Return the only one."""
+    [path] = directory.glob("*.h5")
+    return mjrec.load_trajectory(path)
 
 
 # --- what is written -----------------------------------------------------------------
 
 
-def test_close_leaves_a_rendered_directory(pendulum: Any, tmp_path: Path) -> None:
-    """Video, hashes, metadata, trajectory, model; no log and no promise."""
-    with monitored(pendulum, tmp_path, lambda e: True, workers=1) as env:
+def test_close_leaves_a_rendered_directory(tmp_path: Path) -> None:
+    """Video, hashes, metadata, trajectory, model; no log, and nothing pending."""
+    with monitored(make(), tmp_path, lambda e: True) as env:
         steps(env, 3)
+        video = env.video_recorder
+        assert (video.enabled, video.functional, video.empty) == (True, True, False)
+        assert video.frame_count == 4
         steps(env, 2, seed=1)
+        assert not env.video_recorder.finished
+        video = env.video_recorder
+    assert video.finished
+    assert Path(str(video.path)).exists()
     assert videos_in(tmp_path) == [0, 1]
     assert not list(tmp_path.glob(".*"))
     assert not in_flight(tmp_path)
-    assert len(list(tmp_path.glob("*.h5"))) == 2
     assert len(list(tmp_path.glob("openaigym.model.*.mjb.gz"))) == 1
-    manifest = manifest_of(tmp_path)
-    assert manifest["mjrec"]["pending"] == []
-    assert len(manifest["videos"]) == 2
-    assert len(frames_in(tmp_path, 0)) == 4
-    assert len(frames_in(tmp_path, 1)) == 3
+    assert pending_in(tmp_path) == []
+    assert len(manifest_of(tmp_path)["videos"]) == 2
+    assert [len(frames_in(tmp_path, episode)) for episode in (0, 1)] == [4, 3]
+    # The last episode is no part of the statistics.
+    metadata = metadata_of(tmp_path, 1)
+    assert (metadata["complete"], metadata["reason"]) == (False, "close")
+    recorded = [mjrec.load_trajectory(path) for path in sorted(tmp_path.glob("*.h5"))]
+    assert [each.complete for each in recorded] == [False, False]
 
 
-def test_live_recording_takes_the_same_frames(tmp_path: Path) -> None:
-    """And says the same of them: 25 steps a second at 10 frames are every third."""
-    about = {}
-    for render in ("live", "deferred"):
-        options: dict[str, Any] = {"max_fps": 10, "render": render, "workers": 1}
-        monitor = mjrec.Monitor(
-            make(render_mode="rgb_array"), tmp_path / render, **options
-        )
-        with monitor as env:
+@pytest.mark.parametrize("max_fps", [None, 10])
+def test_a_deferred_video_is_the_live_one(max_fps: int | None, tmp_path: Path) -> None:
+    """The same bytes, and all that the live one's metadata says."""
+    found = {}
+    for how in ("live", "deferred"):
+        env = make(render_mode="rgb_array")
+        directory = tmp_path / how
+        with mjrec.Monitor(
+            env, directory, workers=1, max_fps=max_fps, render=how
+        ) as env:
             steps(env, 4)
-            video = env.video_recorder
-            # Under the attribute that gym had.
-            assert (video.enabled, video.functional, video.empty) == (True, True, False)
-            assert video.frame_count == 3
-        assert video.finished
-        assert Path(str(video.path)).exists()
-        about[render] = metadata_of(tmp_path / render, 0)
-    live, later = about["live"], about["deferred"]
-    assert live.keys() - {"recording_reason"} <= later.keys()
-    assert (live["recording"], later["recording"]) == ("live", "deferred")
-    assert (live["pictures"], later["pictures"]) == ("env.render", "scene")
+        found[how] = metadata_of(directory, 0)
+    live, deferred = found["live"], found["deferred"]
+    assert live.keys() - {"recording_reason"} <= deferred.keys()
+    assert (live["recording"], deferred["recording"]) == ("live", "deferred")
+    assert (live["pictures"], deferred["pictures"]) == ("env.render", "scene")
     same = "fps timestep stride frame_count frame_steps height width seed complete"
-    same += " decoded_sha256 file_sha256 gl_renderer playback_speed reason"
-    assert {k: live[k] for k in same.split()} == {k: later[k] for k in same.split()}
-    assert (later["stride"], later["fps"]) == (3, "25/3")
-    assert later["frame_steps"] == [[0, 3], [4, 4]]
-    assert later["playback_speed"] == 1
-    # Closed in mid-episode, which is no part of the statistics.
-    assert (later["complete"], later["reason"]) == (False, "close")
-    [path] = (tmp_path / "deferred").glob("*.h5")
-    assert mjrec.load_trajectory(path).complete is False
+    for key in [*same.split(), "decoded_sha256", "file_sha256", "gl_renderer"]:
+        assert live[key] == deferred[key], key
+    assert deferred["playback_speed"] == 1
+    if max_fps:
+        # Of 25 steps a second every third, and the last.
+        assert (deferred["stride"], deferred["fps"]) == (3, "25/3")
+        assert deferred["frame_steps"] == [[0, 3], [4, 4]]
+        assert len(frames_in(directory, 0)) == 3
+
+
+def test_a_trajectory_holds_what_happened(tmp_path: Path) -> None:
+    """Also seed and environment; observations where asked for; a replaced reset not."""
+    with monitored(make(), tmp_path, workers=0, observations=True) as env:
+        env.reset(seed=3)
+        seen = [env.reset(seed=4)[0]]
+        actions = [np.array([0.1 * k]) for k in range(3)]
+        taken = [env.step(action) for action in actions]
+    trajectory = trajectory_in(tmp_path)
+    np.testing.assert_array_equal(trajectory.actions, actions)
+    assert trajectory.rewards.tolist() == [step[1] for step in taken]
+    recorded = trajectory.observations
+    np.testing.assert_array_equal(recorded, seen + [step[0] for step in taken])
+    assert (trajectory.seed, trajectory.episode_id) == (4, 0)
+    assert trajectory.environment["framework"] == "gymnasium"
+    assert trajectory.environment["id"] == "InvertedPendulum-v5"
+    assert trajectory.states.shape[0] == 4
+    assert trajectory.time[1] == pytest.approx(0.04)
+
+
+@parametrize(
+    ("options", "kept", "filmed"),
+    [
+        ({}, [0, 1], [0, 1]),
+        ({"trajectory_callable": lambda episode: episode == 2}, [2], [0, 1]),
+        ({"mode": "evaluation"}, [0, 1, 2], [0, 1]),
+        ({"mode": "evaluation", "render": "off"}, [0, 1, 2], []),
+        ({"trajectory_callable": True}, [0, 1, 2], [0, 1]),
+        ({"trajectory_callable": False}, [], [0, 1]),
+    ],
+    default=2,
+)
+def test_trajectories_are_kept_as_asked(
+    options: dict[str, Any], kept: list[int], filmed: list[int], tmp_path: Path
+) -> None:
+    """The videos' own are removed once the videos are there, if they are not wanted."""
+    with monitored(make(), tmp_path, **options) as env:
+        for seed in range(3):
+            steps(env, 1, seed=seed)
+    found = sorted(path.name.split(".")[-2] for path in tmp_path.glob("*.h5"))
+    assert found == [f"episode{number:06d}" for number in kept]
+    assert videos_in(tmp_path) == filmed
 
 
 # --- pending -------------------------------------------------------------------------
 
 
-def test_no_workers_leave_the_videos_pending(
-    pendulum: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_without_workers_videos_are_pending(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The manifest lists them, one line says how to make them, and that makes them."""
-    with monitored(pendulum, tmp_path, lambda e: e < 2, workers=0) as env:
+    with monitored(make(), tmp_path, lambda e: e < 2, workers=0) as env:
         for seed in range(3):
             steps(env, 2, seed=seed)
     assert videos_in(tmp_path) == []
-    pending = manifest_of(tmp_path)["mjrec"]["pending"]
-    assert [entry["episode_id"] for entry in pending] == [0, 1]
+    assert pending_in(tmp_path) == [0, 1]
     assert f"2 videos pending: mjrec render {tmp_path}" in caplog.text
-    command = [sys.executable, "-m", "mjrec", "render", str(tmp_path)]
-    subprocess.run(command, check=True, capture_output=True)
+    render(tmp_path)
     assert videos_in(tmp_path) == [0, 1]
-    assert manifest_of(tmp_path)["mjrec"]["pending"] == []
+    assert pending_in(tmp_path) == []
     assert len(manifest_of(tmp_path)["videos"]) == 2
 
 
@@ -142,32 +201,18 @@ def leave_without_waiting(env: Any) -> None:
     env.close(wait=False)
 
 
-def leave_to_the_collector(env: Any) -> None:
-    steps(env, 2)
+@pytest.mark.parametrize("leave", [leave_by_exception, leave_without_waiting, steps])
+def test_leaving_otherwise_renders_nothing(
+    leave: Callable[..., None], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Nor does garbage collection. What is pending is said, and no child is left."""
+    before = children()
+    env = mjrec.Monitor(make(), tmp_path, workers=1)
+    leave(env, *[2][: leave is steps])
     del env
     gc.collect()
-
-
-LEAVING: dict[str, Callable[[Any], None]] = {
-    "exception": leave_by_exception,
-    "close(wait=False)": leave_without_waiting,
-    "garbage collection": leave_to_the_collector,
-}
-
-
-@pytest.mark.parametrize("leave", LEAVING.values(), ids=LEAVING)
-def test_leaving_otherwise_renders_nothing(
-    leave: Callable[[Any], None],
-    pendulum: Any,
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """Manifest and journal are there, what was not rendered is pending, no child is."""
-    before = children()
-    leave(mjrec.Monitor(pendulum, tmp_path, workers=1))
     assert children() == before
-    [entry] = manifest_of(tmp_path)["mjrec"]["pending"]
-    assert entry["episode_id"] == 0
+    assert pending_in(tmp_path) == [0]
     assert "1 video pending" in caplog.text
     assert videos_in(tmp_path) == []
     assert len(in_flight(tmp_path)) == 1
@@ -175,7 +220,7 @@ def test_leaving_otherwise_renders_nothing(
 
 
 SCRIPT = """
-import sys, gymnasium, mjrec
+import os, pathlib, sys, time, gymnasium, mjrec
 env = gymnasium.make("InvertedPendulum-v5", height=48, width=64)
 env = mjrec.Monitor(env, sys.argv[1], workers=1)
 env.reset(seed=0)
@@ -198,12 +243,34 @@ def run_script(
     )
 
 
-def test_end_of_the_interpreter_renders_nothing(tmp_path: Path) -> None:
-    """One line says what is pending."""
-    done = run_script(SCRIPT, tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("1 video pending: mjrec render") == 1
-    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
+# Closed at the end of the interpreter, by the user, or never.
+LEFT = {
+    "exit": ("", 0),
+    "close": ("env.close(wait=False)\n", 0),
+    "kill": (
+        "while not list(pathlib.Path(sys.argv[1]).glob('*.zip')): time.sleep(0.01)\n"
+        "os.kill(os.getpid(), 9)\n",
+        -signal.SIGKILL,
+    ),
+}
+
+
+@pytest.mark.parametrize("way", LEFT)
+def test_a_copy_is_rendered_on_another_machine(way: str, tmp_path: Path) -> None:
+    """What was left pending, also in a log's tail; its model is compiled there."""
+    code, status = LEFT[way]
+    done = run_script(SCRIPT.replace("workers=1", "workers=0") + code, tmp_path / "run")
+    assert done.returncode == status, done.stderr
+    killed = way == "kill"
+    assert done.stderr.count("1 video pending: mjrec render") == (not killed)
+    assert killed == bool(list((tmp_path / "run").glob("*.tail")))
+    shutil.copytree(tmp_path / "run", tmp_path / "copy")
+    shutil.rmtree(tmp_path / "run")
+    # Where this user has stored no model.
+    render(tmp_path / "copy", XDG_STATE_HOME=str(tmp_path / "state"))
+    assert len(frames_in(tmp_path / "copy", 0)) == 2
+    metadata = metadata_of(tmp_path / "copy", 0)
+    assert metadata["reason"] == ("killed" if killed else "close")
 
 
 @pytest.mark.usefixtures("default_signals")
@@ -212,7 +279,7 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(
 ) -> None:
     """The manifest is written, the line is said, and the process ends at once."""
     code = SCRIPT + (
-        "import os, signal, threading, time\n"
+        "import signal, threading\n"
         "def interrupt():\n"
         "    while not os.path.exists(sys.argv[2]): time.sleep(0.01)\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
@@ -222,7 +289,7 @@ def test_ctrl_c_while_waiting_leaves_the_rest_pending(
     done = run_script(code, tmp_path, stuck_encoder)
     assert done.returncode == -signal.SIGINT, done.stderr
     assert "1 video pending: mjrec render" in done.stderr
-    assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
+    assert pending_in(tmp_path) == [0]
 
 
 # --- which way -----------------------------------------------------------------------
@@ -237,70 +304,47 @@ class Overlay(gymnasium.Wrapper[Any, Any, Any, Any]):
         return frame
 
 
-def test_overlay_is_recorded_live_and_says_why(
+def test_an_overlay_is_recorded_live_and_says_why(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its pictures do not follow from the state."""
+    """Its frames do not follow from the state; to render it again says so, too."""
     caplog.set_level(logging.INFO)
-    env = mjrec.Monitor(Overlay(make(render_mode="rgb_array")), tmp_path)
-    with env:
+    with mjrec.Monitor(Overlay(make(render_mode="rgb_array")), tmp_path) as env:
         steps(env, 1)
     metadata = metadata_of(tmp_path, 0)
     assert metadata["recording"] == "live"
     assert "Overlay" in metadata["recording_reason"]
     assert "Overlay" in caplog.text
     assert frames_in(tmp_path, 0)[0][0].min() > 240
-
-
-def test_drawing_a_live_recording_again_says_what_is_missing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """What a wrapper painted on top is in no state."""
-    with mjrec.Monitor(Overlay(make(render_mode="rgb_array")), tmp_path) as env:
-        steps(env, 1)
-    [path] = tmp_path.glob("*.h5")
     caplog.clear()
+    [path] = tmp_path.glob("*.h5")
     assert next(mjrec.render(path))[0].max() < 240
     assert "recorded live, because the wrapper" in caplog.text
     assert "Overlay" in caplog.text
 
 
-def test_deferred_by_force_is_an_error_that_names_the_class(tmp_path: Path) -> None:
-    """Nothing is written."""
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"render": "deferred"}, "PicturesDiffer", "Overlay"),
+        *(({"render": v}, "InvalidArgument", "deferred") for v in ("later", 3, "")),
+        *(
+            ({"workers": value}, "InvalidArgument", "workers")
+            for value in (-1, 1.5, True, "2")
+        ),
+    ],
+)
+def test_impossible_options_are_refused_before_anything_is_made(
+    options: dict[str, Any], error: str, words: str, corridor: Any, tmp_path: Path
+) -> None:
+    """Deferred by force names the class that draws, or lacks a simulation."""
     env = Overlay(make(render_mode="rgb_array"))
-    with pytest.raises(mjrec.PicturesDiffer, match="Overlay"):
-        mjrec.Monitor(env, tmp_path / "d", render="deferred")
+    with pytest.raises(getattr(mjrec, error), match=words):
+        mjrec.Monitor(env, tmp_path / "d", **options)
+    if error == "PicturesDiffer":
+        with pytest.raises(mjrec.PicturesDiffer, match="no MuJoCo model"):
+            mjrec.Monitor(corridor, tmp_path / "d", **options)
     assert not (tmp_path / "d").exists()
-    env.close()
-
-
-def test_deferred_by_force_needs_a_simulation(corridor: Any, tmp_path: Path) -> None:
-    """There is nothing to defer to without a state."""
-    with pytest.raises(mjrec.PicturesDiffer, match="no MuJoCo model"):
-        mjrec.Monitor(corridor, tmp_path, render="deferred")
-
-
-def test_off_writes_trajectories_and_no_videos(pendulum: Any, tmp_path: Path) -> None:
-    """Of every episode, in evaluation mode."""
-    with monitored(pendulum, tmp_path, render="off", mode="evaluation") as env:
-        steps(env, 2)
-        steps(env, 2)
-    assert len(list(tmp_path.glob("*.h5"))) == 2
-    assert not list(tmp_path.glob("*video*"))
-
-
-@pytest.mark.parametrize("value", ["later", 3, ""])
-def test_no_such_way_to_render(value: Any, pendulum: Any, tmp_path: Path) -> None:
-    """The message lists them."""
-    with pytest.raises(mjrec.InvalidArgument, match="deferred"):
-        mjrec.Monitor(pendulum, tmp_path, render=value)
-
-
-@pytest.mark.parametrize("value", [-1, 1.5, True, "2"])
-def test_workers_are_a_number(value: Any, pendulum: Any, tmp_path: Path) -> None:
-    """Of processes."""
-    with pytest.raises(mjrec.InvalidArgument, match="workers"):
-        mjrec.Monitor(pendulum, tmp_path, workers=value)
 
 
 class Touching(MujocoEnv):
@@ -330,84 +374,48 @@ class Touching(MujocoEnv):
         return np.concatenate([self.data.qpos, self.data.qvel])
 
 
-def test_plugin_that_draws_is_recorded_live_with_a_message(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Its pictures do not follow from what can be put back."""
-    env = Touching(tmp_path / "grid.xml", "rgb_array")
-    with mjrec.Monitor(env, tmp_path / "d", env_id="Touching-v0") as monitor:
-        monitor.reset()
-        monitor.step(np.zeros(0))
-    [said] = [r.getMessage() for r in caplog.records if "drawn live" in r.getMessage()]
-    assert "mujoco.sensor.touch_grid" in said
-    metadata = metadata_of(tmp_path / "d", 0)
-    assert metadata["recording"] == "live"
-    assert metadata["pictures"] == "env.render"
-    assert len(frames_in(tmp_path / "d", 0)) == 2
-
-
 @pytest.mark.parametrize(
-    ("render", "mode", "error"),
-    [("deferred", "rgb_array", "PicturesDiffer"), (None, None, "NoPictures")],
-)
-def test_plugin_that_draws_and_no_way_to_record_it(
-    render: Any, mode: Any, error: str, tmp_path: Path
-) -> None:
-    """One clear error at the first reset, instead of unchecked pictures."""
-    env = Touching(tmp_path / "grid.xml", mode)
-    directory = tmp_path / "d"
-    monitor = mjrec.Monitor(env, directory, render=render, env_id="Touching-v0")
-    with pytest.raises(getattr(mjrec, error), match="touch_grid"):
-        monitor.reset()
-    monitor.close()
-    assert videos_in(directory) == []
-
-
-# --- which trajectories --------------------------------------------------------------
-
-
-def trajectories(directory: Path) -> list[str]:
-    return sorted(path.name.split(".")[-2] for path in directory.glob("*.h5"))
-
-
-@parametrize(
-    ("options", "kept"),
+    ("how", "mode", "error"),
     [
-        ({}, [0, 1]),
-        ({"mode": "evaluation"}, [0, 1, 2]),
-        ({"trajectory_callable": True}, [0, 1, 2]),
-        ({"trajectory_callable": lambda episode: episode == 2}, [2]),
-        ({"trajectory_callable": False}, []),
+        (None, "rgb_array", None),
+        ("deferred", "rgb_array", "PicturesDiffer"),
+        (None, None, "NoPictures"),
     ],
 )
-def test_which_trajectories_are_kept(
-    options: dict[str, Any], kept: list[int], pendulum: Any, tmp_path: Path
+def test_a_plugin_that_draws_is_recorded_live_or_refused(
+    *,
+    how: Any,
+    mode: Any,
+    error: str | None,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """The videos' own are removed once the videos are there, if they are not wanted."""
-    with monitored(pendulum, tmp_path, workers=1, **options) as env:
-        for seed in range(3):
-            steps(env, 1, seed=seed)
-    assert trajectories(tmp_path) == [f"episode{number:06d}" for number in kept]
-    assert videos_in(tmp_path) == [0, 1]
-
-
-def test_observations_are_recorded_where_asked_for(
-    pendulum: Any, tmp_path: Path
-) -> None:
-    """One more than there are steps."""
-    with mjrec.Monitor(pendulum, tmp_path, workers=0, observations=True) as env:
-        first, _ = env.reset(seed=0)
-        second = env.step(env.action_space.sample())[0]
-    [path] = tmp_path.glob("*.h5")
-    recorded = mjrec.load_trajectory(path).observations
-    np.testing.assert_array_equal(recorded, [first, second])
+    """Its frames do not follow from what can be put back, and one message says so."""
+    env = Touching(tmp_path / "grid.xml", mode)
+    with mjrec.Monitor(
+        env, tmp_path / "d", render=how, env_id="Touching-v0"
+    ) as monitor:
+        if error:
+            with pytest.raises(getattr(mjrec, error), match="touch_grid"):
+                monitor.reset()
+        else:
+            monitor.reset()
+            monitor.step(np.zeros(0))
+    if error:
+        assert videos_in(tmp_path / "d") == []
+        return
+    said = [r.getMessage() for r in caplog.records if "drawn live" in r.getMessage()]
+    assert ["mujoco.sensor.touch_grid" in each for each in said] == [True]
+    metadata = metadata_of(tmp_path / "d", 0)
+    assert (metadata["recording"], metadata["pictures"]) == ("live", "env.render")
+    assert len(frames_in(tmp_path / "d", 0)) == 2
 
 
 # --- frames --------------------------------------------------------------------------
 
 
 # Takes more than five seconds: the same video by several numbers of workers.
-def test_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
+def test_a_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
     """One worker or three."""
     hashes = set()
     for workers in (1, 3):
@@ -420,30 +428,21 @@ def test_video_is_the_same_bytes_whoever_draws_it(tmp_path: Path) -> None:
     assert len(hashes) == 1
 
 
-def test_changed_texture_shows_after_model_changed(tmp_path: Path) -> None:
-    """From the next frame on, as with a renderer that uploads it."""
+def test_what_changes_in_the_model_shows(tmp_path: Path) -> None:
+    """Colours by themselves, textures after `model_changed`: from the next frame on."""
     env = make("Ant-v5")
-    with mjrec.Monitor(env, tmp_path, workers=1) as monitored:
-        monitored.reset(seed=0)
-        monitored.step(np.zeros(8))
+    with mjrec.Monitor(env, tmp_path, workers=1) as monitor:
+        monitor.reset(seed=0)
+        monitor.step(np.zeros(8))
         env.unwrapped.model.tex_data[:] = 255 - env.unwrapped.model.tex_data
-        monitored.model_changed()
-        monitored.step(np.zeros(8))
-    _, before, after = frames_in(tmp_path, 0)
-    assert np.abs(before.astype(int) - after).mean() > 20
-
-
-def test_reset_before_any_step_replaces_the_trajectory(
-    pendulum: Any, tmp_path: Path
-) -> None:
-    """It keeps its number."""
-    with mjrec.Monitor(pendulum, tmp_path, workers=0) as env:
-        env.reset(seed=1)
-        env.reset(seed=2)
-        env.step(np.zeros(1))
-    [path] = tmp_path.glob("*.h5")
-    trajectory = mjrec.load_trajectory(path)
-    assert (trajectory.seed, trajectory.episode_id) == (2, 0)
+        monitor.model_changed()
+        monitor.step(np.zeros(8))
+        env.unwrapped.model.geom_rgba[:] = (0, 1, 0, 1)
+        monitor.step(np.zeros(8))
+    _, *shown = (frame.astype(int) for frame in frames_in(tmp_path, 0))
+    textured, coloured = (np.abs(a - b) for a, b in itertools.pairwise(shown))
+    assert textured.mean() > 20
+    assert coloured.max() > 60
 
 
 # --- the simulation is left alone ----------------------------------------------------
@@ -473,54 +472,48 @@ def test_no_opengl_in_the_simulation(tmp_path: Path) -> None:
     assert len(frames_in(tmp_path, 0)) == 2
 
 
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Humanoid-v5"])
-def test_recording_does_not_disturb(env_id: str, tmp_path: Path) -> None:
-    """Observations, rewards, states and random numbers are bit for bit the same."""
-
-    def run(env: Any) -> list[Any]:
-        seen = []
-        for seed in (3, None):
-            seen.append(env.reset(seed=seed)[0])
-            env.action_space.seed(1)
-            for _ in range(5):
-                observation, reward, *_ = env.step(env.action_space.sample())
-                seen += [observation, reward, env.unwrapped.data.qacc_warmstart.copy()]
-        return [np.asarray(value).tobytes() for value in seen]
-
-    assert run(make(env_id)) == run(monitored(make(env_id), tmp_path, workers=0))
+def test_model_and_data_may_be_replaced_and_deleted(tmp_path: Path) -> None:
+    """Rows follow the data that there is; none are read from freed memory."""
+    env = make("HalfCheetah-v5")
+    shown = []
+    with monitored(env, tmp_path, workers=0) as monitor:
+        inner = env.unwrapped
+        monitor.reset(seed=0)
+        for _ in range(4):
+            monitor.step(np.ones(6))
+            shown.append(inner.data.qpos.copy())
+            inner.data = inner.mujoco_renderer.data = copy.copy(inner.data)
+            gc.collect()
+        del inner.data, inner.model
+        inner.mujoco_renderer.data = inner.mujoco_renderer.model = None
+        gc.collect()
+    trajectory = trajectory_in(tmp_path)
+    assert len(trajectory.rewards) == 4
+    # After the time.
+    np.testing.assert_array_equal(trajectory.states[1:, 1:10], shown)
 
 
 @pytest.mark.thorough
-def test_global_random_state_is_left_alone(tmp_path: Path) -> None:
+def test_the_global_random_state_is_left_alone(tmp_path: Path) -> None:
     """Python's and NumPy's, also where a library is loaded for the first time."""
+    bare, recorded = SCRIPT.split("env = mjrec")
     code = (
-        "import random, sys, gymnasium, numpy as np, mjrec\n"
-        "env = gymnasium.make('InvertedPendulum-v5', height=48, width=64)\n"
+        f"import random, numpy as np\n{bare}"
         "def state(): return random.getstate(), np.random.get_state()[1].tolist()\n"
-        "before = state()\n"
-        "env = mjrec.Monitor(env, sys.argv[1], workers=1)\n"
-        "env.reset(seed=0); env.step([0.0]); env.close()\n"
+        f"before = state()\nenv = mjrec{recorded}env.close()\n"
         "assert state() == before\n"
     )
-    done = run_script(code, tmp_path)
+    done = run_script(code.replace("env.action_space.sample()", "[0.0]"), tmp_path)
     assert done.returncode == 0, done.stderr
 
 
 # --- where monitors live -------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_forked_child_is_told_and_does_not_hang(pendulum: Any, tmp_path: Path) -> None:
-    """The monitor belongs to the process that made it."""
-    with mjrec.Monitor(pendulum, tmp_path, workers=1) as env:
-        steps(env, 1)
-        pid = os.fork()
-        if pid == 0:
-            try:
-                env.step(np.zeros(1))
-            except mjrec.Error as error:
-                (tmp_path / "told.json").write_text(json.dumps(str(error)))
-            os._exit(0)
-        assert os.waitpid(pid, 0)[1] == 0
-    assert "forked" in json.loads((tmp_path / "told.json").read_text())
-    assert videos_in(tmp_path) == [0]
+def test_works_in_a_script_without_a_main_guard(tmp_path: Path) -> None:
+    """Workers never import the user's main module."""
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT + "print('once')\nenv.close()\n")
+    command = [sys.executable, str(script), str(tmp_path / "out")]
+    assert subprocess.check_output(command, text=True) == "once\n"
+    assert len(list((tmp_path / "out").glob("*.mp4"))) == 1

@@ -200,7 +200,7 @@ def test_the_given_gpu_draws(name: Callable[[EglDevice], str]) -> None:
     done = run(
         f"given = render_on_given_gpu({gpu!r}, required=True)\n"
         "import mujoco\n"
-        "from mjrec.simulation.gl_strings import current_gl_facts\n"
+        "from mjrec.simulation.gl_info import current_gl_facts\n"
         "context = mujoco.GLContext(16, 16); context.make_current()\n"
         "import OpenGL.GL\n"
         "facts = current_gl_facts()\n"

@@ -24,25 +24,16 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "openaigym.manifest.0.1.manifest.json"
 
 
-def test_it_comes_back_as_it_was(path: Path) -> None:
-    """What is read is what was written."""
+def test_keys_are_in_gyms_order_with_ours_last(path: Path) -> None:
+    """What is read is what was written; nothing stands for a missing key of ours."""
     write_manifest(path, MANIFEST)
     assert read_manifest(path) == MANIFEST
-
-
-def test_keys_are_in_gyms_order_with_ours_last(path: Path) -> None:
-    """A person finds what gym wrote where gym wrote it."""
-    write_manifest(path, MANIFEST)
     assert list(json.loads(path.read_text())) == [
         "stats",
         "videos",
         "env_info",
         "mjrec",
     ]
-
-
-def test_without_our_key_the_text_is_gyms(path: Path) -> None:
-    """Nothing stands for a missing key."""
     write_manifest(path, Manifest("s", (("a", "b"),), {"gym_version": "0.21.0"}, None))
     assert path.read_text() == (
         '{"stats": "s", "videos": [["a", "b"]], "env_info": {"gym_version": "0.21.0"}}'
@@ -50,25 +41,13 @@ def test_without_our_key_the_text_is_gyms(path: Path) -> None:
     assert read_manifest(path).mjrec is None
 
 
-def test_keys_of_later_versions_are_ignored(path: Path) -> None:
-    """Gym 0.1.2 to 0.4.10 wrote `seeds`."""
-    content = {"stats": "s", "videos": [], "env_info": {}, "seeds": [1]}
-    path.write_text(json.dumps(content))
-    assert read_manifest(path) == Manifest("s", (), {}, None)
-
-
-BAD_NAMES = ["../s", "a/b", "/etc/passwd", "..", ".", "", "a\\b", "a\0b"]
-
-
-@pytest.mark.parametrize("name", BAD_NAMES)
+@pytest.mark.parametrize(
+    "name", ["../s", "a/b", "/etc/passwd", "..", ".", "", "a\\b", "a\0b"]
+)
 def test_a_name_outside_the_directory_is_refused(path: Path, name: str) -> None:
     """As statistics, video or metadata, when reading and when writing."""
-    for manifest in (
-        {"stats": name, "videos": []},
-        {"stats": "s", "videos": [[name, "m"]]},
-        {"stats": "s", "videos": [["v", name]]},
-    ):
-        path.write_text(json.dumps({**manifest, "env_info": {}}))
+    for stats, videos in ((name, []), ("s", [[name, "m"]]), ("s", [["v", name]])):
+        path.write_text(json.dumps({"stats": stats, "videos": videos, "env_info": {}}))
         with pytest.raises(UnreadableFile, match="not the name of a file"):
             read_manifest(path)
     path.unlink()
@@ -83,19 +62,14 @@ def test_a_name_outside_the_directory_is_refused(path: Path, name: str) -> None:
         ('{"stats": "s", "videos": []', "not whole JSON"),
         ("null", "an object belongs there, not null"),
         ('{"videos": [], "env_info": {}}', "it has no 'stats'"),
-        ('{"stats": "s", "env_info": {}}', "it has no 'videos'"),
-        ('{"stats": "s", "videos": []}', "it has no 'env_info'"),
         ('{"stats": 1, "videos": [], "env_info": {}}', "a text belongs there"),
-        ('{"stats": "s", "videos": ["ab"], "env_info": {}}', "a list belongs there"),
         ('{"stats": "s", "videos": [["a"]], "env_info": {}}', "not 1 names"),
-        ('{"stats": "s", "videos": [], "env_info": []}', "an object belongs there"),
+        ('{"stats": "s", "videos": [], "env_info": [], "x": 1}', "an object belongs"),
         ('{"stats": "s", "videos": [], "env_info": {}, "mjrec": 1}', "'mjrec'"),
     ],
 )
-def test_a_damaged_file_is_named_with_the_reason(
-    path: Path, content: str, reason: str
-) -> None:
-    """Each kind of damage is one clear error."""
+def test_damage_is_named_with_the_reason(path: Path, content: str, reason: str) -> None:
+    """Each kind is one clear error."""
     path.write_text(content)
     with pytest.raises(UnreadableFile, match=reason) as caught:
         read_manifest(path)

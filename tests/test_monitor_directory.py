@@ -38,75 +38,59 @@ HIDDEN = {
     ".openaigym.video.0.1.video000027.mp4.0123abcd.part": ("0.1", 27),
     ".openaigym.manifest.0.1.manifest.json.0123abcd.part": (None, None),
 }
-FOREIGN = (
-    "openaigym.notes.txt",
-    "openaigym.manifest",
-    "openaigym..manifest.json",
-    "mjrec.evaluation.0.1.jsonl",
-    "openaigym.video.0.1.video27.mp4",
-    "openaigym.states.0.1.log",
-    "notes",
+# A part of a clip is only ever in a log.
+NO_FILE = {"openaigym.clip.0.1.step000000137.part000000": ("0.1", None)}
+FOREIGN = dict.fromkeys(
+    (
+        "openaigym.notes.txt",
+        "openaigym.manifest",
+        "openaigym..manifest.json",
+        "mjrec.evaluation.0.1.jsonl",
+        "openaigym.video.0.1.video27.mp4",
+        "openaigym.states.0.1.log",
+        "notes",
+    ),
+    (None, None),
 )
+NAMES = {**VISIBLE, **HIDDEN, **NO_FILE, **FOREIGN}
 
 
-@pytest.mark.parametrize("name", [*VISIBLE, *HIDDEN])
-def test_name_says_monitor_and_episode(name: str) -> None:
-    """As far as it has them."""
-    assert (infix_of(name), episode_of(name)) == {**VISIBLE, **HIDDEN}[name]
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_says_monitor_and_episode(name: str) -> None:
+    """As far as it has them; others' names say nothing."""
+    assert (infix_of(name), episode_of(name)) == NAMES[name]
 
 
-def test_a_clips_part_says_its_monitor_and_is_no_file(tmp_path: Path) -> None:
-    """It is only ever in a log; its number is not that of an episode."""
-    name = "openaigym.clip.0.1.step000000137.part000000"
-    (tmp_path / name).touch()
-    assert (infix_of(name), episode_of(name)) == ("0.1", None)
-    assert list(iter_monitor_files(tmp_path, hidden=True)) == []
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-def test_other_names_say_nothing(name: str) -> None:
-    """They are somebody else's files."""
-    assert (infix_of(name), episode_of(name)) == (None, None)
-
-
-def test_files_are_listed_in_the_order_of_their_names(tmp_path: Path) -> None:
-    """Hidden ones if asked for, and no other files, nor directories."""
-    for name in (*VISIBLE, *HIDDEN, *FOREIGN):
+def test_monitor_files_are_listed_by_name(tmp_path: Path) -> None:
+    """Hidden ones if asked for; no other files, no directories."""
+    for name in NAMES:
         (tmp_path / name).touch()
     (tmp_path / "openaigym.manifest.1.1.manifest.json").mkdir()
     listed = [path.name for path in iter_monitor_files(tmp_path)]
     assert listed == sorted(VISIBLE)
     listed = [path.name for path in iter_monitor_files(tmp_path, hidden=True)]
     assert listed == sorted([*VISIBLE, *HIDDEN])
-    assert set(names_in(tmp_path)) >= {*VISIBLE, *HIDDEN, *FOREIGN}
+    assert set(names_in(tmp_path)) >= set(NAMES)
+    assert list(iter_monitor_files(tmp_path / "missing")) == []
 
 
 def test_links_count_where_they_lead_to_a_file(tmp_path: Path) -> None:
-    """One to a file does; one to nothing, to a directory or to itself does not."""
+    """One to nothing, to a directory or to itself does not."""
     names = [f"openaigym.manifest.{n}.1.manifest.json" for n in range(4)]
-    file, gone, folder, loop = (tmp_path / name for name in names)
+    for name, target in zip(names, ["file", "gone", ".", names[3]], strict=True):
+        (tmp_path / name).symlink_to(target)
     (tmp_path / "file").touch()
-    file.symlink_to("file")
-    gone.symlink_to("nothing")
-    folder.symlink_to(".")
-    loop.symlink_to(loop.name)
-    assert list(iter_monitor_files(tmp_path)) == [file]
+    assert list(iter_monitor_files(tmp_path)) == [tmp_path / names[0]]
 
 
-def test_directory_that_is_not_there_holds_nothing(tmp_path: Path) -> None:
-    """Nobody has recorded into it."""
-    assert list(iter_monitor_files(tmp_path / "none")) == []
-
-
-def test_who_looks_in_the_wrong_place_is_told_of_the_folders(tmp_path: Path) -> None:
+def test_a_wrong_directory_names_the_folders_with_recordings(tmp_path: Path) -> None:
     """An evaluation has one for each task; some are named."""
     assert "mjrec record ENV --out" in where_recordings_are(tmp_path)
     for number in range(7):
         folder = tmp_path / f"task{number}"
         folder.mkdir()
         (folder / "openaigym.episodes.0.1.jsonl").touch()
-    told = where_recordings_are(tmp_path)
-    assert told == (
+    assert where_recordings_are(tmp_path) == (
         "Its folders do (task0, task1, task2, task3, task4 and 2 more): name one of "
         "them."
     )

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Where a monitor may record, and with which number it begins."""
+
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from result_files import ENV_INFO, entry, write_journal, write_saved
 from trajectories_by_hand import write_log
 
 import mjrec
+from conftest import Corridor, run_episodes
 from mjrec import (
     DifferentEnvironment,
     DirectoryInUse,
@@ -20,127 +22,82 @@ from mjrec import (
     InvalidArgument,
     UnreadableFile,
 )
-from mjrec.formats.journal import JournalEntry, JournalWriter
-from mjrec.formats.manifest import Manifest, write_manifest
 from mjrec.formats.monitor_directory import (
     Infix,
     journal_name,
     lock_name,
     manifest_name,
 )
-from mjrec.recorder.opening import OpenDirectory, open_directory
 
-ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
+ANOTHER = "Ant-v5"
 
 
-def open_(directory: Path, **options: Any) -> OpenDirectory:
-    wanted = {"force": False, "resume": False, "uid": None, "env_info": ENV_INFO}
-    return open_directory(directory, **(wanted | options))
+def monitor(directory: Path, **options: Any) -> Any:
+    return mjrec.Monitor(Corridor(), directory, video_callable=False, **options)
+
+
+def first_number(directory: Path, **options: Any) -> int:
+    """Return the number that a monitor begins with, and forget the monitor."""
+    opened = monitor(directory, **{"resume": True, **options})
+    opened.close()
+    for path in directory.glob(f"*{opened.infix}*"):
+        path.unlink()
+    return int(opened.episode_id)
+
+
+def record(directory: Path, episodes: int = 2, **options: Any) -> None:
+    with monitor(directory, **options) as env:
+        run_episodes(env, episodes)
 
 
 def write_video(directory: Path, infix: str, episode: int) -> None:
     (directory / f"openaigym.video.{infix}.video{episode:06d}.mp4").touch()
 
 
-def record(
-    directory: Path, make_corridor: Any, play: Callable[..., None], **options: Any
-) -> Any:
-    """Record two episodes without videos."""
-    with mjrec.Monitor(
-        make_corridor(), directory, video_callable=False, **options
-    ) as env:
-        play(env, 2)
-    return env
-
-
-def test_makes_the_directory_and_its_parents(tmp_path: Path) -> None:
-    """A directory that is not there is made."""
-    place = open_(tmp_path / "a" / "b")
-    assert place.path.is_dir()
-    assert place.first_episode_id == 0
-    place.lock.release()
-
-
-def test_relative_directory_is_fixed_at_opening(
+def test_a_relative_directory_is_fixed_at_opening(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A later chdir changes nothing."""
+    """It is made with its parents; a later chdir changes nothing."""
     monkeypatch.chdir(tmp_path)
-    place = open_(Path("a"))
-    assert place.path == tmp_path / "a"
-    place.lock.release()
+    with monitor(Path("a/b")) as env:
+        assert env.episode_id == 0
+        monkeypatch.chdir("/")
+        run_episodes(env, 1)
+    assert len(list((tmp_path / "a" / "b").glob("*.jsonl"))) == 1
 
 
-def test_existing_recordings_need_force_or_resume(
-    tmp_path: Path, make_corridor: Any, play: Any
-) -> None:
-    """The error lists files and the ways out."""
-    record(tmp_path, make_corridor, play)
-    with pytest.raises(ExistingRecordings, match=r"(?s)manifest.*resume=True.*force"):
-        open_(tmp_path)
-
-
-def test_videos_without_a_manifest_are_recordings_too(tmp_path: Path) -> None:
-    """What a crashed run left is not silently added to."""
+def test_existing_recordings_need_force_or_resume(tmp_path: Path) -> None:
+    """The error lists files and the ways out; a crashed run's videos count too."""
     write_video(tmp_path, "0.1", 0)
     with pytest.raises(ExistingRecordings):
-        open_(tmp_path)
+        monitor(tmp_path)
+    record(tmp_path, force=True)
+    with pytest.raises(ExistingRecordings, match=r"(?s)manifest.*resume=True.*force"):
+        monitor(tmp_path)
 
 
-def test_other_peoples_files_are_no_recordings(tmp_path: Path) -> None:
-    """Only names that monitors give count."""
-    (tmp_path / "notes.txt").touch()
-    (tmp_path / "openaigym.notes.txt").touch()
-    open_(tmp_path).lock.release()
+def test_force_deletes_monitor_files_only(tmp_path: Path, names: Any) -> None:
+    """Others' files are no recordings, and stay, whatever their names begin with."""
+    others = ["notes.txt", "openaigym.manifest.1.1.manifest.json", "openaigym.txt"]
+    (tmp_path / others[1]).mkdir()
+    for name in (others[0], others[2]):
+        (tmp_path / name).touch()
+    record(tmp_path)
+    with monitor(tmp_path, force=True) as env:
+        assert [name for name in names(tmp_path) if env.infix not in name] == others
+        with pytest.raises(DirectoryInUse):
+            monitor(tmp_path, force=True)
 
 
-def test_force_deletes_monitor_files_only(
-    tmp_path: Path, make_corridor: Any, play: Any, names: Any
-) -> None:
-    """Notes and directories stay, whatever their names begin with."""
-    record(tmp_path, make_corridor, play)
-    (tmp_path / "openaigym.notes.txt").touch()
-    (tmp_path / "openaigym.manifest.1.1.manifest.json").mkdir()
-    open_(tmp_path, force=True).lock.release()
-    assert names(tmp_path) == [
-        "openaigym.manifest.1.1.manifest.json",
-        "openaigym.notes.txt",
-    ]
-
-
-def test_force_does_not_delete_under_an_open_monitor(
-    tmp_path: Path, make_corridor: Any
-) -> None:
-    """Another monitor's files are not pulled from under it."""
-    with mjrec.Monitor(make_corridor(), tmp_path), pytest.raises(DirectoryInUse):
-        open_(tmp_path, force=True)
-
-
-def test_resume_goes_on_after_the_highest_number(
-    tmp_path: Path, make_corridor: Any, play: Any
-) -> None:
-    """Two episodes were recorded, so the next is number 2."""
-    record(tmp_path, make_corridor, play)
-    place = open_(tmp_path, resume=True)
-    assert place.first_episode_id == 2
-    place.lock.release()
-
-
-def test_resume_counts_videos_of_a_dead_monitor(tmp_path: Path) -> None:
-    """A run that was killed before its manifest has its videos to count by."""
-    write_video(tmp_path, "0.1", 7)
-    place = open_(tmp_path, resume=True)
-    assert place.first_episode_id == 8
-    place.lock.release()
-
-
-def test_resume_counts_an_episode_in_flight(tmp_path: Path) -> None:
-    """The unfinished video of a killed run has a number too."""
-    write_video(tmp_path, "0.1", 0)
-    (tmp_path / ".openaigym.video.0.1.video000001.mp4.0a1b2c3d.part").touch()
-    place = open_(tmp_path, resume=True)
-    assert place.first_episode_id == 2
-    place.lock.release()
+def test_resume_goes_on_after_the_highest_number(tmp_path: Path) -> None:
+    """By what a closed run counted, and by a dead one's videos."""
+    record(tmp_path)
+    assert first_number(tmp_path) == 2
+    write_video(tmp_path, "0.x", 7)
+    assert first_number(tmp_path) == 8
+    # A number that makes names which no file can have does not count.
+    write_video(tmp_path, "0.x", 10**150)
+    assert first_number(tmp_path) == 8
 
 
 def test_resume_counts_the_same_uid_only(tmp_path: Path) -> None:
@@ -148,212 +105,143 @@ def test_resume_counts_the_same_uid_only(tmp_path: Path) -> None:
     write_video(tmp_path, "0.alice", 7)
     write_video(tmp_path, "0.bob", 3)
     for uid, expected in (("bob", 4), ("alice", 8), ("carol", 0), (None, 8)):
-        place = open_(tmp_path, resume=True, uid=uid)
-        assert place.first_episode_id == expected
-        place.lock.release()
+        assert first_number(tmp_path, uid=uid) == expected
 
 
 def test_resume_never_takes_a_used_name(tmp_path: Path) -> None:
-    """The same uid, or a pid that was used before, gets another monitor id."""
-    for number in range(50):
-        write_video(tmp_path, f"{number}.same", 0)
-    places = [open_(tmp_path, resume=True, uid="same") for _ in range(2)]
-    taken = {str(place.infix) for place in places}
+    """A uid that was used before gets another monitor id."""
+    used = {f"{number}.same" for number in range(50)}
+    for infix in used:
+        write_video(tmp_path, infix, 0)
+    with (
+        monitor(tmp_path, resume=True, uid="same") as one,
+        monitor(tmp_path, resume=True, uid="same") as other,
+    ):
+        taken = {str(one.infix), str(other.infix)}
     assert len(taken) == 2
-    assert not taken & {f"{number}.same" for number in range(50)}
-    for place in places:
-        place.lock.release()
+    assert not taken & used
 
 
-def test_open_monitors_do_not_count(
-    tmp_path: Path, make_corridor: Any, play: Any
-) -> None:
+def test_open_monitors_do_not_count(tmp_path: Path) -> None:
     """Monitors that share a directory number independently, until they close."""
-    with mjrec.Monitor(make_corridor(), tmp_path, video_callable=False) as first:
-        play(first, 3)
-        with mjrec.Monitor(
-            make_corridor(), tmp_path, resume=True, video_callable=False
-        ) as second:
-            play(second, 1)
+    with monitor(tmp_path) as first:
+        run_episodes(first, 3)
+        with monitor(tmp_path, resume=True) as second:
+            run_episodes(second, 1)
             assert (first.episode_id, second.episode_id) == (3, 1)
-    place = open_(tmp_path, resume=True)
-    assert place.first_episode_id == 3
-    place.lock.release()
+    assert first_number(tmp_path) == 3
 
 
-def test_killed_monitor_counts_as_dead(tmp_path: Path) -> None:
+def test_a_killed_monitor_counts_as_dead(tmp_path: Path) -> None:
     """Its lock file stays but is not held; its journal has the numbers."""
-    script = f"""
-import os, signal, sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-import conftest, mjrec
-env = mjrec.Monitor(conftest.Corridor(), {str(tmp_path)!r}, video_callable=False)
-conftest.run_episodes(env, 4)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-    done = subprocess.run([sys.executable, "-c", script], check=False)
-    assert done.returncode == -signal.SIGKILL
-    place = open_(tmp_path, resume=True)
-    assert place.first_episode_id == 4
-    place.lock.release()
+    code = (
+        f"import os, sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "import pathlib, test_opening as t\n"
+        "env = t.monitor(pathlib.Path(sys.argv[1]))\n"
+        "t.run_episodes(env, 4); os.kill(os.getpid(), 9)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], check=False)
+    assert done.returncode == -9
+    assert first_number(tmp_path) == 4
 
 
-def test_torn_line_keeps_its_number(
-    tmp_path: Path, make_corridor: Any, play: Any, caplog: pytest.LogCaptureFixture
+def test_a_torn_line_keeps_its_number(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Its episode is lost, and the next one is not taken for it; the log says so."""
-    record(tmp_path, make_corridor, play)
-    (journal,) = tmp_path.glob("*.jsonl")
-    for path in tmp_path.glob("*.json"):
-        path.unlink()
-    lines = journal.read_bytes().splitlines(keepends=True)
-    last = next(n for n, line in enumerate(lines) if b'"episode_id": 1' in line)
-    journal.write_bytes(b"".join(lines[: last + 1])[:-20])
-    place = open_(tmp_path, resume=True)
-    assert place.first_episode_id == 2
-    assert f"line {last + 1} (episode 1): it was cut off" in caplog.text
-    place.lock.release()
+    journal = write_journal(tmp_path, "0.7", 0, 1, run={"env_info": ENV_INFO})
+    journal.write_bytes(journal.read_bytes()[:-20])
+    assert first_number(tmp_path) == 2
+    assert "line left out: line 3 (episode 1)" in caplog.text
 
 
-@pytest.mark.parametrize("next_id", [None, True, -1, 1.5, "7", 10**4000, {}])
-def test_impossible_next_number_is_an_error(tmp_path: Path, next_id: object) -> None:
+@pytest.mark.parametrize("number", [None, True, -1, 1.5, "7", 10**4000, {}])
+def test_an_impossible_next_number_is_an_error(tmp_path: Path, number: object) -> None:
     """A manifest may come from anybody; numbers go into names of files."""
-    stats = "openaigym.episode_batch.0.7.stats.json"
-    path = tmp_path / "openaigym.manifest.0.7.manifest.json"
-    details = {"next_episode_id": next_id}
-    write_manifest(path, Manifest(stats, (), ENV_INFO, details))
+    path = write_saved(tmp_path, "0.7", details={"next_episode_id": number})
     with pytest.raises(UnreadableFile, match=rf"{path.name}.*next_episode_id"):
-        open_(tmp_path, resume=True)
+        monitor(tmp_path, resume=True)
 
 
-def test_name_with_an_impossible_number_does_not_count(tmp_path: Path) -> None:
-    """It would make names that no file can have."""
-    write_video(tmp_path, "0.7", 10**150)
-    write_video(tmp_path, "0.7", 4)
-    place = open_(tmp_path, resume=True)
-    assert place.first_episode_id == 5
-    place.lock.release()
+def test_resume_over_another_environment_is_an_error(tmp_path: Path) -> None:
+    """Also while it is open, or killed with its journal alone left; both are named."""
+    with monitor(tmp_path / "a") as env:
+        with pytest.raises(DifferentEnvironment, match=rf"Corridor\).*{ANOTHER}"):
+            monitor(tmp_path / "a", resume=True, env_id=ANOTHER)
+        run_episodes(env, 1)
+    with pytest.raises(DifferentEnvironment, match=rf"Corridor\).*{ANOTHER}"):
+        monitor(tmp_path / "a", resume=True, env_id=ANOTHER)
+    run = {"env_info": {**ENV_INFO, "env_id": ANOTHER}}
+    (tmp_path / "b").mkdir()
+    write_journal(tmp_path / "b", "0.7", entry(0), run=run)
+    with pytest.raises(DifferentEnvironment, match=rf"{ANOTHER}.*Corridor"):
+        monitor(tmp_path / "b", resume=True)
 
 
-def test_resume_over_a_journal_of_another_environment_is_an_error(
-    tmp_path: Path,
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        *(({"uid": u}, "uid") for u in ("", "a/b", ".hidden", "a b", "é", "x" * 101)),
+        *(({"resume": r}, 'True, False, or "join"') for r in ("yes", 1, None)),
+    ],
+)
+def test_wrong_options_make_nothing(
+    tmp_path: Path, options: dict[str, Any], what: str
 ) -> None:
-    """Where the monitor was killed and its lock was not copied along."""
-    writer = JournalWriter(
-        tmp_path / "openaigym.episodes.0.7.jsonl",
-        run={"env_info": ENV_INFO | {"env_id": "Ant-v5"}},
-    )
-    writer.append(JournalEntry(0, 1, 1.0, "t", 0.0, 1.0, 0, None, True, False))
-    writer.close()
-    with pytest.raises(DifferentEnvironment, match=r"Ant-v5.*Corridor"):
-        open_(tmp_path, resume=True)
-
-
-def test_resume_over_another_environment_is_an_error(
-    tmp_path: Path, make_corridor: Any, play: Any
-) -> None:
-    """The error shows both names."""
-    record(tmp_path, make_corridor, play)
-    with pytest.raises(DifferentEnvironment, match=r"Corridor\).*Ant-v5"):
-        open_(tmp_path, resume=True, env_info=ENV_INFO | {"env_id": "Ant-v5"})
-
-
-def test_resume_over_another_open_environment_is_an_error(
-    tmp_path: Path, make_corridor: Any
-) -> None:
-    """Also before the other monitor wrote anything."""
-    with (
-        mjrec.Monitor(make_corridor(), tmp_path),
-        pytest.raises(DifferentEnvironment),
-    ):
-        open_(tmp_path, resume=True, env_info=ENV_INFO | {"env_id": "Ant-v5"})
-
-
-@pytest.mark.parametrize("uid", ["", "a/b", ".hidden", "a b", "é", "x" * 101])
-def test_uid_must_make_a_file_name(tmp_path: Path, uid: str) -> None:
-    """Else nothing is made."""
-    with pytest.raises(InvalidArgument, match="uid"):
-        open_(tmp_path / "new", uid=uid)
+    """A uid must make a file name; a slip is not taken for yes."""
+    with pytest.raises(InvalidArgument, match=what):
+        monitor(tmp_path / "new", **options)
     assert not (tmp_path / "new").exists()
 
 
-def test_file_in_place_of_the_directory_is_an_error(tmp_path: Path) -> None:
-    """The error names the path."""
+@pytest.mark.parametrize("path", ["{}/file", "/proc/self", "/proc/mjrec/recordings"])
+def test_an_impossible_directory_is_an_error(path: str, tmp_path: Path) -> None:
+    """It names the path: a file, and where not even root may write."""
     (tmp_path / "file").touch()
-    with pytest.raises(DirectoryNotWritable, match="file"):
-        open_(tmp_path / "file")
-
-
-def test_name_that_is_too_long_is_an_error(tmp_path: Path) -> None:
-    """The system's own words are in it."""
+    with pytest.raises(DirectoryNotWritable, match=path.removeprefix("{}")):
+        monitor(Path(path.format(tmp_path)))
     with pytest.raises(DirectoryNotWritable, match="too long"):
-        open_(tmp_path / ("x" * 300))
-
-
-@pytest.mark.parametrize("path", ["/proc/self", "/proc/mjrec/recordings"])
-def test_unwritable_directory_is_an_error(path: str) -> None:
-    """Where not even root may write, be the directory there or not."""
-    with pytest.raises(DirectoryNotWritable, match=path):
-        open_(Path(path))
+        monitor(tmp_path / ("x" * 300))
 
 
 def test_failed_opening_removes_what_it_made(tmp_path: Path) -> None:
     """Directories made on the way go again."""
-    with pytest.raises(TypeError):
-        open_directory(
-            tmp_path / "a" / "b", force=False, resume=False, uid=None, env_info=None
-        )  # type: ignore[arg-type]  # a failure on purpose
+    with pytest.raises(mjrec.NoPictures):
+        mjrec.Monitor(Corridor(render_mode=None), tmp_path / "a" / "b")
     assert not (tmp_path / "a").exists()
 
 
-def test_joining_looks_at_nobody_elses_files(tmp_path: Path) -> None:
-    """Whatever is there, also what cannot be read, and numbers begin with 0."""
+def test_joining_looks_at_no_other_files(tmp_path: Path) -> None:
+    """Also where they cannot be read; numbers begin with 0."""
     write_video(tmp_path, "0.elsewhere", 7)
     (tmp_path / "openaigym.manifest.1.elsewhere.manifest.json").write_text("{")
-    other = ENV_INFO | {"env_id": "Ant-v5"}
-    place = open_(tmp_path, resume="join", env_info=other)
-    assert place.first_episode_id == 0
-    place.lock.release()
+    assert first_number(tmp_path, resume="join", env_id=ANOTHER) == 0
 
 
-def test_joining_takes_nobody_elses_name(tmp_path: Path) -> None:
+def test_joining_takes_no_used_name(tmp_path: Path) -> None:
     """A manifest, a journal or a lock shows that a name was given before."""
-    first = open_(tmp_path, resume="join", uid="same")
-    after = [Infix(first.infix.monitor_id + n, "same") for n in (1, 2, 3)]
-    (tmp_path / manifest_name(after[0])).touch()
-    (tmp_path / journal_name(after[1])).touch()
-    (tmp_path / lock_name(after[2])).touch()
-    place = open_(tmp_path, resume="join", uid="same")
-    assert place.infix.monitor_id > after[2].monitor_id
-    for each in (first, place):
-        each.lock.release()
+    with monitor(tmp_path, resume="join", uid="same") as first:
+        number = Infix.parse(str(first.infix)).monitor_id
+        after = [Infix(number + n, "same") for n in (1, 2, 3)]
+        (tmp_path / manifest_name(after[0])).touch()
+        (tmp_path / journal_name(after[1])).touch()
+        (tmp_path / lock_name(after[2])).touch()
+        with monitor(tmp_path, resume="join", uid="same") as second:
+            assert Infix.parse(str(second.infix)).monitor_id > after[2].monitor_id
 
 
-def test_a_monitor_that_joins_leaves_dead_ones_as_they_are(
-    tmp_path: Path,
-    make_corridor: Any,
-    play: Callable[..., None],
-    caplog: pytest.LogCaptureFixture,
+def test_joining_leaves_dead_monitors_as_they_are(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Putting them in order is left to others."""
+    """`resume=True` recovers them."""
     env_id = ENV_INFO["env_id"]
     dead = write_log(tmp_path, infix=Infix(0, "1"), ended=False, env_id=env_id)
     left = [path for path in tmp_path.iterdir() if ".states." in path.name]
     before = [path.read_bytes() for path in left]
-    record(tmp_path, make_corridor, play, resume="join")
+    record(tmp_path, resume="join")
     assert [path.read_bytes() for path in left] == before
     assert not dead.exists()
-    record(tmp_path, make_corridor, play, resume=True)
+    record(tmp_path, resume=True)
     assert not any(path.exists() for path in left)
     assert dead.exists()
     assert "Not recovered" not in caplog.text
-
-
-@pytest.mark.parametrize("resume", ["yes", 1, None])
-def test_resume_is_one_of_three(
-    resume: Any, tmp_path: Path, make_corridor: Any
-) -> None:
-    """A slip is not taken for yes."""
-    with pytest.raises(InvalidArgument, match='True, False, or "join"'):
-        mjrec.Monitor(make_corridor(), tmp_path / "a", False, resume=resume)
-    assert not (tmp_path / "a").exists()

@@ -46,7 +46,7 @@ CONFINED = {
     "dm_control": {"environments"},
     "imageio": {"evidence", "reporting"},
     "imageio_ffmpeg": {"formats"},
-    "h5py": {"formats"},
+    "h5py": {"formats", "evidence.packing.identity_traces"},
     "tyro": {"commands"},
     "scipy": {"evaluation"},
     "matplotlib": {"reporting"},

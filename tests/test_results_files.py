@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import tracemalloc
@@ -16,7 +17,6 @@ from mjrec.evaluation.result_columns import ResultVideo
 from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.results_files import (
     ChosenEpisode,
-    ReadResults,
     is_evaluation,
     read_results,
     write_results,
@@ -104,7 +104,7 @@ def files(result: EpisodeResult) -> EpisodeFiles:
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    """Plan, summaries, choice, versions, and each number bit for bit."""
+    """Plan, summaries, choice, versions, files, and each number bit for bit."""
     read = read_results(written(tmp_path))
     assert read.plan == PLAN
     assert read.summaries == (SUMMARY,)
@@ -119,30 +119,28 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert failed.total_reward is None
     assert failed.failure == 'it said "no", and went =1+1 \\udc80'
     assert infinite == RESULTS[3]
-
-
-def test_columns_know_the_files_of_an_episode(tmp_path: Path) -> None:
-    """Trajectory and video are named where there are any."""
-    columns = read_results(written(tmp_path)).columns["a,b-v0"]
+    columns = read.columns["a,b-v0"]
     assert columns.videos == {0: ResultVideo(VIDEO, SHA)}
     assert columns.trajectory_prefix(0) == "openaigym.trajectory.0.w.episode000000"
     assert columns.trajectory_prefix(1) is None
     assert columns.failed.tolist() == [False, False, True, False]
 
 
-def test_results_csv_is_what_the_documentation_says(tmp_path: Path) -> None:
-    """Header, order, truth, and one line for each episode."""
-    assert (written(tmp_path) / "results.csv").read_text().splitlines() == [
+def test_the_files_are_what_the_documentation_says(tmp_path: Path) -> None:
+    """Header, order, truth, and a line for each episode; JSON for every reader."""
+    written(tmp_path)
+    assert (tmp_path / "results.csv").read_text().splitlines() == [
         "task,seed,episode,return,length,terminated,truncated,success,failure",
         '"a,b-v0",7,0,0.30000000000000004,5,false,true,true,',
         '"a,b-v0",7,1,nan,5,false,true,,',
         '"a,b-v0",3,0,,5,,,,"it said ""no"", and went =1+1 \\udc80"',
         '"a,b-v0",3,1,-inf,5,false,true,,',
     ]
+    json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
 
 
 def test_results_without_timing_are_read(tmp_path: Path) -> None:
-    """Whoever publishes the results alone leaves the times away."""
+    """Results may be published without the times."""
     (written(tmp_path) / "timing.csv").unlink()
     first, *_ = read_results(tmp_path)
     assert first.total_reward == 0.1 + 0.2
@@ -222,45 +220,34 @@ def test_a_link_out_of_the_directory_is_not_followed(tmp_path: Path) -> None:
         read_results(tmp_path / "there")
 
 
-def many(directory: Path, count: int) -> ReadResults:
-    plan = EvaluationPlan(
-        tasks=(EvaluatedTask("T-v0", "T"),), policy="zero", seeds=(0,), episodes=count
-    )
+def test_many_episodes_need_little_memory(tmp_path: Path) -> None:
+    """A hundred bytes each at most, so that a million fit into 100 MB."""
+    count = 20_000
     written(
-        directory,
-        plan=plan,
+        tmp_path,
+        plan=dataclasses.replace(
+            PLAN, tasks=(EvaluatedTask("T-v0", "T"),), seeds=(0,), episodes=count
+        ),
         results=[],
         summaries=[TaskSummary(task="T-v0", runs=1, episodes=count)],
         selection={},
     )
-    with (
-        (directory / "results.csv").open("a") as results,
-        (directory / "timing.csv").open("a") as timing,
-    ):
-        for n in range(count):
-            results.write(f"T-v0,0,{n},{n / 7!r},1000,false,true,,\n")
-            timing.write(f"T-v0,0,{n},1790000000.{n},0.5,0.worker,{n},,,\n")
-    return read_results(directory)
-
-
-def test_many_episodes_need_little_memory(tmp_path: Path) -> None:
-    """A hundred bytes each at most, so that a million fit into 100 MB."""
+    rows = {
+        "results": [f"T-v0,0,{n},{n / 7!r},1000,false,true,,\n" for n in range(count)],
+        "timing": [
+            f"T-v0,0,{n},1790000000.{n},0.5,0.worker,{n},,,\n" for n in range(count)
+        ],
+    }
+    for name, lines in rows.items():
+        with (tmp_path / f"{name}.csv").open("a") as file:
+            file.writelines(lines)
+    del rows, lines
     tracemalloc.start()
     try:
-        read = many(tmp_path, 20_000)
+        read = read_results(tmp_path)
         _, most = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert len(read.columns["T-v0"]) == 20_000
+    assert len(read.columns["T-v0"]) == count
     # 1 MB for what does not grow.
-    assert most < 20_000 * 150 + 1_000_000
-
-
-def test_the_results_are_json_that_every_reader_accepts(tmp_path: Path) -> None:
-    """No NaN, no Infinity."""
-
-    def refused(token: str) -> None:
-        raise AssertionError(token)
-
-    text = (written(tmp_path) / "results.json").read_text()
-    json.loads(text, parse_constant=refused)
+    assert most < count * 150 + 1_000_000

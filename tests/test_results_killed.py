@@ -14,23 +14,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from result_files import ENV_INFO, write_journal, write_saved
 from trajectories_by_hand import write_log
 
 import mjrec
 from mjrec.errors import UnreadableFile
-from mjrec.formats.journal import JournalEntry, JournalWriter
-from mjrec.formats.manifest import Manifest, write_manifest
-from mjrec.formats.stats_file import StatsFile, write_stats_file
-
-TESTS = Path(__file__).parent
-ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
 
 
 def killed(directory: Path, code: str, options: str) -> Path:
     """Record in a process that kills itself after `code`, which has `env`, `play`."""
     script = (
         "import os, sys\n"
-        f"sys.path.insert(0, {str(TESTS)!r})\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "import mjrec\n"
         "from conftest import Corridor, run_episodes as play\n"
         f"env = mjrec.Monitor(Corridor(), {str(directory)!r}, {options})\n"
@@ -46,7 +41,7 @@ def killed(directory: Path, code: str, options: str) -> Path:
 
 @pytest.fixture(scope="module")
 def killed_early(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory in which a monitor died in its fourth episode, without manifest."""
+    """A monitor died in its fourth episode, without manifest."""
     return killed(
         tmp_path_factory.mktemp("early"),
         "play(env, 2, seed=5); env.set_monitor_mode('evaluation'); play(env, 1)\n"
@@ -57,7 +52,7 @@ def killed_early(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def killed_late(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One in which a monitor died after its fifth episode; its manifest has four."""
+    """A monitor died after its fifth episode; its manifest has four."""
     return killed(
         tmp_path_factory.mktemp("late"),
         "play(env, 5)",
@@ -88,55 +83,17 @@ def only(directory: Path, pattern: str) -> Path:
     return path
 
 
-def entry(episode_id: int, end_time: float | None = None) -> JournalEntry:
-    return JournalEntry(
-        episode_id=episode_id,
-        length=10 + episode_id,
-        reward=float(episode_id),
-        type="t",
-        start_time=99.5 + episode_id,
-        end_time=100.0 + episode_id if end_time is None else end_time,
-        seed=episode_id,
-        options=None,
-        terminated=True,
-        truncated=False,
-    )
-
-
-def write_journal(directory: Path, infix: str, *numbers: int, **options: Any) -> Path:
-    path = directory / f"openaigym.episodes.{infix}.jsonl"
-    writer = JournalWriter(path, **options)
-    for number in numbers:
-        writer.append(entry(number))
-    writer.close()
-    return path
-
-
-def write_saved(
-    directory: Path, infix: str, *numbers: int, details: dict[str, Any] | None = None
-) -> Path:
-    """Write the manifest and the statistics of the episodes of these numbers."""
-    entries = [entry(number) for number in numbers]
-    stats = StatsFile(
-        initial_reset_timestamp=98.0,
-        timestamps=tuple(e.end_time for e in entries),
-        episode_lengths=tuple(e.length for e in entries),
-        episode_rewards=tuple(e.reward for e in entries),
-        episode_types=tuple(e.type for e in entries),
-    )
-    name = f"openaigym.episode_batch.{infix}.stats.json"
-    write_stats_file(directory / name, stats)
-    path = directory / f"openaigym.manifest.{infix}.manifest.json"
-    write_manifest(path, Manifest(name, (), ENV_INFO, details))
+def video(directory: Path, number: int) -> Path:
+    path = directory / f"openaigym.video.0.7.video{number:06d}.mp4"
+    path.touch()
     return path
 
 
 def test_a_journal_is_enough(early: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Of a monitor that left no manifest; the episode in flight does not count."""
+    """The episode in flight does not count."""
     results = load(early)
-    journal = only(early, "*.jsonl")
     assert not list(early.glob("*.json"))
-    assert results["manifests"] == [str(journal)]
+    assert results["manifests"] == [str(only(early, "*.jsonl"))]
     assert results["env_info"] == ENV_INFO
     assert results["data_sources"] == [0, 0, 0]
     assert results["episode_lengths"] == [3, 3, 3]
@@ -153,7 +110,7 @@ def test_a_journal_is_enough(early: Path, caplog: pytest.LogCaptureFixture) -> N
 def test_a_journal_cut_anywhere_gives_its_whole_episodes(
     early: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Whatever byte of the last line was the last to be written; the rest is said."""
+    """At any byte of the last line; each reader says what was left out."""
     journal = only(early, "*.jsonl")
     whole = journal.read_bytes()
     last = len(whole.splitlines(keepends=True)[-1])
@@ -163,12 +120,11 @@ def test_a_journal_cut_anywhere_gives_its_whole_episodes(
         count = 3 if missing <= 1 else 2
         assert load(early)["episode_lengths"] == [3] * count
         assert len(list(mjrec.iter_episodes(early))) == count
-        # Once by each of the two.
         assert len(caplog.records) == (2 if 1 < missing < last else 0)
 
 
 def test_an_older_manifest_does_not_hide_the_last_episodes(late: Path) -> None:
-    """Of a monitor with `write_upon_reset`: the journal has one more."""
+    """The journal has one more; finished videos are found, broken ones are not."""
     manifest = only(late, "*.manifest.json")
     saved = json.loads(only(late, "*.stats.json").read_text())
     results = load(late)
@@ -178,90 +134,59 @@ def test_an_older_manifest_does_not_hide_the_last_episodes(late: Path) -> None:
     assert results["manifests"] == [str(manifest)]
     assert results["initial_reset_timestamp"] == saved["initial_reset_timestamp"]
     assert [e.episode_id for e in mjrec.iter_episodes(late)] == [0, 1, 2, 3, 4]
-
-
-def test_resumed_monitors_are_merged_with_the_dead(
-    late: Path, make_corridor: Any, play: Any
-) -> None:
-    """Each once, and numbered on; closed ones by their statistics files."""
-    with mjrec.Monitor(
-        make_corridor(2), late, resume=True, video_callable=False
-    ) as env:
-        play(env, 2)
-    results = load(late)
-    assert results["episode_lengths"] == [3] * 5 + [2] * 2
-    assert len(results["manifests"]) == 2
-    by_source = [results["data_sources"].count(source) for source in (0, 1)]
-    assert sorted(by_source) == [2, 5]
-    numbers = [episode.episode_id for episode in mjrec.iter_episodes(late)]
-    assert sorted(numbers) == list(range(7))
-
-
-def test_finished_videos_of_a_killed_monitor_are_found(late: Path) -> None:
-    """With an older manifest and without one; broken ones are not among them."""
-    videos = load(late)["videos"]
-    assert [Path(video).name[-10:] for video, _ in videos] == [
-        "000000.mp4",
-        "000004.mp4",
-    ]
-    manifest = json.loads(only(late, "*.manifest.json").read_text())
-    assert [name for name, _ in manifest["videos"]] == [Path(videos[0][0]).name]
-    only(late, "*.manifest.json").unlink()
+    videos = results["videos"]
+    assert [Path(path).name[-10:] for path, _ in videos] == ["000000.mp4", "000004.mp4"]
+    listed = json.loads(manifest.read_text())["videos"]
+    assert [name for name, _ in listed] == [Path(videos[0][0]).name]
+    manifest.unlink()
     assert load(late)["videos"] == videos
     Path(videos[0][1]).write_text('{"broken": true}')
     assert load(late)["videos"] == videos[1:]
 
 
-def test_an_open_monitor_counts(tmp_path: Path, corridor: Any, play: Any) -> None:
-    """With what it has completed, as if it had died now."""
-    with mjrec.Monitor(corridor, tmp_path, video_callable=False) as env:
-        play(env, 2)
-        assert load(tmp_path)["episode_lengths"] == [3, 3]
-        assert load(tmp_path)["env_info"] == ENV_INFO
-    assert load(tmp_path)["episode_lengths"] == [3, 3]
+def test_an_archive_holds_the_videos_of_a_killed_monitor(late: Path) -> None:
+    """Not its journal: gym's archive is videos and their metadata."""
+    videos = load(late)["videos"]
+    archive = io.BytesIO()
+    mjrec.write_archive(videos, archive)
+    archive.seek(0)
+    with tarfile.open(fileobj=archive) as tar:
+        assert tar.getnames() == [
+            *(Path(name).name for pair in videos for name in pair),
+            "manifest.json",
+        ]
 
 
-def test_the_source_with_more_episodes_wins(tmp_path: Path) -> None:
-    """Never both; the statistics file where they are equal."""
-    write_saved(tmp_path, "0.7", 1, 2, 3)
-    journal = write_journal(tmp_path, "0.7", 3, 4)
-    assert load(tmp_path)["episode_lengths"] == [11, 12, 13]
-    journal.unlink()
-    write_journal(tmp_path, "0.7", 4, 5, 6)
-    assert load(tmp_path)["episode_lengths"] == [11, 12, 13]
-    journal.unlink()
-    write_journal(tmp_path, "0.7", 1, 2, 3, 4)
-    assert load(tmp_path)["episode_lengths"] == [11, 12, 13, 14]
-    assert load(tmp_path)["initial_reset_timestamps"] == [98.0]
-
-
-def test_a_number_written_twice_is_no_more_episodes(tmp_path: Path) -> None:
-    """A journal wins by episodes, not by lines."""
-    write_saved(tmp_path, "0.7", 1, 2, 3)
-    write_journal(tmp_path, "0.7", 1, 2, 2, 2, 2)
-    assert load(tmp_path)["episode_lengths"] == [11, 12, 13]
-
-
-def test_sources_are_in_the_order_of_their_manifests(tmp_path: Path) -> None:
-    """Be they there or not: each keeps its place in every list."""
-    last = write_saved(tmp_path, "2.7", 3)
-    first = write_saved(tmp_path, "0.7", 2)
-    middle = write_journal(tmp_path, "10.7", 1)
-    results = load(tmp_path)
-    assert results["manifests"] == [str(first), str(middle), str(last)]
-    assert results["data_sources"] == [1, 0, 2]
-    assert results["initial_reset_timestamps"] == [98.0, 100.5, 98.0]
-
-
-def test_a_closed_monitors_journal_is_not_looked_into(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_open_and_resumed_monitors_are_merged_with_the_dead(
+    late: Path, make_corridor: Any, play: Any
 ) -> None:
-    """For the statistics; there may be a million lines of it."""
-    write_saved(tmp_path, "0.7", 1, 2)
-    journal = write_journal(tmp_path, "0.7", 1)
-    journal.write_bytes(journal.read_bytes() + b"damaged\n")
-    monkeypatch.delattr("mjrec.results.sources.JournalReader")
-    assert load(tmp_path)["episode_lengths"] == [11, 12]
+    """Each once, and numbered on; an open one as if it had died now."""
+    with mjrec.Monitor(
+        make_corridor(2), late, resume=True, video_callable=False
+    ) as env:
+        play(env, 2)
+        opened = load(late)
+    closed = load(late)
+    for results in (opened, closed):
+        assert results["episode_lengths"] == [3] * 5 + [2] * 2
+        assert len(results["manifests"]) == 2
+        by_source = [results["data_sources"].count(source) for source in (0, 1)]
+        assert sorted(by_source) == [2, 5]
+    numbers = [episode.episode_id for episode in mjrec.iter_episodes(late)]
+    assert sorted(numbers) == list(range(7))
+
+
+@pytest.mark.parametrize(
+    ("journal", "count"), [((3, 4), 3), ((4, 5, 6), 3), ((1, 2, 3, 4), 4)]
+)
+def test_the_source_with_more_episodes_wins(
+    tmp_path: Path, journal: tuple[int, ...], count: int
+) -> None:
+    """Never both; the statistics file where they are equal. Lines do not count."""
+    write_saved(tmp_path, "0.7", 1, 2, 3)
+    write_journal(tmp_path, "0.7", *journal, *journal[-1:] * 4)
+    assert load(tmp_path)["episode_lengths"] == [11, 12, 13, 14][:count]
+    assert load(tmp_path)["initial_reset_timestamps"] == [98.0]
 
 
 @pytest.mark.parametrize("witness", ["journal", "lock", "log", "metadata"])
@@ -282,26 +207,24 @@ def test_without_a_manifest_something_else_says_what_was_recorded(
     assert load(tmp_path)["env_info"] == ENV_INFO
 
 
-@pytest.mark.parametrize("lock", ["", "[1]", '{"env_info": {"env_id": 7}}', "\0" * 9])
-def test_what_nobody_says_is_left_out(
-    tmp_path: Path, lock: str, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    "lock", ["", "[1]", '{"env_info": {"env_id": 7}}', "\0" * 9, None]
+)
+def test_what_no_file_says_is_left_out(
+    tmp_path: Path, lock: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """And is no difference from what others say."""
+    """It is no difference from what others say; no link in place of a lock is read."""
     write_journal(tmp_path, "0.7", 1)
-    (tmp_path / ".openaigym.0.7.lock").write_text(lock)
+    path = tmp_path / ".openaigym.0.7.lock"
+    if lock is None:
+        (tmp_path / "secret").write_text(json.dumps({"env_info": ENV_INFO}))
+        path.symlink_to("secret")
+    else:
+        path.write_text(lock)
     assert load(tmp_path)["env_info"] == {"gym_version": "mjrec-1"}
     write_saved(tmp_path, "1.7", 2)
     assert load(tmp_path)["env_info"] == ENV_INFO
     assert not caplog.records
-
-
-def test_a_link_in_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
-    """A directory may come from anybody."""
-    write_journal(tmp_path, "0.7", 1)
-    secret = tmp_path / "secret"
-    secret.write_text(json.dumps({"env_info": ENV_INFO}))
-    (tmp_path / ".openaigym.0.7.lock").symlink_to(secret)
-    assert load(tmp_path)["env_info"] == {"gym_version": "mjrec-1"}
 
 
 @pytest.mark.parametrize("pattern", ["*.manifest.json", "*.stats.json"])
@@ -326,48 +249,33 @@ def test_a_journal_stands_in_for_damaged_files(
     if content is not None or "stats" in pattern:
         assert [damaged.name in r.getMessage() for r in caplog.records] == [True] * 2
         journal.unlink()
-        with pytest.raises(UnreadableFile, match=damaged.name):
-            mjrec.load_results(tmp_path)
-        with pytest.raises(UnreadableFile, match=damaged.name):
-            list(mjrec.iter_episodes(tmp_path))
+        for read in (mjrec.load_results, lambda path: list(mjrec.iter_episodes(path))):
+            with pytest.raises(UnreadableFile, match=damaged.name):
+                read(tmp_path)
 
 
-def test_statistics_stand_in_for_a_journal_that_cannot_be_read(
+def test_statistics_stand_in_for_a_damaged_journal(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Be it damaged as a whole, with every line."""
-    write_saved(tmp_path, "0.7", 1, 2, details={"first_episode_id": 1})
-    write_journal(tmp_path, "0.7").write_bytes(b"\xff\n" * 5000)
-    assert load(tmp_path)["episode_lengths"] == [11, 12]
-    assert "1000 lines" not in caplog.text
-    assert [e.length for e in mjrec.iter_episodes(tmp_path)] == [11, 12]
-
-
-def test_a_journal_that_cannot_be_read_is_named(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """With statistics beside it in a warning, once; without them in the error."""
+    """With every line damaged; then a link, which is named and never followed."""
     details = {"first_episode_id": 1, "next_episode_id": 3}
     manifest = write_saved(tmp_path, "0.7", 1, 2, details=details)
-    (tmp_path / "openaigym.trajectory.0.7.episode000001.h5").touch()
-    journal = tmp_path / "openaigym.episodes.0.7.jsonl"
-    # Nothing outside of the directory is read for it.
+    journal = write_journal(tmp_path, "0.7")
+    journal.write_bytes(b"\xff\n" * 5000)
+    assert load(tmp_path)["episode_lengths"] == [11, 12]
+    assert [e.length for e in mjrec.iter_episodes(tmp_path)] == [11, 12]
+    caplog.clear()
+    journal.unlink()
     journal.symlink_to("/proc/self/status")
     assert load(tmp_path)["episode_lengths"] == [11, 12]
-    (record,) = caplog.records
-    assert f"{journal}: it is a link" in record.getMessage()
     assert [e.length for e in mjrec.iter_episodes(tmp_path)] == [11, 12]
-    assert len(caplog.records) == 2
+    said = [f"{journal}: it is a link" in each.getMessage() for each in caplog.records]
+    assert said == [True, True]
     manifest.unlink()
     only(tmp_path, "*.stats.json").unlink()
     for read in (mjrec.load_results, lambda path: list(mjrec.iter_episodes(path))):
         with pytest.raises(UnreadableFile, match="out of its directory"):
             read(tmp_path)
-
-
-def numbers(directory: Path) -> list[tuple[int, int | None]]:
-    """Return each episode's number and seed."""
-    return [(e.episode_id, e.seed) for e in mjrec.iter_episodes(directory)]
 
 
 @pytest.mark.parametrize("lost", [0, 1, 3])
@@ -381,41 +289,42 @@ def test_a_lost_line_of_a_journal_costs_its_details_only(
     lines = journal.read_bytes().splitlines(keepends=True)
     lines[lost] = b"\0" * 100 + b"\n"
     journal.write_bytes(b"".join(lines))
-    video = tmp_path / f"openaigym.video.0.7.video00000{5 + lost}.mp4"
-    video.touch()
-    expected: list[tuple[int, int | None]] = [(n, n) for n in (5, 6, 7, 8)]
+    shown = video(tmp_path, 5 + lost)
+    expected: list[Any] = [(n, n) for n in (5, 6, 7, 8)]
     expected[lost] = (5 + lost, None)
-    assert numbers(tmp_path) == expected
-    episode = list(mjrec.iter_episodes(tmp_path))[lost]
-    assert (episode.length, episode.video) == (15 + lost, video)
+    episodes = list(mjrec.iter_episodes(tmp_path))
+    assert [(each.episode_id, each.seed) for each in episodes] == expected
+    assert (episodes[lost].length, episodes[lost].video) == (15 + lost, shown)
 
 
-def test_a_number_that_is_lost_shows_no_other_episodes_video(tmp_path: Path) -> None:
-    """Episode 6 or 7 was reset in mid-episode; nobody knows which."""
-    write_saved(tmp_path, "0.7", 5, 7, 8, details={"next_episode_id": 9})
-    write_journal(tmp_path, "0.7", 5, 8)
-    for number in (6, 7):
-        (tmp_path / f"openaigym.video.0.7.video00000{number}.mp4").touch()
-    assert numbers(tmp_path) == [(5, 5), (6, None), (8, 8)]
-    assert [e.video for e in mjrec.iter_episodes(tmp_path)] == [None] * 3
-
-
-def test_a_lost_journal_leaves_numbers_where_there_is_no_doubt(tmp_path: Path) -> None:
-    """Where every number of the monitor was completed."""
-    details = {"first_episode_id": 5, "next_episode_id": 7}
-    write_saved(tmp_path, "0.7", 5, 6, details=details)
-    video = tmp_path / "openaigym.video.0.7.video000005.mp4"
-    video.touch()
-    assert numbers(tmp_path) == [(5, None), (6, None)]
-    assert [e.video for e in mjrec.iter_episodes(tmp_path)] == [video, None]
-    write_saved(tmp_path, "0.7", 5, 6, details=details | {"next_episode_id": 8})
-    assert [e.video for e in mjrec.iter_episodes(tmp_path)] == [None, None]
+@pytest.mark.parametrize(
+    ("saved", "journal", "following", "numbers", "shown"),
+    [
+        # Episode 6 or 7 was reset in mid-episode; nothing says which.
+        ((5, 7, 8), (5, 8), 9, [5, 6, 8], [True, False, True]),
+        # The journal is lost, and every number was completed; then not every one.
+        ((5, 6), (), 7, [5, 6], [True, True]),
+        ((5, 6), (), 8, [5, 6], [False, False]),
+    ],
+)
+def test_an_episode_in_doubt_shows_no_video(
+    tmp_path: Path, saved: Any, journal: Any, following: int, numbers: Any, shown: Any
+) -> None:
+    """Where its number is lost, and it may be that of another."""
+    details = {"first_episode_id": 5, "next_episode_id": following}
+    write_saved(tmp_path, "0.7", *saved, details=details)
+    if journal:
+        write_journal(tmp_path, "0.7", *journal)
+    for number in range(5, 9):
+        video(tmp_path, number)
+    episodes = list(mjrec.iter_episodes(tmp_path))
+    assert [each.episode_id for each in episodes] == numbers
+    assert [each.video is not None for each in episodes] == shown
 
 
 def test_the_episode_that_outlived_the_manifest_is_pending(tmp_path: Path) -> None:
-    """It had begun when the manifest was written, and was no promise yet."""
-    details = {"next_episode_id": 3, "pending": []}
-    write_saved(tmp_path, "0.7", 0, 1, details=details)
+    """It had begun when the manifest was written, and was not pending yet."""
+    write_saved(tmp_path, "0.7", 0, 1, details={"next_episode_id": 3, "pending": []})
     write_journal(tmp_path, "0.7", 0, 1, 2)
     for number in range(3):
         name = f"openaigym.trajectory.0.7.episode00000{number}.h5"
@@ -433,32 +342,3 @@ def test_a_journal_alone_is_a_monitors(tmp_path: Path, corridor: Any) -> None:
         mjrec.Monitor(corridor, tmp_path, video_callable=False)
     with mjrec.Monitor(corridor, tmp_path, video_callable=False, force=True):
         assert not journal.exists()
-
-
-def test_clearing_removes_first_what_lists_the_rest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """If it is interrupted, no results are left without their files."""
-    write_saved(tmp_path, "0.7", 1)
-    write_journal(tmp_path, "1.7", 1)
-    (tmp_path / "openaigym.episode_batch.1.7.stats.json").touch()
-    removed: list[str] = []
-    monkeypatch.setattr(
-        Path, "unlink", lambda path, missing_ok: removed.append(path.name)
-    )
-    mjrec.clear_monitor_files(tmp_path)
-    assert {name.split(".")[1] for name in removed[:2]} == {"manifest", "episodes"}
-    assert len(removed) == 4
-
-
-def test_an_archive_holds_the_videos_of_a_killed_monitor(late: Path) -> None:
-    """Not its journal: gym's archive is videos and their metadata."""
-    videos = load(late)["videos"]
-    archive = io.BytesIO()
-    mjrec.write_archive(videos, archive)
-    archive.seek(0)
-    with tarfile.open(fileobj=archive) as tar:
-        assert tar.getnames() == [
-            *(Path(name).name for pair in videos for name in pair),
-            "manifest.json",
-        ]

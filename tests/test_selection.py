@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from mjrec.errors import InvalidArgument, UnknownName
 from mjrec.recorder.selection import (
-    UNDECIDED,
     Selection,
     Standing,
     selection_from,
@@ -62,13 +61,6 @@ def chosen(keep: Any, episodes: Sequence[FinishedEpisode]) -> list[int]:
     return selection.chosen
 
 
-def worse(one: FinishedEpisode, other: FinishedEpisode) -> bool:
-    """Tell whether a return is worse, as a person would say it."""
-    if math.isnan(other.reward):
-        return False
-    return math.isnan(one.reward) or one.reward < other.reward
-
-
 # Few different ones, so that there are ties.
 some_rewards = st.lists(
     st.sampled_from([0.0, -0.0, 1.0, -2.5, 7.25, math.nan, math.inf, -math.inf]),
@@ -82,54 +74,20 @@ def with_rewards(rewards: Sequence[float]) -> list[FinishedEpisode]:
 
 
 @given(some_rewards, st.integers(1, 5))
-def test_worst_are_those_with_fewer_than_n_before_them(
-    rewards: list[float], count: int
-) -> None:
-    """Before an episode stand the worse ones, and the earlier of equal ones."""
+def test_returns_are_ranked(rewards: list[float], count: int) -> None:
+    """NaN is the worst; of equal ones the earlier counts; the median is the lower."""
     episodes = with_rewards(rewards)
-    assert chosen(f"worst:{count}", episodes) == [
-        this.episode_id
-        for this in episodes
-        if sum(
-            worse(other, this)
-            or (not worse(this, other) and other.episode_id < this.episode_id)
-            for other in episodes
-        )
-        < count
-    ]
-
-
-@given(some_rewards, st.integers(1, 5))
-def test_best_are_those_with_fewer_than_n_before_them(
-    rewards: list[float], count: int
-) -> None:
-    """The same, the other way round; NaN is still the worst."""
-    episodes = with_rewards(rewards)
-    assert chosen(f"best:{count}", episodes) == [
-        this.episode_id
-        for this in episodes
-        if sum(
-            worse(this, other)
-            or (not worse(other, this) and other.episode_id < this.episode_id)
-            for other in episodes
-        )
-        < count
-    ]
-
-
-@given(some_rewards)
-def test_median_is_the_first_episode_in_the_lower_middle(rewards: list[float]) -> None:
-    """At most half of the others are worse, and fewer than half are better."""
-    episodes = with_rewards(rewards)
-    half = (len(episodes) - 1) // 2
-    middle = [
-        this.episode_id
-        for this in episodes
-        if sum(worse(other, this) for other in episodes)
-        <= half
-        < len(episodes) - sum(worse(this, other) for other in episodes)
-    ]
-    assert chosen("median", episodes) == middle[:1]
+    # Python's sort is stable, and so is it in reverse.
+    known = {e.episode_id: not math.isnan(e.reward) for e in episodes}
+    rank = {e.episode_id: (known[e.episode_id], e.reward) for e in episodes}
+    rank |= {number: (False, 0.0) for number in known if not known[number]}
+    worst = sorted(rank, key=lambda number: rank[number])
+    best = sorted(rank, key=lambda number: rank[number], reverse=True)
+    assert chosen(f"worst:{count}", episodes) == sorted(worst[:count])
+    assert chosen(f"best:{count}", episodes) == sorted(best[:count])
+    middle = [rank[number] for number in worst][(len(worst) - 1) // 2 :][:1]
+    first = [number for number in rank if rank[number] in middle][:1]
+    assert chosen("median", episodes) == first
 
 
 @given(
@@ -151,6 +109,10 @@ def test_failures_are_what_the_environment_calls_so(
     ]
     assert chosen("failures", episodes) == failed
     assert chosen(f"failures:{most}", episodes) == failed[:most]
+    # At the end of each, so that after the last nothing is recorded any more.
+    selection = told(f"failures:{most}", episodes)
+    assert selection.chosen == failed[:most]
+    assert selection.is_full == (len(failed) >= most)
 
 
 @given(some_rewards, st.integers(1, 3), st.sampled_from(["best", "worst"]))
@@ -184,19 +146,7 @@ def test_an_episode_may_be_told_of_twice(rewards: list[float], rule: str) -> Non
     assert chosen(rule, twice) == chosen(rule, episodes)
 
 
-def test_failures_are_decided_at_once() -> None:
-    """And after the last of so many nothing can be chosen any more."""
-    selection = selection_from("failures:1")
-    selection.add(episode(0, terminated=False))
-    assert selection.standing(0) is Standing.DROPPED
-    assert not selection.is_full
-    selection.add(episode(1))
-    assert selection.standing(1) is Standing.CHOSEN
-    assert selection.is_full
-    assert selection.chosen == [1]
-
-
-def test_function_gets_the_finished_episodes() -> None:
+def test_a_function_gets_the_finished_episodes() -> None:
     """All of them, in their order, once; NumPy's numbers will do."""
     calls = []
 
@@ -205,9 +155,7 @@ def test_function_gets_the_finished_episodes() -> None:
         return np.array([4, 0])
 
     selection = told(longest, [episode(k) for k in range(5)])
-    assert selection.name == f"{test_function_gets_the_finished_episodes.__name__}" + (
-        ".<locals>.longest"
-    )
+    assert selection.name.endswith("finished_episodes.<locals>.longest")
     assert {selection.standing(k) for k in range(5)} == {Standing.CANDIDATE}
     selection.close()
     selection.close()
@@ -217,7 +165,6 @@ def test_function_gets_the_finished_episodes() -> None:
 
 
 def no_function(episodes: Sequence[FinishedEpisode]) -> Any:
-    """Raise."""
     raise ZeroDivisionError("of the user")
 
 
@@ -233,7 +180,7 @@ def no_function(episodes: Sequence[FinishedEpisode]) -> Any:
         (lambda episodes: episodes[:1], "TypeError"),
     ],
 )
-def test_function_that_cannot_choose_is_named(
+def test_a_function_that_cannot_choose_is_named(
     keep: Callable[..., Any], what: str
 ) -> None:
     """And nothing is decided, so that nothing needs to be deleted."""
@@ -244,48 +191,34 @@ def test_function_that_cannot_choose_is_named(
     assert selection.undecided == 3
 
 
-@pytest.mark.parametrize("rule", ["worst:2", "best:1", "failures", "median"])
-def test_without_episodes_nothing_is_chosen(rule: str) -> None:
-    """A run may be closed before anything has finished."""
-    assert chosen(rule, []) == []
-
-
-@pytest.mark.parametrize("keep", ["wurst:3", "", "median:2", "best-3", ":3", "all"])
-def test_unknown_rule_is_told_which_there_are(keep: str) -> None:
-    """The names as they are to be written."""
-    with pytest.raises(UnknownName, match=r"best:N, worst:N, failures.* median"):
-        selection_from(keep)
-
-
 @pytest.mark.parametrize(
-    "keep",
-    ["worst", "worst:", "worst:0", "best:-1", "best:x", "failures:0", "worst:1.5"],
+    ("keeps", "error", "what"),
+    [
+        (
+            ["wurst:3", "", "median:2", "best-3", ":3", "all", "undecided"],
+            UnknownName,
+            r"best:N, worst:N, failures.* median",
+        ),
+        (
+            [
+                "worst",
+                "worst:",
+                "worst:0",
+                "best:-1",
+                "best:x",
+                "failures:0",
+                "worst:1.5",
+            ],
+            InvalidArgument,
+            "1 or more",
+        ),
+        ([3, True, ["worst:3"], b"worst:3"], InvalidArgument, "must be one of best:N"),
+    ],
 )
-def test_rule_without_a_number_of_episodes(keep: str) -> None:
-    """The error says where it stands."""
-    with pytest.raises(InvalidArgument, match="1 or more"):
-        selection_from(keep)
-
-
-@pytest.mark.parametrize("keep", [3, True, ["worst:3"], b"worst:3"])
-def test_what_is_neither_text_nor_function(keep: Any) -> None:
-    """Is an error that lists the rules."""
-    with pytest.raises(InvalidArgument, match="must be one of best:N"):
-        selection_from(keep)
-
-
-def test_what_is_decided_elsewhere_stays_open() -> None:
-    """All are candidates, also when there are no more."""
-    episodes = [episode(number, float(number)) for number in range(3)]
-    selection = told(UNDECIDED, episodes)
-    selection.close()
-    assert selection.is_left_open
-    assert selection.undecided == 3
-    assert {selection.standing(n) for n in range(3)} == {Standing.CANDIDATE}
-    assert selection.chosen == []
-
-
-def test_no_text_of_a_users_leaves_it_open() -> None:
-    """Whoever gives a rule gets a decision."""
-    with pytest.raises(UnknownName):
-        selection_from("undecided")
+def test_what_is_no_rule_is_an_error(
+    keeps: list[Any], error: type[Exception], what: str
+) -> None:
+    """It lists the rules as they are to be written."""
+    for keep in keeps:
+        with pytest.raises(error, match=what):
+            selection_from(keep)

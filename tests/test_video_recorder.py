@@ -6,7 +6,6 @@ import logging
 import re
 from fractions import Fraction
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -20,8 +19,7 @@ from mjrec import InvalidArgument, VideoRecorder
 
 def metadata_of(recorder: VideoRecorder) -> dict[str, Any]:
     assert recorder.metadata_path is not None
-    content: dict[str, Any] = json.loads(Path(recorder.metadata_path).read_text())
-    return content
+    return dict(json.loads(Path(recorder.metadata_path).read_text()))
 
 
 def record(recorder: VideoRecorder, env: Any, steps: int) -> dict[str, Any]:
@@ -34,147 +32,130 @@ def record(recorder: VideoRecorder, env: Any, steps: int) -> dict[str, Any]:
     return metadata_of(recorder)
 
 
-class Pictures:
-    """Gives a list of things as pictures."""
+def rate_in(recorder: VideoRecorder) -> Fraction | None:
+    with av.open(str(recorder.path)) as container:
+        return container.streams.video[0].average_rate
+
+
+class Frames:
+    """Gives a list of things as frames."""
 
     render_mode = "rgb_array"
-    metadata = {"render_fps": 5}  # noqa: RUF012  as environments have it
 
-    def __init__(self, *pictures: Any) -> None:
-        self.pictures = list(pictures)
+    def __init__(self, *frames: Any, **metadata: Any) -> None:
+        self.frames = list(frames)
+        self.metadata = metadata
 
     def render(self) -> Any:
-        return self.pictures.pop(0)
+        frame = self.frames.pop(0)
+        if isinstance(frame, Exception):
+            raise frame
+        return frame
 
 
-def picture(height: int = 8, width: int = 10) -> Any:
-    return np.full((height, width, 3), 90, np.uint8)
+def grey(brightness: int = 90) -> Any:
+    return np.full((8, 10, 3), brightness, np.uint8)
 
 
-def picture_of(number: int) -> Any:
-    return np.full((16, 16, 3), 25 * number, np.uint8)
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "v.mp4"
 
 
-def number_of(frame: Any) -> int:
-    return round(float(frame.mean()) / 25)
-
-
-def test_every_capture_is_a_frame(corridor: Any, tmp_path: Path) -> None:
-    """The reset's frame and the last one are in the file, in order."""
-    recorder = VideoRecorder(corridor, tmp_path / "v.mp4")
+def test_every_capture_is_a_frame(corridor: Any, path: Path) -> None:
+    """The reset's and the last one are in the file, in order; nothing comes later."""
+    given = {"episode_id": 1}
+    recorder = VideoRecorder(corridor, path, given)
     metadata = record(recorder, corridor, 3)
+    recorder.capture_frame()
+    recorder.close()
     shown = [int((frame[0, :, 0] > 128).sum()) for frame in frames_of(recorder.path)]
     assert shown == [4, 8, 12, 16]
-    assert metadata["frame_count"] == 4
-    assert metadata["frame_steps"] == [[0, 3]]
+    assert (metadata["frame_count"], metadata["frame_steps"]) == (4, [[0, 3]])
     assert metadata["content_type"] == "video/mp4"
     assert recorder.functional
     assert not recorder.empty
-
-
-def test_metadata_has_gyms_encoder_keys(corridor: Any, tmp_path: Path) -> None:
-    """Backend, version and command line; no absolute path that a move makes stale."""
-    metadata = record(VideoRecorder(corridor, tmp_path / "v.mp4"), corridor, 1)
+    # gym's keys; no absolute path that a move makes stale.
     encoder = metadata["encoder_version"]
     assert encoder["backend"] == "ffmpeg"
     assert encoder["version"].startswith("ffmpeg version")
     assert encoder["cmdline"][-1] == "v.mp4"
+    assert given == {"episode_id": 1}
 
 
-def test_rate_is_the_simulated_time_of_a_step(halfcheetah: Any, tmp_path: Path) -> None:
-    """HalfCheetah steps 0.05 s, so its video has 20 frames a second."""
-    metadata = record(VideoRecorder(halfcheetah, tmp_path / "v.mp4"), halfcheetah, 2)
-    assert metadata["fps"] == "20"
-    assert metadata["timestep"] == "1/20"
-    assert metadata["playback_speed"] == 1.0
+class Repeat(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Repeats actions, which makes the step longer, whatever is declared."""
+
+    def step(self, action: Any) -> Any:
+        self.env.step(action)
+        return self.env.step(action)
 
 
-def test_rate_is_right_above_action_repeat(halfcheetah: Any, tmp_path: Path) -> None:
-    """A wrapper that repeats actions makes the step longer, whatever is declared."""
-
-    class Repeat(gymnasium.Wrapper[Any, Any, Any, Any]):
-        def step(self, action: Any) -> Any:
-            self.env.step(action)
-            return self.env.step(action)
-
-    env = Repeat(halfcheetah)
-    assert record(VideoRecorder(env, tmp_path / "v.mp4"), env, 2)["fps"] == "10"
-
-
-def test_rate_that_is_no_whole_number_is_exact(tmp_path: Path) -> None:
-    """Humanoid's 0.015 s are 200/3 frames a second, also in the file."""
-    env = gymnasium.make("Humanoid-v5", render_mode="rgb_array", width=32, height=32)
-    recorder = VideoRecorder(env, tmp_path / "v.mp4")
-    assert record(recorder, env, 2)["fps"] == "200/3"
-    with av.open(str(recorder.path)) as container:
-        assert container.streams.video[0].average_rate == Fraction(200, 3)
-    env.close()
-
-
-def test_rate_without_simulation_is_the_declared_one(
-    corridor: Any, tmp_path: Path
+@pytest.mark.parametrize(
+    ("env_id", "wrapper", "options", "fps", "speed"),
+    [
+        ("HalfCheetah-v5", None, {}, "20", 1.0),
+        ("HalfCheetah-v5", Repeat, {}, "10", 1.0),
+        ("Humanoid-v5", None, {}, "200/3", 1.0),
+        # `fps` is written, and selects no frames.
+        ("HalfCheetah-v5", None, {"fps": 10}, "10", 0.5),
+    ],
+)
+def test_rate_is_the_simulated_time_of_a_step(
+    *, env_id: str, wrapper: Any, options: Any, fps: str, speed: float, path: Path
 ) -> None:
-    """`render_fps` counts where no simulated time is to be seen."""
-    assert (
-        record(VideoRecorder(corridor, tmp_path / "v.mp4"), corridor, 2)["fps"] == "10"
-    )
+    """Exact, also in the file."""
+    env: Any = gymnasium.make(env_id, render_mode="rgb_array", width=32, height=32)
+    env = wrapper(env) if wrapper else env
+    recorder = VideoRecorder(env, path, **options)
+    metadata = record(recorder, env, 2)
+    env.close()
+    assert (metadata["fps"], metadata["playback_speed"]) == (fps, speed)
+    assert metadata["frame_count"] == 3
+    assert rate_in(recorder) == Fraction(fps)
+    if env_id == "HalfCheetah-v5" and wrapper is None:
+        assert metadata["timestep"] == "1/20"
+
+
+@pytest.mark.parametrize(("steps", "frames"), [(2, 3), (0, 1)])
+def test_rate_without_simulation_is_the_declared_one(
+    corridor: Any, path: Path, steps: int, frames: int
+) -> None:
+    """Also of a single frame, which is a video."""
+    recorder = VideoRecorder(corridor, path)
+    assert record(recorder, corridor, steps)["fps"] == "10"
+    assert len(frames_of(recorder.path)) == frames
 
 
 def test_nothing_declared_is_30_and_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The warning names the argument that chooses."""
-    source = Pictures(picture(), picture())
-    source.metadata = {}
-    recorder = VideoRecorder(source, tmp_path / "v.mp4")
-    recorder.capture_frame()
-    recorder.capture_frame()
-    recorder.close()
+    with VideoRecorder(Frames(grey(), grey()), path) as recorder:
+        recorder.capture_frame()
+        recorder.capture_frame()
+    assert recorder.finished
     assert metadata_of(recorder)["fps"] == "30"
     assert "fps=" in caplog.text
 
 
-def test_fps_is_written_and_selects_nothing(halfcheetah: Any, tmp_path: Path) -> None:
-    """Every frame is there, played at half the speed."""
-    recorder = VideoRecorder(halfcheetah, tmp_path / "v.mp4", fps=10)
-    metadata = record(recorder, halfcheetah, 3)
-    assert metadata["frame_count"] == 4
-    assert metadata["playback_speed"] == 0.5
-
-
-@pytest.mark.parametrize("fps", [0, -1, float("nan"), True, "30"])
-def test_impossible_fps_is_an_error(corridor: Any, tmp_path: Path, fps: Any) -> None:
-    """At construction, before anything is written."""
-    with pytest.raises(InvalidArgument, match="fps must be"):
-        VideoRecorder(corridor, tmp_path / "v.mp4", fps=fps)
-
-
-def test_single_frame_is_a_video(corridor: Any, tmp_path: Path) -> None:
-    """One capture is enough; the rate is then the declared one."""
-    recorder = VideoRecorder(corridor, tmp_path / "v.mp4")
-    assert record(recorder, corridor, 0)["fps"] == "10"
-    assert len(frames_of(recorder.path)) == 1
-
-
-def test_frame_list_is_drained_in_order(make_corridor: Any, tmp_path: Path) -> None:
+def test_a_frame_list_is_drained_in_order(make_corridor: Any, path: Path) -> None:
     """All the frames of a step are recorded, and the rate fits them."""
     env = make_corridor(render_mode="rgb_array_list")
-    # Three pictures for each tenth of a second.
+    # Three frames for each tenth of a second.
     times = iter([0.0, 0.1, 0.2])
     shown = iter([[1, 2, 3], [4, 5, 6], [7, 8, 9]])
-    env.render = lambda: [picture_of(number) for number in next(shown)]
-    recorder = VideoRecorder(env, tmp_path / "v.mp4", clock=lambda: next(times))
+    env.render = lambda: [grey(25 * number) for number in next(shown)]
+    recorder = VideoRecorder(env, path, clock=lambda: next(times))
     metadata = record(recorder, env, 2)
-    recorded = [number_of(frame) for frame in frames_of(recorder.path)]
+    recorded = [round(float(frame.mean()) / 25) for frame in frames_of(recorder.path)]
     assert recorded == list(range(1, 10))
-    assert metadata["frame_count"] == 9
-    assert metadata["fps"] == "30"
+    assert (metadata["frame_count"], metadata["fps"]) == (9, "30")
     assert metadata["playback_speed"] == 1.0
-    with av.open(str(recorder.path)) as container:
-        assert container.streams.video[0].average_rate == 30
+    assert rate_in(recorder) == 30
 
 
-def test_text_environment_becomes_an_asciicast(
+def test_a_text_environment_becomes_an_asciicast(
     make_corridor: Any, tmp_path: Path
 ) -> None:
     """Frames of the mode ansi are text, shown at the declared rate."""
@@ -189,18 +170,23 @@ def test_text_environment_becomes_an_asciicast(
     assert cast["stdout"][0][0] == 0.1
 
 
-@pytest.mark.parametrize("mode", [None, "human", "depth_array"])
-def test_without_pictures_it_is_not_enabled(
-    make_corridor: Any, tmp_path: Path, mode: str | None
+@pytest.mark.parametrize(
+    ("mode", "enabled"),
+    [(None, True), ("human", True), ("depth_array", True), ("rgb_array", False)],
+)
+def test_a_recorder_without_frames_does_nothing(
+    make_corridor: Any, path: Path, mode: str | None, enabled: bool
 ) -> None:
-    """It then does nothing and leaves nothing, as in gym."""
-    recorder = VideoRecorder(make_corridor(render_mode=mode), tmp_path / "v.mp4")
+    """It leaves nothing, as in gym; none is drawn where it is not enabled."""
+    env = make_corridor(render_mode=mode)
+    recorder = VideoRecorder(env, path, enabled=enabled)
     recorder.capture_frame()
     recorder.close()
     assert not recorder.enabled
     assert not recorder.functional
     assert recorder.path is None
-    assert not list(tmp_path.iterdir())
+    assert env.rendered == 0
+    assert not list(path.parent.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -214,13 +200,11 @@ def test_without_pictures_it_is_not_enabled(
         ("text", "str"),
     ],
 )
-def test_bad_frame_keeps_the_good_ones(
-    tmp_path: Path, bad: Any, reason: str, caplog: pytest.LogCaptureFixture
+def test_a_bad_frame_keeps_the_good_ones(
+    path: Path, bad: Any, reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The video ends there, playable; one warning and the metadata say why."""
-    recorder = VideoRecorder(
-        Pictures(picture(), picture(), bad, picture(), bad), tmp_path / "v.mp4"
-    )
+    recorder = VideoRecorder(Frames(grey(), grey(120), bad, grey(), bad), path)
     for _ in range(5):
         recorder.capture_frame()
     recorder.close()
@@ -228,27 +212,28 @@ def test_bad_frame_keeps_the_good_ones(
     assert not recorder.functional
     assert len(frames_of(recorder.path)) == 2
     assert metadata_of(recorder)["broken"] is True
-    # That nothing moves in the two is another matter.
     told = [r for r in caplog.records if r.name == "mjrec.recorder.video_recorder"]
     [warning] = [r for r in told if r.levelno == logging.WARNING]
     assert re.search(reason, warning.getMessage())
 
 
-def test_bad_first_frame_leaves_no_video(tmp_path: Path) -> None:
+def test_a_bad_first_frame_leaves_no_video(path: Path) -> None:
     """The metadata says that it is broken and empty."""
-    recorder = VideoRecorder(Pictures(None), tmp_path / "v.mp4")
-    recorder.capture_frame()
-    recorder.close()
+    with VideoRecorder(Frames(None), path) as recorder:
+        recorder.capture_frame()
     assert recorder.empty
     metadata = metadata_of(recorder)
     assert metadata["broken"]
     assert metadata["empty"]
-    assert [p.name for p in tmp_path.iterdir()] == ["v.meta.json"]
+    assert [p.name for p in path.parent.iterdir()] == ["v.meta.json"]
 
 
-def test_no_frame_leaves_only_metadata(corridor: Any, tmp_path: Path) -> None:
-    """It says `empty`; a second close changes nothing."""
-    recorder = VideoRecorder(corridor, tmp_path / "v.mp4", {"episode_id": 3})
+def test_without_a_frame_there_is_only_metadata(path: Path) -> None:
+    """An error of render() is raised unchanged, and breaks nothing."""
+    recorder = VideoRecorder(Frames(RuntimeError("no GL")), path, {"episode_id": 3})
+    with pytest.raises(RuntimeError, match="no GL"):
+        recorder.capture_frame()
+    assert not recorder.broken
     recorder.close()
     recorder.close()
     assert recorder.empty
@@ -259,104 +244,47 @@ def test_no_frame_leaves_only_metadata(corridor: Any, tmp_path: Path) -> None:
     }
 
 
-def test_capture_after_close_does_nothing(corridor: Any, tmp_path: Path) -> None:
-    """The finished file stays as it is."""
-    recorder = VideoRecorder(corridor, tmp_path / "v.mp4")
-    record(recorder, corridor, 1)
-    recorder.capture_frame()
-    recorder.close()
-    assert len(frames_of(recorder.path)) == 2
-
-
-def test_reused_picture_array_is_copied(tmp_path: Path) -> None:
-    """An environment may draw every picture into the same array."""
-    shared = picture()
-
-    class Reusing:
-        render_mode = "rgb_array"
-        metadata = {"render_fps": 5}  # noqa: RUF012  as environments have it
-
-        def render(self) -> Any:
-            shared[:] = np.clip(shared + 60, 0, 255)
-            return shared
-
-    recorder = VideoRecorder(Reusing(), tmp_path / "v.mp4")
-    for _ in range(2):
+def test_a_reused_array_is_copied(path: Path) -> None:
+    """An environment may draw every frame into the same array."""
+    shared = grey(150)
+    with VideoRecorder(Frames(shared, shared), path) as recorder:
         recorder.capture_frame()
-    recorder.close()
-    first, second = frames_of(recorder.path)
-    assert abs(int(first.mean()) - 150) < 4
-    assert abs(int(second.mean()) - 210) < 4
-
-
-def test_error_of_render_is_raised_unchanged(tmp_path: Path) -> None:
-    """It is the environment's own and breaks nothing."""
-
-    def fail() -> None:
-        raise RuntimeError("no GL")
-
-    recorder = VideoRecorder(
-        SimpleNamespace(render_mode="rgb_array", render=fail), tmp_path / "v.mp4"
-    )
-    with pytest.raises(RuntimeError, match="no GL"):
+        shared[:] = 210
         recorder.capture_frame()
-    assert not recorder.broken
-    recorder.close()
-    assert metadata_of(recorder)["empty"]
+    means = [int(frame.mean()) for frame in frames_of(recorder.path)]
+    assert means == pytest.approx([150, 210], abs=4)
 
 
-def test_path_and_base_path_are_either_or(corridor: Any, tmp_path: Path) -> None:
-    """Both at once is an error."""
-    with pytest.raises(InvalidArgument, match="not both"):
-        VideoRecorder(corridor, tmp_path / "v.mp4", base_path=tmp_path / "v")
+@pytest.mark.parametrize(
+    ("mode", "options", "words"),
+    [
+        *(
+            ("rgb_array", {"path": "v.mp4", "fps": fps}, "fps must be")
+            for fps in (0, -1, float("nan"), True, "30")
+        ),
+        ("rgb_array", {"path": "v.mp4", "base_path": "v"}, "not both"),
+        ("rgb_array", {"path": "v.avi"}, r"end in \.mp4"),
+        ("ansi", {"path": "v.mp4"}, r"end in \.json"),
+    ],
+)
+def test_impossible_options_are_an_error(
+    make_corridor: Any, mode: str, options: dict[str, Any], words: str
+) -> None:
+    """At construction, before anything is written."""
+    with pytest.raises(InvalidArgument, match=words):
+        VideoRecorder(make_corridor(render_mode=mode), **options)
 
 
-def test_wrong_extension_is_an_error(make_corridor: Any, tmp_path: Path) -> None:
-    """The error says which it must be."""
-    with pytest.raises(InvalidArgument, match=r"end in \.json"):
-        VideoRecorder(make_corridor(render_mode="ansi"), tmp_path / "v.mp4")
-    with pytest.raises(InvalidArgument, match=r"end in \.mp4"):
-        VideoRecorder(make_corridor(), tmp_path / "v.avi")
-
-
-def test_without_a_path_it_makes_one(corridor: Any) -> None:
-    """A new temporary directory holds the video."""
-    recorder = VideoRecorder(corridor)
-    record(recorder, corridor, 1)
-    assert len(frames_of(recorder.path)) == 2
-
-
-def test_later_chdir_parts_nothing(
+def test_a_relative_path_is_fixed_and_a_missing_one_is_made(
     corridor: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Video and metadata go where the relative path pointed at first."""
+    """A later chdir parts nothing; without a path it is in a new directory."""
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path)
     recorder = VideoRecorder(corridor, "v.mp4")
     monkeypatch.chdir(tmp_path / "elsewhere")
     record(recorder, corridor, 1)
     assert {p.name for p in tmp_path.glob("v.*")} == {"v.mp4", "v.meta.json"}
-
-
-def test_with_closes(corridor: Any, tmp_path: Path) -> None:
-    """Leaving the block finishes the file."""
-    with VideoRecorder(corridor, tmp_path / "v.mp4") as recorder:
-        recorder.capture_frame()
-    assert recorder.finished
-    assert len(frames_of(recorder.path)) == 1
-
-
-def test_users_metadata_is_left_alone(corridor: Any, tmp_path: Path) -> None:
-    """The dictionary given is copied, not changed."""
-    given = {"episode_id": 1}
-    record(VideoRecorder(corridor, tmp_path / "v.mp4", given), corridor, 1)
-    assert given == {"episode_id": 1}
-
-
-def test_disabled_recorder_does_nothing(corridor: Any, tmp_path: Path) -> None:
-    """Not even a picture is drawn."""
-    recorder = VideoRecorder(corridor, tmp_path / "v.mp4", enabled=False)
-    recorder.capture_frame()
-    recorder.close()
-    assert corridor.rendered == 0
-    assert not list(tmp_path.iterdir())
+    recorder = VideoRecorder(corridor)
+    record(recorder, corridor, 1)
+    assert len(frames_of(recorder.path)) == 2

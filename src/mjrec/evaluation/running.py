@@ -102,7 +102,7 @@ def make_acting(evaluation: Evaluation, task: str, seed: int) -> Acting:
     )
     if "mujoco" in sys.modules:
         # Not at the top, because it loads MuJoCo, which not every task has.
-        from ..simulation.mujoco_warnings import log_mujoco_warnings
+        from ..simulation.warnings import log_mujoco_warnings
 
         log_mujoco_warnings()
     with _closing_on_error(named.environment):
@@ -392,7 +392,7 @@ def _warnings(environment: Any) -> dict[str, int]:
     if simulation is None:
         return {}
     # Not at the top, because it loads MuJoCo, which not every task has.
-    from ..simulation.warning_counts import warning_counts
+    from ..simulation.warnings import warning_counts
 
     return warning_counts(simulation)
 

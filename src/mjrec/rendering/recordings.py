@@ -38,8 +38,8 @@ from ..formats.monitor_directory import (
     video_lock_name,
     video_prefix,
 )
+from ..formats.trajectory import added_up
 from ..formats.trajectory_file import find_trajectory
-from ..formats.trajectory_reader import added_up
 from ..formats.video_metadata import is_done, metadata_path
 from .recorded_facts import (
     further_video_paths,

@@ -17,7 +17,7 @@ from ..errors import InvalidArgument, UnreadableFile
 from ..formats.in_flight import is_in_flight, list_paths, read_list
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
 from ..machine import usable_cpus
-from ..simulation.model_trust import trusting_all_models
+from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine, given_engine
 from .finish import bring_up_to_date, do_jobs
 from .jobs import Outcome, Variant, VideoJob
@@ -286,7 +286,7 @@ def _videos_of_variant(
 
 
 def _trusting(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
-    with trusting_all_models():
+    with trusting_models():
         yield from outcomes
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mjrec.errors import InvalidArgument
-from mjrec.simulation.model_fields import (
+from mjrec.simulation.fields import (
     apply_fields,
     array_names,
     read_fields,

@@ -19,15 +19,14 @@ import pytest
 from touch_grid import TOUCH_GRID
 
 from mjrec.errors import ClosedError, PicturesDiffer
-from mjrec.simulation.episode_states import EpisodeStates
-from mjrec.simulation.gathering import WORDS
-from mjrec.simulation.integration_state import STATE_SPEC
-from mjrec.simulation.model_fields import apply_fields
+from mjrec.simulation.capture import Capture, EpisodeStart
+from mjrec.simulation.fields import apply_fields
+from mjrec.simulation.layout import read_state
+from mjrec.simulation.memory import WORDS
 from mjrec.simulation.model_store import load_model
-from mjrec.simulation.scene_check import differences
-from mjrec.simulation.scene_view import SceneView, scene_view_from_facts
+from mjrec.simulation.self_check import differences
 from mjrec.simulation.snapshot import restore_snapshot
-from mjrec.simulation.state_source import EpisodeStart, StateSource
+from mjrec.simulation.view import SceneView, view_from_facts
 
 BALL = """
 <mujoco>
@@ -46,17 +45,16 @@ BALL = """
 
 
 class Simulation:
-    """What an environment has, and a recorder of its states."""
-
-    is_unmoved = False
+    """What an environment has, and what takes its states down."""
 
     def __init__(self, directory: Path, xml: str = BALL, **options: Any) -> None:
         self.camera, self.option = mujoco.MjvCamera(), mujoco.MjvOption()
         self.directory = directory
         self.fresh = options.pop("fresh", False)
+        self.is_unmoved = True
         self.compile(xml)
         mujoco.mjv_defaultFreeCamera(self.model, self.camera)
-        self.states = EpisodeStates(
+        self.states = Capture(
             lambda: (self.model, self.data), view=self.view, **options
         )
         self.states.open(directory)
@@ -86,146 +84,99 @@ class Simulation:
         self.row = np.zeros(self.start.snapshot.size, np.uint8)
         return self.start
 
+    def begin_scene(self) -> Any:
+        return self.begin().scene
+
     def capture(self) -> Any:
         return self.states.capture_snapshot(self.row)
 
+    def captured(self, name: str) -> Any:
+        return self.start.snapshot.unpack(self.row)[name]
+
+    def shown(self, flag: str) -> int:
+        """Show what a flag is for; return its number."""
+        index = int(mujoco.mjtVisFlag.__members__[f"mjVIS_{flag}"])
+        self.option.flags[index] = True
+        return index
+
 
 @pytest.fixture
-def simulation(tmp_path: Path) -> Iterator[Simulation]:
-    made = Simulation(tmp_path)
-    yield made
-    made.states.finish()
-    made.states.close()
+def new(tmp_path: Path) -> Iterator[Callable[..., Simulation]]:
+    made: list[Simulation] = []
+
+    def make(*args: Any, **options: Any) -> Simulation:
+        made.append(Simulation(tmp_path, *args, **options))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.states.finish()
+        each.states.close()
 
 
-def test_it_is_a_state_source(simulation: Simulation) -> None:
-    """Type checkers compare the signatures; this compares the names."""
-    source: StateSource = simulation.states
-    assert all(hasattr(source, n) for n in vars(StateSource) if not n.startswith("_"))
+@pytest.fixture
+def simulation(new: Callable[..., Simulation]) -> Simulation:
+    return new()
 
 
 def test_a_state_is_the_integration_state(simulation: Simulation) -> None:
-    """Byte for byte, its components by name."""
-    start = simulation.begin()
-    expected = np.empty(mujoco.mj_stateSize(simulation.model, STATE_SPEC))
+    """Byte for byte."""
+    simulation.begin()
     for _ in range(3):
         simulation.step()
-        state = np.empty_like(expected)
+        state = np.empty(len(read_state(simulation.model, simulation.data)))
         simulation.states.capture_state(state)
-        mujoco.mj_getState(simulation.model, simulation.data, expected, STATE_SPEC)
+        expected = read_state(simulation.model, simulation.data)
         assert state.tobytes() == expected.tobytes()
-    offsets = {component.name: component.offset for component in start.state}
-    assert expected[offsets["qpos"]] == simulation.data.qpos[0]
 
 
-@pytest.fixture
-def still(tmp_path: Path) -> Iterator[Simulation]:
-    """One that tells whether its view has moved."""
-    made = Simulation(tmp_path, is_unmoved=lambda: made.is_unmoved)
-    made.is_unmoved = True
-    yield made
-    made.states.finish()
-    made.states.close()
-
-
-def test_its_memory_holds_what_is_captured(still: Simulation) -> None:
-    """State and snapshot, for as long as nothing else has changed."""
-    memory = still.begin().memory
-    assert memory is not None
-    state = np.empty(mujoco.mj_stateSize(still.model, STATE_SPEC))
+def test_rows_can_be_gathered_while_only_the_state_changes(
+    new: Callable[..., Simulation],
+) -> None:
+    """State and snapshot; not once model, view or what `model_changed` says moved."""
+    still = new(is_unmoved=lambda: still.is_unmoved)
+    start = still.begin()
+    assert start.words is not None
     for _ in range(3):
         still.step()
-        assert memory.is_current()
-        row = WORDS.take(memory.words).tobytes()
-        still.states.capture_state(state)
+        assert start.is_current()
         assert still.capture() is None
-        assert row == state.tobytes() + still.row.tobytes()
-    assert still.begin().memory is not None
-
-
-def test_its_memory_is_not_current_while_anything_else_has_changed(
-    still: Simulation,
-) -> None:
-    """A field of the model, the view, or what `model_changed` says."""
-    memory = still.begin().memory
-    assert memory is not None
+        state = read_state(still.model, still.data).tobytes()
+        assert WORDS.take(start.words).tobytes() == state + still.row.tobytes()
     still.model.geom_rgba[0] = (1, 0, 0, 1)
-    assert not memory.is_current()
+    assert not start.is_current()
     assert list(still.capture()) == ["geom_rgba"]
-    assert memory.is_current()
+    assert start.is_current()
     still.is_unmoved = False
-    assert not memory.is_current()
+    assert not start.is_current()
     still.is_unmoved = True
-    assert memory.is_current()
     still.states.model_changed()
-    assert not memory.is_current()
+    assert not start.is_current()
+    assert still.begin().words is not None
 
 
-def test_there_is_no_such_memory_where_a_closer_look_is_needed(
+def test_rows_are_not_gathered_where_a_closer_look_is_needed(
     simulation: Simulation,
 ) -> None:
-    """Nobody tells here whether the view has moved."""
-    assert simulation.begin().memory is None
-
-
-def test_a_picture_follows_from_what_was_recorded(simulation: Simulation) -> None:
-    """The stored model, facts and a row give the scene of that moment."""
-    simulation.option.flags[int(mujoco.mjtVisFlag.mjVIS_INERTIA)] = True
-    simulation.model.geom_rgba[0] = (1, 0, 0, 1)
+    """Nothing tells here whether the view has moved."""
     start = simulation.begin()
-    simulation.step(7)
-    assert simulation.capture() is None
-    simulation.states.finish()
-    assert start.refusal is None
-    assert start.scene is not None
-    model = load_model(simulation.directory, start.model)
-    _check_scene(simulation, model, simulation.view(), start)
-
-
-def _check_scene(
-    simulation: Simulation,
-    model: mujoco.MjModel,
-    live_view: SceneView,
-    start: EpisodeStart,
-    fields: Any = (),
-) -> None:
-    assert start.scene is not None
-    view = scene_view_from_facts(start.scene)
-    apply_fields(model, dict(fields), camera=view.camera, option=view.option)
-    data = mujoco.MjData(model)
-    restore_snapshot(start.snapshot.unpack(simulation.row), model, data)
-    live = _scene(simulation.model, simulation.data, live_view)
-    again = _scene(model, data, view)
-    assert list(differences(live, again, view.option)) == []
-
-
-def _scene(
-    model: mujoco.MjModel, data: mujoco.MjData, view: SceneView
-) -> mujoco.MjvScene:
-    scene = mujoco.MjvScene(model, maxgeom=view.max_geom)
-    _update(scene, model, data, view)
-    return scene
-
-
-def _update(
-    scene: mujoco.MjvScene,
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    view: SceneView,
-) -> None:
-    mujoco.mjv_updateScene(model, data, view.option, None, view.camera, 7, scene)
+    assert (start.words, start.is_current()) == (None, False)
 
 
 def test_changes_of_model_and_view_are_told_once(simulation: Simulation) -> None:
-    """Colours, headlight, gravity, camera and option, at the next capture."""
+    """And the stored model, facts, a row and these changes give the scene."""
+    simulation.shown("INERTIA")
+    simulation.model.geom_rgba[0] = (1, 0, 0, 1)
     start = simulation.begin()
+    assert start.refusal is None
+    simulation.step(7)
     assert simulation.capture() is None
     simulation.model.site_rgba[0] = (0, 1, 0, 1)
     simulation.model.vis.headlight.ambient[:] = 0.5
     simulation.model.opt.gravity[2] = -1
     simulation.model.stat.extent = 3
     simulation.camera.lookat[0] = 2
-    simulation.option.flags[int(mujoco.mjtVisFlag.mjVIS_TRANSPARENT)] = True
+    simulation.shown("TRANSPARENT")
     changed = simulation.capture()
     assert changed.keys() == {
         *("site_rgba", "vis.headlight.ambient", "opt.gravity", "stat.extent"),
@@ -234,11 +185,26 @@ def test_changes_of_model_and_view_are_told_once(simulation: Simulation) -> None
     assert simulation.capture() is None
     simulation.states.finish()
     model = load_model(simulation.directory, start.model)
-    _check_scene(simulation, model, simulation.view(), start, changed)
+    assert start.scene is not None
+    view = view_from_facts(start.scene)
+    apply_fields(model, changed, camera=view.camera, option=view.option)
+    data = mujoco.MjData(model)
+    restore_snapshot(start.snapshot.unpack(simulation.row), model, data)
+    live = mujoco.MjvScene(simulation.model, maxgeom=100)
+    update(live, simulation.model, simulation.data, simulation.view())
+    again = mujoco.MjvScene(model, maxgeom=100)
+    update(again, model, data, view)
+    assert list(differences(live, again, view.option)) == []
 
 
-def test_a_texture_is_looked_at_when_somebody_says_so(simulation: Simulation) -> None:
-    """And at the next reset, without a word."""
+def update(scene: Any, model: Any, data: Any, view: SceneView) -> None:
+    mujoco.mjv_updateScene(model, data, view.option, None, view.camera, 7, scene)
+
+
+def test_long_arrays_are_looked_at_when_somebody_says_so(
+    simulation: Simulation,
+) -> None:
+    """Textures, for example; and at the next reset, without a word."""
     simulation.begin()
     simulation.model.tex_data[5] ^= 1
     assert simulation.capture() is None
@@ -269,68 +235,59 @@ def test_the_model_is_stored_once_and_differences_are_told(
 def test_a_model_that_consists_of_other_things_is_stored_anew(
     simulation: Simulation,
 ) -> None:
-    """What cannot be set from a recording is never a difference in one."""
+    """In mid-episode that is an error, where it is drawn, because it cannot be set."""
     first = simulation.begin()
     simulation.model.geom_type[1] = int(mujoco.mjtGeom.mjGEOM_BOX)
     second = simulation.begin()
     assert second.model != first.model
     assert second.model_fields == {}
+    simulation.model.dof_Madr[0] += 1
+    assert simulation.capture() is None
     simulation.model.geom_type[1] = int(mujoco.mjtGeom.mjGEOM_SPHERE)
     with pytest.raises(PicturesDiffer, match="geom_type of the model has changed"):
         simulation.capture()
 
 
 def test_a_recompiled_model_is_another_one(simulation: Simulation) -> None:
-    """As in composer environments, at every reset; captures follow the new data."""
+    """As in composer environments, at every reset; in mid-episode it is an error."""
     first = simulation.begin()
     simulation.compile(BALL.replace('size=".1"', 'size=".2"'))
     second = simulation.begin()
     assert second.model != first.model
     simulation.step(3)
     simulation.capture()
-    values = second.snapshot.unpack(simulation.row)
-    assert np.array_equal(values["geom_xpos"], simulation.data.geom_xpos)
-    simulation.compile(BALL)
-    assert simulation.begin().model == first.model
-
-
-def test_another_model_in_mid_episode_is_an_error(simulation: Simulation) -> None:
-    """What is recorded would be of two models."""
-    simulation.begin()
+    assert np.array_equal(simulation.captured("geom_xpos"), simulation.data.geom_xpos)
     simulation.compile(BALL)
     with pytest.raises(PicturesDiffer, match="gone over to another model"):
         simulation.capture()
     with pytest.raises(PicturesDiffer, match="gone over to another model"):
         simulation.states.capture_state(np.empty(8))
+    assert simulation.begin().model == first.model
 
 
 def test_other_data_of_the_same_model_is_followed(simulation: Simulation) -> None:
     """Captures are of the data that the environment has at that moment."""
-    start = simulation.begin()
+    simulation.begin()
     simulation.data = mujoco.MjData(simulation.model)
     simulation.data.qpos[0] = 0.75
     mujoco.mj_forward(simulation.model, simulation.data)
     assert simulation.capture() is None
-    values = start.snapshot.unpack(simulation.row)
-    assert np.array_equal(values["geom_xpos"], simulation.data.geom_xpos)
+    assert np.array_equal(simulation.captured("geom_xpos"), simulation.data.geom_xpos)
 
 
-FLAGS = ("CONTACTPOINT", "CONTACTFORCE", "CONTACTSPLIT", "ISLAND")
-
-
-@pytest.mark.parametrize("flag", FLAGS)
+@pytest.mark.parametrize(
+    "flag", ["CONTACTPOINT", "CONTACTFORCE", "CONTACTSPLIT", "ISLAND"]
+)
 def test_what_only_constraints_tell_is_refused(
     simulation: Simulation, flag: str
 ) -> None:
     """States are still recorded, and what changes in the model still told."""
-    index = int(mujoco.mjtVisFlag.__members__[f"mjVIS_{flag}"])
     if flag == "ISLAND" and hasattr(mujoco.mjtEnableBit, "mjENBL_ISLAND"):
         simulation.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ISLAND)
-    simulation.option.flags[index] = True
+    index = simulation.shown(flag)
     start = simulation.begin()
     assert f"mjVIS_{flag} of the visual options" in (start.refusal or "")
-    assert start.scene is None
-    assert start.snapshot.fields == ()
+    assert (start.scene, start.snapshot.fields) == (None, ())
     assert start.state
     assert simulation.states.changed_fields() is None
     simulation.model.geom_rgba[0] = 0.5
@@ -346,8 +303,7 @@ def test_an_option_that_snapshots_cannot_follow_is_an_error(
 ) -> None:
     """Turned on in mid-episode it is too late for another row."""
     simulation.begin()
-    inertia = int(mujoco.mjtVisFlag.mjVIS_INERTIA)
-    simulation.option.flags[inertia] = True
+    simulation.shown("INERTIA")
     with pytest.raises(PicturesDiffer, match="xipos"):
         simulation.capture()
     assert simulation.begin().refusal is None
@@ -357,12 +313,12 @@ def test_an_option_that_snapshots_cannot_follow_is_an_error(
         simulation.capture()
 
 
-def test_an_obstacle_is_a_refusal_and_in_mid_episode_an_error(tmp_path: Path) -> None:
+def test_an_obstacle_is_a_refusal_and_in_mid_episode_an_error(
+    new: Callable[..., Simulation],
+) -> None:
     """Markers in a viewer, for example."""
     obstacles: list[str] = ["there is a marker"]
-    simulation = Simulation(
-        tmp_path, obstacle=lambda: obstacles[0] if obstacles else None
-    )
+    simulation = new(obstacle=lambda: obstacles[0] if obstacles else None)
     assert simulation.begin().refusal == "there is a marker"
     obstacles.clear()
     assert simulation.begin().refusal is None
@@ -372,22 +328,25 @@ def test_an_obstacle_is_a_refusal_and_in_mid_episode_an_error(tmp_path: Path) ->
         simulation.capture()
 
 
-def test_a_plugin_that_draws_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_plugin_that_draws_is_refused_by_name(
+    new: Callable[..., Simulation],
+) -> None:
     """Before it has drawn anything."""
-    simulation = Simulation(tmp_path, TOUCH_GRID)
-    assert "mujoco.sensor.touch_grid draws" in (simulation.begin().refusal or "")
+    assert "mujoco.sensor.touch_grid draws" in (new(TOUCH_GRID).begin().refusal or "")
 
 
 def test_a_field_that_is_forgotten_is_refused(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first picture is compared, whatever the reason for a difference is."""
-    monkeypatch.setattr("mjrec.simulation.snapshot._ALWAYS", ("geom_xmat",))
+    """The first frame is compared, whatever the reason for a difference is."""
+    monkeypatch.setattr("mjrec.simulation.layout.ALWAYS", ("geom_xmat",))
     assert "the scene is another one" in (simulation.begin().refusal or "")
 
 
-def test_a_picture_is_taken_when_the_environment_would_draw(tmp_path: Path) -> None:
-    """What a render callback moves is in the picture, and put back afterwards."""
+def test_a_frame_is_taken_when_the_environment_would_draw(
+    new: Callable[..., Simulation],
+) -> None:
+    """What a render callback moves is in the frame, and put back afterwards."""
     calls = []
 
     def at_picture(capture: Callable[[], None]) -> None:
@@ -397,114 +356,94 @@ def test_a_picture_is_taken_when_the_environment_would_draw(tmp_path: Path) -> N
         calls.append(1)
         simulation.data.geom_xpos[:] = kept
 
-    simulation = Simulation(tmp_path, at_picture=at_picture)
-    start = simulation.begin()
-    assert len(calls) == 1, "the check is of such a picture too"
+    simulation = new(at_picture=at_picture)
+    simulation.begin()
+    assert len(calls) == 1, "the check is of such a frame too"
     assert simulation.capture() is None
-    values = start.snapshot.unpack(simulation.row)
-    assert values["geom_xpos"][1].tolist() == [7, 8, 9]
+    assert simulation.captured("geom_xpos")[1].tolist() == [7, 8, 9]
     assert simulation.data.geom_xpos[1].tolist() != [7, 8, 9]
 
 
-def _recorded_and_live(simulation: Simulation, pictures: int) -> None:
-    """Compare scenes that stay, picture by picture: a live and a recorded one."""
-    start = simulation.begin()
-    assert start.scene is not None
+def check_scenes_that_stay(simulation: Simulation, frames: int) -> None:
+    """Compare scenes that stay, frame by frame: a live and a recorded one."""
+    view = view_from_facts(simulation.begin_scene())
     own = simulation.view()
     camera, option = copy.copy(own.camera), copy.copy(own.option)
     live_view = dataclasses.replace(own, camera=camera, option=option)
     live = mujoco.MjvScene(simulation.model, maxgeom=100)
-    view = scene_view_from_facts(start.scene)
     model = copy.copy(simulation.model)
     data = mujoco.MjData(model)
     again = mujoco.MjvScene(model, maxgeom=100)
-    for _ in range(pictures):
+    for _ in range(frames):
         simulation.step(30)
         changed = simulation.capture() or {}
-        _update(live, simulation.model, simulation.data, live_view)
+        update(live, simulation.model, simulation.data, live_view)
         apply_fields(model, changed, camera=view.camera, option=view.option)
-        restore_snapshot(start.snapshot.unpack(simulation.row), model, data)
-        _update(again, model, data, view)
+        restore_snapshot(simulation.start.snapshot.unpack(simulation.row), model, data)
+        update(again, model, data, view)
         assert list(differences(live, again, view.option)) == []
     left = [camera.pos.tolist() for camera in live.camera]
-    assert simulation.states.begin_episode().scene["previous_cameras"] == left  # type: ignore[index]  # there is one
+    assert simulation.begin_scene()["previous_cameras"] == left
 
 
-def _track(simulation: Simulation) -> None:
+def test_an_infinite_plane_remembers_the_camera_before(simulation: Simulation) -> None:
+    """An episode says what the last frame before has left, until it is forgotten."""
+    simulation.compile(BALL, plane="0 0 1")
+    simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
+    simulation.camera.fixedcamid = 0
+    assert simulation.begin_scene()["previous_cameras"] is None
+    check_scenes_that_stay(simulation, 3)
+    simulation.states.forget_pictures()
+    assert simulation.begin_scene()["previous_cameras"] is None
+
+
+@pytest.mark.parametrize(("plane", "fresh"), [("2 2 1", False), ("0 0 1", True)])
+def test_only_infinite_planes_in_scenes_that_stay_remember(
+    new: Callable[..., Simulation], plane: str, fresh: bool
+) -> None:
+    """A plane with edges does not, nor does a scene that is made for each frame."""
+    simulation = new(fresh=fresh)
+    simulation.compile(BALL, plane=plane)
+    simulation.begin()
+    simulation.capture()
+    assert simulation.begin_scene()["previous_cameras"] is None
+
+
+def track(simulation: Simulation) -> None:
     simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
     simulation.camera.trackbodyid = 1
 
 
-def test_an_infinite_plane_remembers_the_camera_before(simulation: Simulation) -> None:
-    """It is said what the last picture of the episode before has left in the scene."""
-    simulation.compile(BALL, plane="0 0 1")
-    simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
-    simulation.camera.fixedcamid = 0
-    scene = simulation.begin().scene
-    assert scene is not None
-    assert scene["previous_cameras"] is None
-    _recorded_and_live(simulation, 3)
-
-
-def test_pictures_before_can_be_forgotten(simulation: Simulation) -> None:
-    """Then an episode begins in a scene that nothing has been drawn in."""
-    simulation.compile(BALL, plane="0 0 1")
-    simulation.begin()
-    simulation.capture()
-    after = simulation.begin().scene
-    assert after is not None
-    assert after["previous_cameras"] is not None
-    simulation.states.forget_pictures()
-    scene = simulation.begin().scene
-    assert scene is not None
-    assert scene["previous_cameras"] is None
-
-
-def test_only_infinite_planes_in_scenes_that_stay_remember(tmp_path: Path) -> None:
-    """A plane with edges does not, nor does a scene that is made for each picture."""
-    for plane, fresh in (("2 2 1", False), ("0 0 1", True)):
-        simulation = Simulation(tmp_path, fresh=fresh)
-        simulation.compile(BALL, plane=plane)
-        simulation.begin()
-        simulation.capture()
-        scene = simulation.begin().scene
-        assert scene is not None
-        assert scene["previous_cameras"] is None
-
-
-def test_a_camera_that_tracks_moves_from_picture_to_picture(
-    simulation: Simulation,
-) -> None:
-    """Each picture moves it a fifth of the way; where to is part of the recording."""
-    _track(simulation)
+def test_a_camera_that_tracks_moves_from_frame_to_frame(simulation: Simulation) -> None:
+    """Each frame moves it a fifth of the way; where to is part of the recording."""
+    track(simulation)
     before = simulation.camera.lookat.copy()
-    _recorded_and_live(simulation, 4)
+    check_scenes_that_stay(simulation, 4)
     assert np.array_equal(simulation.camera.lookat, before), "the user's own stays"
-    scene = simulation.begin().scene
-    assert scene is not None
-    assert scene["camera"]["lookat"] != before.tolist()
+    assert simulation.begin_scene()["camera"]["lookat"] != before.tolist()
 
 
 def test_nothing_is_written_to_the_simulation(simulation: Simulation) -> None:
     """Model and data are the same bytes before and after."""
-    _track(simulation)
-    model, data = simulation.model, simulation.data
-    arrays = [getattr(data, n) for n in dir(data) if not n.startswith("_")]
-    arrays = [a for a in arrays if isinstance(a, np.ndarray)]
-    before = [array.tobytes() for array in arrays]
-    kept = copy.copy(model)
+    track(simulation)
+
+    def everything() -> list[bytes]:
+        saved = np.empty(mujoco.mj_sizeModel(simulation.model), np.uint8)
+        mujoco.mj_saveModel(simulation.model, None, saved)
+        data = simulation.data
+        values = [getattr(data, n) for n in dir(data) if not n.startswith("_")]
+        arrays = [value for value in values if isinstance(value, np.ndarray)]
+        return [array.tobytes() for array in (saved, *arrays)]
+
+    before = everything()
     simulation.begin()
     simulation.capture()
-    assert [array.tobytes() for array in arrays] == before
-    buffers = []
-    for each in (model, kept):
-        buffer = np.empty(mujoco.mj_sizeModel(each), np.uint8)
-        mujoco.mj_saveModel(each, None, buffer)
-        buffers.append(buffer.tobytes())
-    assert buffers[0] == buffers[1]
+    assert everything() == before
 
 
-def test_an_episode_is_the_same_with_and_without_captures(tmp_path: Path) -> None:
+def test_an_episode_is_the_same_with_and_without_captures(
+    new: Callable[..., Simulation],
+) -> None:
     """Observations of a real environment do not depend on being recorded."""
 
     def observations(*, recorded: bool) -> list[bytes]:
@@ -512,7 +451,7 @@ def test_an_episode_is_the_same_with_and_without_captures(tmp_path: Path) -> Non
             base: Any = env.unwrapped
             observation, _ = env.reset(seed=3)
             found = [observation.tobytes()]
-            simulation = Simulation(tmp_path)
+            simulation = new()
             simulation.model, simulation.data = base.model, base.data
             if recorded:
                 assert simulation.begin().refusal is None
@@ -522,34 +461,30 @@ def test_an_episode_is_the_same_with_and_without_captures(tmp_path: Path) -> Non
                 found.append(observation.tobytes())
                 if recorded:
                     assert simulation.capture() is None
-            simulation.states.finish()
             return found
 
     assert observations(recorded=True) == observations(recorded=False)
 
 
 @pytest.mark.dm_control
-def test_dm_controls_objects_are_as_good_as_mujocos(tmp_path: Path) -> None:
-    """Its wrappers are seen through, and its option draws no range finders."""
+def test_dm_controls_objects_are_as_good_as_mujocos(
+    new: Callable[..., Simulation],
+) -> None:
+    """Its wrappers are seen through."""
     suite = pytest.importorskip("dm_control.suite")
     physics = suite.load("cartpole", "balance").physics
-    option = mujoco.MjvOption()
-    option.flags[int(mujoco.mjtVisFlag.mjVIS_RANGEFINDER)] = False
-    simulation = Simulation(tmp_path, fresh=True)
+    simulation = new(fresh=True)
     simulation.model, simulation.data = physics.model, physics.data
-    simulation.option = option
-    start = simulation.begin()
-    assert start.refusal is None
-    assert start.scene is not None
-    index = int(mujoco.mjtVisFlag.mjVIS_RANGEFINDER)
-    assert start.scene["option"]["flags"][index] == 0
+    assert simulation.begin().refusal is None
     physics.step()
     assert simulation.capture() is None
-    values = start.snapshot.unpack(simulation.row)
-    assert np.array_equal(values["geom_xpos"], physics.data.ptr.geom_xpos)
+    expected = physics.data.ptr.geom_xpos
+    assert np.array_equal(simulation.captured("geom_xpos"), expected)
 
 
-def test_what_belongs_around_a_reset_is_passed_on(tmp_path: Path) -> None:
+def test_what_belongs_around_a_reset_is_passed_on(
+    new: Callable[..., Simulation],
+) -> None:
     """It is the environment's own affair."""
     inside = []
 
@@ -558,28 +493,24 @@ def test_what_belongs_around_a_reset_is_passed_on(tmp_path: Path) -> None:
         inside.append(1)
         yield
 
-    with Simulation(tmp_path, resetting=resetting).states.resetting():
+    with new(resetting=resetting).states.resetting(), new().states.resetting():
         assert inside
-    with Simulation(tmp_path).states.resetting():
-        pass
 
 
 def test_calls_out_of_turn_are_errors(simulation: Simulation) -> None:
     """Nothing can be captured before an episode begins, or after the end."""
-    out = np.zeros(8, np.uint8)
     states = simulation.states
-    with pytest.raises(ClosedError, match="begin_episode"):
-        states.capture_state(np.empty(8))
-    with pytest.raises(ClosedError, match="begin_episode"):
-        states.changed_fields()
-    with pytest.raises(ClosedError, match="begin_episode"):
-        states.capture_snapshot(out)
-    simulation.begin()
-    simulation.states.close()
-    simulation.states.close()
-    with pytest.raises(ClosedError, match="begin_episode"):
-        simulation.capture()
-    unopened = EpisodeStates(simulation.states._simulation, view=simulation.view)
+    for _ in range(2):
+        with pytest.raises(ClosedError, match="begin_episode"):
+            states.capture_state(np.empty(8))
+        with pytest.raises(ClosedError, match="begin_episode"):
+            states.changed_fields()
+        with pytest.raises(ClosedError, match="begin_episode"):
+            states.capture_snapshot(np.zeros(8, np.uint8))
+        simulation.begin()
+        states.close()
+    states.close()
+    unopened = Capture(lambda: (simulation.model, simulation.data), view=states._view)
     with pytest.raises(ClosedError, match="open"):
         unopened.begin_episode()
 
@@ -590,7 +521,7 @@ def test_no_opengl_is_needed() -> None:
 import os, pathlib, sys, tempfile
 os.environ["MUJOCO_GL"] = "disable"
 sys.path.insert(0, {str(Path(__file__).parent)!r})
-from test_episode_states import Simulation
+from test_capture import Simulation
 simulation = Simulation(pathlib.Path(tempfile.mkdtemp()))
 assert simulation.begin().refusal is None
 simulation.capture()

@@ -3,16 +3,22 @@
 
 from __future__ import annotations
 
-import copy
-
 import mujoco
 import numpy as np
 import pytest
+from touch_grid import TOUCH_GRID
 
 from mjrec.formats.trajectory import RowLayout
-from mjrec.simulation.scene_check import differences, scene_difference, updated_scene
-from mjrec.simulation.scene_view import SceneView
-from mjrec.simulation.snapshot import SnapshotSource, snapshot_layout
+from mjrec.simulation import self_check
+from mjrec.simulation.layout import read_state, snapshot_layout
+from mjrec.simulation.self_check import (
+    differences,
+    drawing_plugin,
+    scene_difference,
+    updated_scene,
+)
+from mjrec.simulation.snapshot import SnapshotSource
+from mjrec.simulation.view import SceneView
 
 XML = """
 <mujoco>
@@ -67,7 +73,7 @@ def checked(
 
 def test_a_whole_snapshot_suffices(simulation: Simulation) -> None:
     """Geoms, lights, cameras, flexes and tendons are the same to the last bit."""
-    assert checked(simulation, snapshot_layout(simulation[0])) is None
+    assert checked(simulation, snapshot_layout(*simulation)) is None
 
 
 @pytest.mark.parametrize(
@@ -83,7 +89,7 @@ def test_a_field_that_is_forgotten_is_noticed(
     simulation: Simulation, field: str, words: str
 ) -> None:
     """As one would be that only a later MuJoCo reads."""
-    whole = snapshot_layout(simulation[0])
+    whole = snapshot_layout(*simulation)
     kept = [(f.name, f.array) for f in whole.fields if f.name != field]
     assert len(kept) == len(whole.fields) - 1
     assert words in (checked(simulation, RowLayout.packed(kept)) or "")
@@ -94,7 +100,7 @@ def test_a_camera_of_the_model_is_checked(simulation: Simulation) -> None:
     view = free_view(simulation[0])
     view.camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
     view.camera.fixedcamid = 0
-    whole = snapshot_layout(simulation[0])
+    whole = snapshot_layout(*simulation)
     assert checked(simulation, whole, view) is None
     kept = [(f.name, f.array) for f in whole.fields if f.name != "cam_xpos"]
     assert checked(simulation, RowLayout.packed(kept), view)
@@ -107,14 +113,10 @@ def test_the_check_writes_to_nothing(simulation: Simulation) -> None:
     view.camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
     view.camera.trackbodyid = 1
     lookat = view.camera.lookat.copy()
-    state = np.empty(mujoco.mj_stateSize(model, 0x1FFF))
-    mujoco.mj_getState(model, data, state, 0x1FFF)
-    before = copy.copy(model), state.copy(), data.geom_xpos.copy()
-    assert checked(simulation, snapshot_layout(model), view) is None
-    mujoco.mj_getState(model, data, state, 0x1FFF)
-    assert np.array_equal(state, before[1])
-    assert np.array_equal(data.geom_xpos, before[2])
-    assert np.array_equal(model.tendon_rgba, before[0].tendon_rgba)
+    before = model.tendon_rgba.copy(), read_state(model, data), data.geom_xpos.copy()
+    assert checked(simulation, snapshot_layout(model, data), view) is None
+    after = model.tendon_rgba, read_state(model, data), data.geom_xpos
+    assert all(map(np.array_equal, before, after))
     assert np.array_equal(view.camera.lookat, lookat)
 
 
@@ -132,3 +134,64 @@ def test_scenes_of_other_states_differ(simulation: Simulation) -> None:
     found = " ".join(differences(live, updated_scene(model, data, view), view.option))
     assert "geoms instead of" in found
     assert "1 lights instead of 2" in found
+
+
+CABLE = """
+<mujoco>
+  <extension><plugin plugin="mujoco.elasticity.cable"/></extension>
+  <worldbody>
+    <composite type="cable" curve="s" count="5 1 1" size="1" initial="none">
+      <plugin plugin="mujoco.elasticity.cable">
+        <config key="twist" value="1e7"/><config key="bend" value="4e6"/>{}
+      </plugin>
+      <geom type="capsule" size=".005"/>
+    </composite>
+  </worldbody>
+</mujoco>
+"""
+
+PID = """
+<mujoco>
+  <extension><plugin plugin="mujoco.pid"/></extension>
+  <worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
+  <actuator>
+    <plugin joint="j" plugin="mujoco.pid"><config key="kp" value="4"/></plugin>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("xml", "found"),
+    [
+        # Its cells appear with the first contact, so that no frame tells.
+        (TOUCH_GRID, "mujoco.sensor.touch_grid"),
+        # With `vmax` it paints its geoms by their strain.
+        (CABLE.format(""), None),
+        (CABLE.format('<config key="vmax" value="0"/>'), None),
+        (CABLE.format('<config key="vmax" value=".05"/>'), "mujoco.elasticity.cable"),
+        (PID, None),
+        ("<mujoco/>", None),
+    ],
+)
+def test_plugins_that_draw_are_known_before_they_do(
+    xml: str, found: str | None
+) -> None:
+    """Most do not; the one that may is asked how it was configured."""
+    assert drawing_plugin(compiled(xml)) == found
+
+
+def test_a_plugin_that_cannot_be_looked_at_counts_as_drawing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where MuJoCo's register cannot be read nothing is believed."""
+    monkeypatch.setattr(self_check, "_library", lambda: None)
+    assert "cannot be looked at" in (drawing_plugin(compiled(PID)) or "")
+
+
+def compiled(xml: str) -> mujoco.MjModel:
+    try:
+        return mujoco.MjModel.from_xml_string(xml)
+    except ValueError as error:
+        # mujoco 4 has no cable.
+        pytest.skip(f"not in this version: {error}")

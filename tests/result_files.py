@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What monitors leave of their episodes, written by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mjrec.formats.journal import JournalEntry, JournalWriter
+from mjrec.formats.manifest import Manifest, write_manifest
+from mjrec.formats.stats_file import StatsFile, write_stats_file
+
+ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
+
+
+def entry(episode_id: int, **facts: Any) -> JournalEntry:
+    """Return an episode that tells its number in all that is known of it."""
+    usual = {
+        "length": 10 + episode_id,
+        "reward": float(episode_id),
+        "type": "t",
+        "start_time": 99.5 + episode_id,
+        "end_time": 100.0 + episode_id,
+        "seed": episode_id,
+        "options": None,
+        "terminated": True,
+        "truncated": False,
+    }
+    return JournalEntry(episode_id, **{**usual, **facts})
+
+
+def write_journal(
+    directory: Path, infix: str, *episodes: int | JournalEntry, **options: Any
+) -> Path:
+    """Write the journal of episodes, or of those of these numbers."""
+    path = directory / f"openaigym.episodes.{infix}.jsonl"
+    writer = JournalWriter(path, **options)
+    for each in episodes:
+        writer.append(entry(each) if isinstance(each, int) else each)
+    writer.close()
+    return path
+
+
+def stats_of(
+    *episodes: int, start: float | None = 98.0, types: str | None = ""
+) -> StatsFile:
+    """Return the statistics of the episodes of these numbers, all of type "t"."""
+    entries = [entry(number) for number in episodes]
+    return StatsFile(
+        initial_reset_timestamp=start,
+        timestamps=tuple(each.end_time for each in entries),
+        episode_lengths=tuple(each.length for each in entries),
+        episode_rewards=tuple(each.reward for each in entries),
+        episode_types=None if types is None else tuple(types or "t" * len(entries)),
+    )
+
+
+def write_saved(
+    directory: Path,
+    infix: str,
+    *episodes: int,
+    stats: StatsFile | None = None,
+    env_info: Any = ENV_INFO,
+    videos: Any = (),
+    details: Any = None,
+    **options: Any,
+) -> Path:
+    """Write statistics, and the manifest that names them; return the latter."""
+    name = f"openaigym.episode_batch.{infix}.stats.json"
+    write_stats_file(directory / name, stats or stats_of(*episodes, **options))
+    path = directory / f"openaigym.manifest.{infix}.manifest.json"
+    write_manifest(path, Manifest(name, tuple(videos), env_info, details))
+    return path
