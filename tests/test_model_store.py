@@ -379,7 +379,7 @@ def test_hostile_fields_are_refused(
 
 def test_a_bomb_of_a_zip_is_not_unpacked(directory: Path) -> None:
     """Its content would be many times what the model needs."""
-    with pytest.raises(UnreadableFile, match="no model has that"):
+    with pytest.raises(UnreadableFile, match="no model needs that"):
         foreign(directory, {"source/main.xml": SPHERE, "source/x": bytes(80 << 20)})
 
 

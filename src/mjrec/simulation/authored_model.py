@@ -130,7 +130,8 @@ def read_authored(path: Path, *, limit: int) -> mujoco.MjModel:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             total = sum(member.file_size for member in archive.infolist())
             if total > limit:
-                raise ValueError(f"its content is {total} bytes, and no model has that")
+                reason = f"its content is {total} bytes, and no model needs that"
+                raise ValueError(reason)
             members = {m.filename: _read(archive, m) for m in archive.infolist()}
         contents = loads(members.pop(_CONTENTS, b"null"))
         if not isinstance(contents, dict) or contents.get("format") != _FORMAT:
