@@ -23,6 +23,7 @@ from .finish import bring_up_to_date, do_jobs
 from .jobs import Outcome, Variant, VideoJob
 from .progress import Progress
 from .recordings import RecordingKey, key_of, parts_of, recordings
+from .recovery import recover
 from .shared_pool import check_workers
 from .views import View
 
@@ -236,15 +237,22 @@ def iter_rendered_videos(
 def _afterwards(
     directory: Path, target: Path, episode: int | None
 ) -> Iterator[Outcome]:
-    """Bring the directory up to date, and yield what nobody knows the recordings of."""
+    """Bring the directory up to date, and yield what stands in the way.
+
+    Of a whole directory, what killed monitors left is put in order too.
+    """
     bring_up_to_date(directory)
-    for path in list_paths(directory) if target.is_dir() and episode is None else ():
+    if not target.is_dir() or episode is not None:
+        return
+    for path in list_paths(directory):
         try:
             read_list(path)
         except UnreadableFile as error:
             if path.exists():
                 reason = str(error)
                 yield Outcome(name=path.name, directory=directory, failure=reason)
+    for file in recover(directory).failures:
+        yield Outcome(name=file.name, directory=directory, failure=file.what)
 
 
 def _trusting(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
