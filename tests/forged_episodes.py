@@ -16,16 +16,16 @@ from typing import Any
 import gymnasium
 import mujoco
 import numpy as np
+from trajectory_contents import TrajectoryContent, content_of
 
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment
 from mjrec.evidence.verification import Check, Level, Verdict
 from mjrec.evidence.verifying.physics_checks import check_physics
 from mjrec.evidence.verifying.task import Task
-from mjrec.formats.trajectory import TrajectoryContent
+from mjrec.formats.trajectory import TrajectoryReader
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
-from mjrec.formats.trajectory_reader import TrajectoryReader
 
 _OPTIONS: dict[str, Any] = {
     "video_callable": False,
@@ -98,7 +98,7 @@ def forge(path: Path, **arrays: Any) -> None:
             in place; and `action` and `snapshot`, of the header.
     """
     with open_trajectory(path) as reader:
-        content = reader.content()
+        content = content_of(reader)
     header = content.header
     facts = {**header.facts, **arrays.pop("facts", {})}
     action = arrays.pop("action", header.action)
@@ -209,19 +209,8 @@ class _Forged(TrajectoryReader):
 
     def close(self) -> None: ...
 
-    def _states(self, start: int, stop: int) -> Any:
-        return self._content.states[start:stop]
-
-    def _actions(self, start: int, stop: int) -> Any:
-        assert self._content.actions is not None
-        return self._content.actions[start:stop]
-
-    def _observations(self, start: int, stop: int) -> Any:
-        assert self._content.observations is not None
-        return self._content.observations[start:stop]
-
-    def _snapshots(self, start: int, stop: int) -> Any:
-        return self._content.snapshots[start:stop]
+    def _rows(self, name: str, start: int, stop: int) -> Any:
+        return getattr(self._content, name)[start:stop]
 
     def _model_change(self, index: int) -> Any:
         return self._content.model_changes[index]

@@ -18,11 +18,12 @@ from trajectories_by_hand import add_row, new_logs
 from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.trajectory import ModelChange, TrajectoryHeader
 from mjrec.simulation.cameras import Camera, resolve_camera
-from mjrec.simulation.model_fields import read_fields
+from mjrec.simulation.fields import read_fields
+from mjrec.simulation.layout import snapshot_layout
 from mjrec.simulation.model_store import ModelStore
 from mjrec.simulation.renderer import SceneRenderer
-from mjrec.simulation.scene_view import SceneView
-from mjrec.simulation.snapshot import SnapshotSource, snapshot_layout
+from mjrec.simulation.snapshot import SnapshotSource
+from mjrec.simulation.view import SceneView
 
 HEIGHT, WIDTH = 48, 64
 FRAMES = 9
@@ -103,7 +104,7 @@ def record(
         width=WIDTH,
         label="rider",
     )
-    layout = snapshot_layout(model, option)
+    layout = snapshot_layout(model, data, option)
     store = ModelStore(directory)
     known = {
         "episode_id": 0,

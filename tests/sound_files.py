@@ -3,21 +3,28 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import mujoco
-from trajectories_by_hand import write_log
+import numpy as np
+from trajectories_by_hand import INFIX, add_row, write_log
 
+from mjrec.formats.in_flight import list_paths
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.manifest import Manifest, write_manifest
+from mjrec.formats.monitor_directory import trajectory_prefix
+from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.stats_file import StatsFile, write_stats_file
+from mjrec.formats.trajectory import Array, ModelChange, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.simulation.authored_model import authored_from_file
 from mjrec.simulation.model_store import ModelStore
 
+PARTS = (".spans", ".log", ".tail", ".looks")
 SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
 
 
@@ -87,17 +94,35 @@ def video(directory: Path) -> Path:
     return path
 
 
-# Each with the reader of `hostile_reading` that it is for. A recording in flight is
-# several files.
+def killed(directory: Path) -> Path:
+    """Record an episode and be killed; return its list."""
+    header = TrajectoryHeader(facts={}, observation=Array("<f8", (9,)))
+    logs = SpanLogs(directory, INFIX, numbers=itertools.count(), tail_bytes=1)
+    span = logs.begin(trajectory_prefix(INFIX, 0), header)
+    for step in range(10):
+        if step == 5:
+            span.add_change(ModelChange(step=5, fields={"geom_rgba": np.ones(4)}))
+        add_row(span, step, observation=step)
+    span.note({"rate": "20"})
+    logs.release()
+    [spans] = list_paths(directory)
+    return spans
+
+
+def killed_with(part: str) -> Callable[[Path], Path]:
+    return lambda directory: killed(directory).with_suffix(part)
+
+
+# Each with the reader of `hostile_reading` that it is for.
 FILES: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "manifest": ("manifest", manifest),
     "stats": ("stats", stats),
     "journal": ("journal", journal),
     "metadata": ("metadata", metadata),
     "h5": ("trajectory", finished),
-    "arrays of an h5": ("arrays", finished),
     "mjb.gz": ("model", compiled),
     "zip": ("model", source),
     "mjcf": ("mjcf", mjcf),
     "video for an archive": ("archive", video),
+    **{part: ("finish", killed_with(part)) for part in PARTS},
 }

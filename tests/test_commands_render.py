@@ -25,7 +25,6 @@ from trajectories_by_hand import (
 
 from mjrec import Monitor, clear_monitor_files, iter_episodes
 from mjrec.commands import main
-from mjrec.formats.monitor_directory import Infix
 from mjrec.rendering.jobs import Variant
 from mjrec.rendering.recordings import RecordingKey, claim
 from mjrec.rendering.views import View
@@ -153,7 +152,7 @@ def test_every_variant_has_a_name_of_its_own() -> None:
         Variant(max_fps=10),
         Variant(fps=10),
     ]
-    path = Path("openaigym.trajectory.0.7.episode000000.h5")
+    path = "openaigym.trajectory.0.7.episode000000.h5"
     names = {variant.name_for(path) for variant in variants}
     assert len(names) == len(variants)
     assert f"{VIDEO}.camera-draft.mp4" in names
@@ -171,18 +170,6 @@ def test_readers_still_find_the_original(
     video.with_suffix(".side.meta.json").write_text("{}")
     [episode] = iter_episodes(tmp_path)
     assert episode.video == video
-
-
-def test_all_episodes_can_be_shown_another_way(
-    tmp_path: Path, mjrec: Run, painter: Painter
-) -> None:
-    """Where no number is given; also of several monitors."""
-    for infix in (INFIX, Infix(1, "7")):
-        write_finished(tmp_path, 0, infix=infix)
-    status, out, _ = mjrec(tmp_path, "--camera", 0)
-    assert status == 0
-    assert "openaigym.video.0.7.video000000.0.mp4: 5 frames" in out
-    assert "openaigym.video.1.7.video000000.0.mp4: 5 frames" in out
 
 
 @pytest.mark.parametrize("name", ["trajectory.0.7.episode000000.h5", "copy.h5"])

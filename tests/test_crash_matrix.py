@@ -23,7 +23,6 @@ from waiting import wait_until
 
 import mjrec
 from mjrec.rendering.finish import finish
-from mjrec.rendering.recordings import recorded_episodes
 
 MOMENTS = 20
 # From the moment in which the child has begun to record.
@@ -157,7 +156,7 @@ def render_all(directory: Path) -> bool:
 
     It ends when it notices that its parent is gone, and until then is left alone.
     """
-    found = list(finish(directory, recorded_episodes(directory), workers=1))
+    found = list(finish(directory, workers=1))
     assert not [each for each in found if each.failure]
     return not any(each.is_elsewhere for each in found)
 

@@ -115,7 +115,7 @@ def record(directory: Path, env: Any, steps: int, **options: Any) -> None:
 
 def finish(directory: Path) -> list[Any]:
     """Render what is pending."""
-    return list(module.finish(directory, recordings(directory), workers=1))
+    return list(module.finish(directory, workers=1))
 
 
 def parts(directory: Path) -> list[str]:

@@ -75,13 +75,6 @@ def zeros(env: Any) -> Any:
     return np.zeros(env.action_spec().shape)
 
 
-@pytest.fixture
-def countdown(tmp_path: Path) -> Iterator[Any]:
-    """A monitor around a `Countdown`, without videos."""
-    with mjrec.Monitor(Countdown(), tmp_path, video_callable=False) as env:
-        yield env
-
-
 class ContractTest(dm_env_test_utils.EnvironmentTestMixin, absltest.TestCase):
     """dm_env's own conformance test of the monitor."""
 
@@ -91,52 +84,42 @@ class ContractTest(dm_env_test_utils.EnvironmentTestMixin, absltest.TestCase):
         return mjrec.Monitor(Countdown(), directory.name, video_callable=False)
 
 
-def test_step_before_reset_begins_an_episode(countdown: Any, tmp_path: Path) -> None:
-    """It is recorded as a reset, not as a step."""
-    assert countdown.step(zeros(countdown)).first()
-    assert countdown.get_total_steps() == 0
-    assert countdown.episode_id == 1
-
-
-def test_step_after_last_begins_the_next_episode(
-    countdown: Any, tmp_path: Path
-) -> None:
-    """The lengths are those of the episodes, without the resets."""
-    for _ in range(8):
-        countdown.step(zeros(countdown))
-    assert countdown.get_episode_lengths() == [3, 3]
-    assert countdown.get_episode_rewards() == [1.5, 1.5]
-
-
-def test_reset_is_allowed_at_any_time(countdown: Any, tmp_path: Path) -> None:
-    """The unfinished episode is no part of the statistics but has a number."""
-    countdown.reset()
-    countdown.step(zeros(countdown))
-    countdown.reset()
-    for _ in range(3):
-        countdown.step(zeros(countdown))
-    assert countdown.get_episode_lengths() == [3]
-    assert journal_of(tmp_path)[0]["episode_id"] == 1
-
-
-def test_early_reset_can_be_forbidden(tmp_path: Path) -> None:
-    """For those who want gym's rule."""
-    with mjrec.Monitor(
-        Countdown(), tmp_path, video_callable=False, allow_early_reset=False
-    ) as env:
-        env.reset()
-        env.step(zeros(env))
-        with pytest.raises(ResetNotAllowed):
-            env.reset()
-
-
-def test_environment_in_mid_episode_is_reset_first(tmp_path: Path) -> None:
-    """An environment that was used before it was wrapped begins anew."""
+def test_steps_that_are_resets(tmp_path: Path) -> None:
+    """Before the first reset and after the last step; whatever was before."""
     inner = Countdown()
     inner.reset()
     inner.step(np.zeros(1))
     with mjrec.Monitor(inner, tmp_path, video_callable=False) as env:
         assert env.step(zeros(env)).first()
+        assert (env.get_total_steps(), env.episode_id) == (0, 1)
+        for _ in range(7):
+            env.step(zeros(env))
+    assert env.get_episode_lengths() == [3, 3]
+    assert env.get_episode_rewards() == [1.5, 1.5]
+    # After close calls go straight to the environment, which was closed once.
+    env.close()
+    assert inner.closed == 1
+    assert env.step(zeros(env)).first()
+    assert env.episode_id == 2
+
+
+def test_reset_is_allowed_at_any_time(tmp_path: Path) -> None:
+    """The unfinished episode has a number and no statistics; it can be forbidden."""
+    with mjrec.Monitor(Countdown(), tmp_path, video_callable=False) as env:
+        env.reset()
+        env.step(zeros(env))
+        env.reset()
+        for _ in range(3):
+            env.step(zeros(env))
+    assert env.get_episode_lengths() == [3]
+    assert journal_of(tmp_path)[0]["episode_id"] == 1
+    with mjrec.Monitor(
+        Countdown(), tmp_path / "b", video_callable=False, allow_early_reset=False
+    ) as env:
+        env.reset()
+        env.step(zeros(env))
+        with pytest.raises(ResetNotAllowed):
+            env.reset()
 
 
 @pytest.mark.parametrize(("discount", "terminated"), [(0.0, True), (1.0, False)])
@@ -164,31 +147,15 @@ def test_environment_that_cannot_be_drawn_is_an_error(tmp_path: Path) -> None:
     assert inner.closed == 0
 
 
-def test_close_closes_the_environment_once(tmp_path: Path) -> None:
-    """After that, calls go straight to it."""
-    inner = Countdown()
-    env = mjrec.Monitor(inner, tmp_path, video_callable=False)
-    env.reset()
-    env.close()
-    env.close()
-    assert inner.closed == 1
-    assert not env.step(zeros(env)).first()
-
-
-def test_what_the_environment_has_is_there(cheetah: Any, tmp_path: Path) -> None:
-    """Physics, task and control timestep can be used through the monitor."""
-    with mjrec.Monitor(cheetah, tmp_path) as env:
+def test_records_dm_control(cheetah: Any, tmp_path: Path) -> None:
+    """Five frames of four steps; the environment's own attributes are there."""
+    with mjrec.Monitor(
+        cheetah, tmp_path, width=64, height=48, env_id="dm_control/cheetah-run"
+    ) as env:
         assert env.physics is cheetah.physics
         assert env.control_timestep() == cheetah.control_timestep()
         with pytest.raises(AttributeError, match="no_such_thing"):
             _ = env.no_such_thing
-
-
-def test_records_dm_control(cheetah: Any, tmp_path: Path) -> None:
-    """Five frames of a four-step episode at the control timestep's rate."""
-    with mjrec.Monitor(
-        cheetah, tmp_path, width=64, height=48, env_id="dm_control/cheetah-run"
-    ) as env:
         for _ in range(5):
             env.step(zeros(env))
     frames = frames_in(tmp_path, 0)
@@ -224,54 +191,30 @@ def test_camera_by_name(cheetah: Any, tmp_path: Path) -> None:
     assert metadata_of(tmp_path, 0)["camera"] == "side"
 
 
-@pytest.mark.thorough
-def test_frame_larger_than_the_offscreen_buffer(cheetah: Any, tmp_path: Path) -> None:
-    """It is drawn by a renderer of our own; the user's model stays as it was."""
-    buffer = cheetah.physics.model.vis.global_.offwidth
-    with mjrec.Monitor(cheetah, tmp_path, width=buffer + 32, height=32) as env:
-        env.reset()
-    assert frames_in(tmp_path, 0)[0].shape == (32, buffer + 32, 3)
-    assert frames_in(tmp_path, 0)[0].std() > 10
-    assert cheetah.physics.model.vis.global_.offwidth == buffer
-    assert metadata_of(tmp_path, 0)["pictures"] == "scene"
-
-
-def test_seed_is_what_the_user_said(cheetah: Any, tmp_path: Path) -> None:
-    """dm_env's reset takes no seed, so the monitor is told."""
-    with mjrec.Monitor(cheetah, tmp_path, video_callable=False) as env:
-        env.seed = 11
-        for _ in range(5):
-            env.step(zeros(env))
-    assert journal_of(tmp_path)[0]["seed"] == 11
-
-
-def test_trajectory_names_the_task_and_its_random_state(
+def test_trajectory_names_what_makes_the_episode_again(
     cheetah: Any, tmp_path: Path
 ) -> None:
-    """What it takes to run the episode again, where the user has named the task."""
+    """The task, where the user names it, its random state, and observations."""
     before = cheetah.task.random.get_state()[1].tolist()
     with mjrec.Monitor(
-        cheetah, tmp_path, workers=0, env_id="dm_control/cheetah-run"
+        cheetah,
+        tmp_path,
+        workers=0,
+        observations=True,
+        env_id="dm_control/cheetah-run",
     ) as env:
-        env.reset()
+        # dm_env's reset takes no seed, so the monitor is told.
+        env.seed = 11
+        first = env.reset().observation
         env.step(zeros(env))
     [path] = tmp_path.glob("*.h5")
     trajectory = mjrec.load_trajectory(path)
     assert trajectory.environment["framework"] == "dm_control"
     assert trajectory.environment["id"] == "dm_control/cheetah-run"
-    assert trajectory.facts["random_state"]["state"]["key"] == before
-
-
-def test_observations_are_one_vector(cheetah: Any, tmp_path: Path) -> None:
-    """The arrays of the dictionary one behind the other, and their names."""
-    with mjrec.Monitor(cheetah, tmp_path, workers=0, observations=True) as env:
-        first = env.reset().observation
-        env.step(zeros(env))
-    [path] = tmp_path.glob("*.h5")
-    trajectory = mjrec.load_trajectory(path)
+    facts = trajectory.facts
+    assert facts["seed"] == 11
+    assert facts["random_state"]["state"]["key"] == before
     assert trajectory.observations is not None
-    np.testing.assert_array_equal(
-        trajectory.observations[0], np.concatenate(list(first.values()))
-    )
-    names = [name for name, _ in trajectory.facts["observation_parts"]]
-    assert names == list(first)
+    parts = np.concatenate(list(first.values()))
+    np.testing.assert_array_equal(trajectory.observations[0], parts)
+    assert [name for name, _ in facts["observation_parts"]] == list(first)

@@ -57,14 +57,16 @@ def facts(healthy: subprocess.CompletedProcess[str]) -> dict[str, Any]:
 
 
 # Takes more than five seconds: each backend draws in a process of its own.
-def test_status_0_where_something_renders(
+def test_a_machine_that_renders(
     healthy: subprocess.CompletedProcess[str], facts: dict[str, Any]
 ) -> None:
-    """EGL renders here, and mjrec would use it."""
+    """Status 0; an unset variable is a note, since other programs choose GLFW then."""
     assert healthy.returncode == 0, healthy.stderr
-    assert facts["can_render"] is True
-    assert facts["backend"] == "egl"
+    assert (facts["can_render"], facts["backend"]) == (True, "egl")
     assert facts["reason"] == "the first that renders"
+    (note,) = facts["problems"]
+    assert "MUJOCO_GL is not set" in note["cause"]
+    assert "export MUJOCO_GL=egl" in note["fix"]
 
 
 def test_the_keys_are_stable(facts: dict[str, Any]) -> None:
@@ -124,13 +126,6 @@ def test_ffmpeg_and_versions(facts: dict[str, Any]) -> None:
     assert packages["gymnasium"]["works"] is True, packages["gymnasium"]
 
 
-def test_an_unset_variable_is_a_note(facts: dict[str, Any]) -> None:
-    """It is no failure: other programs choose GLFW then."""
-    (note,) = facts["problems"]
-    assert "MUJOCO_GL is not set" in note["cause"]
-    assert "export MUJOCO_GL=egl" in note["fix"]
-
-
 @pytest.mark.thorough
 def test_status_1_where_nothing_may_render() -> None:
     """MUJOCO_GL=off: people read why, and what would render."""
@@ -187,8 +182,13 @@ def shown(report: MachineReport) -> str:
 
 
 def test_what_people_see() -> None:
-    """Every fact is there, and brackets are no markup."""
+    """Every fact once, brackets no markup, commands never broken."""
     text = shown(report_of())
+    lines = [line.rstrip() for line in text.splitlines()]
+    assert f"    {_APT}" in lines
+    assert [line for line in lines if len(line) > 80 and _PATH not in line] == []
+    reason = "Nothing renders.\negl: why"
+    assert "egl: why" not in shown(report_of(backend=None, reason=reason))
     for said in (
         "12.3 frames a second",
         "llvmpipe (LLVM 15.0.6, 256 bits), on the CPU",
@@ -205,86 +205,44 @@ def test_what_people_see() -> None:
         assert said in text
 
 
-def test_eighty_columns_and_commands_in_one_piece() -> None:
-    """Lines fit a terminal; what is to be copied is never broken."""
-    lines = [line.rstrip() for line in shown(report_of()).splitlines()]
-    assert f"    {_APT}" in lines
-    assert _PATH in "\n".join(lines)
-    assert [line for line in lines if len(line) > 80 and _PATH not in line] == []
-
-
-def test_a_long_error_is_not_said_twice() -> None:
-    """The causes stand with the backends; the verdict is one line."""
-    text = shown(
-        report_of(backend=None, can_render=False, reason="Nothing renders.\negl: why")
-    )
-    assert "Nothing renders." in text
-    assert "egl: why" not in text
-
-
-def test_ffmpeg_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A program that is no ffmpeg is named, with a way out."""
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
-    found = examine_ffmpeg()
-    assert found.path == "/bin/false"
-    assert not found.encodes
-    assert found.cause
-    assert "IMAGEIO_FFMPEG_EXE" in found.fix
-
-
-def test_ffmpeg_without_libx264(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("refused", "said"),
+    [
+        ("libx264", "Unknown encoder 'libx264'"),
+        # H.264 alone is not enough: what a recording asks for is tried.
+        ("cpu-independent=1", "Error parsing option cpu-independent"),
+    ],
+)
+def test_ffmpeg_that_cannot_encode(
+    refused: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An ffmpeg that cannot encode H.264 is found out, in its own words."""
-    good = examine_ffmpeg()
-    fake = tmp_path / "ffmpeg"
-    fake.write_text(
-        '#!/bin/sh\nfor argument do\n  [ "$argument" = libx264 ] && '
-        "{ echo \"Unknown encoder 'libx264'\" >&2; exit 8; }\ndone\n"
-        f'exec {good.path} "$@"\n'
-    )
-    fake.chmod(0o755)
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake))
-    found = examine_ffmpeg()
-    assert found.version == good.version
-    assert not found.encodes
-    assert "Unknown encoder 'libx264'" in found.cause
-
-
-def test_ffmpeg_that_fails_at_the_real_settings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """H.264 alone is not enough: what a recording asks for is tried."""
+    """It is found out, in its own words."""
     good = examine_ffmpeg()
     assert good.encodes
     fake = tmp_path / "ffmpeg"
     fake.write_text(
-        '#!/bin/sh\nfor argument do\n  [ "$argument" = cpu-independent=1 ] && '
-        "{ echo 'Error parsing option cpu-independent' >&2; exit 8; }\ndone\n"
-        f'exec {good.path} "$@"\n'
+        f'#!/bin/sh\nfor argument do\n  [ "$argument" = {refused} ] && '
+        f'{{ echo "{said}" >&2; exit 8; }}\ndone\nexec {good.path} "$@"\n'
     )
     fake.chmod(0o755)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(fake))
     found = examine_ffmpeg()
-    assert not found.encodes
-    assert found.cause == "Error parsing option cpu-independent"
+    assert (found.version, found.encodes, found.cause) == (good.version, False, said)
 
 
-def test_ffmpeg_that_is_not_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("path", "there"), [("/bin/false", True), ("/no/where", False)]
+)
+def test_what_is_no_ffmpeg(
+    path: str, there: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The report says so and goes on."""
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "nowhere"))
+    """It is named, with a way out."""
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", path)
     found = examine_ffmpeg()
-    assert found.path is None
-    assert "nowhere" in found.cause
-
-
-def test_a_package_that_is_not_installed() -> None:
-    """That is no failure, and it is said how to install it."""
-    found = examine_package("mjrec-there-is-no-such", "import nothing", "pip install x")
-    assert (found.version, found.works) == (None, None)
-    assert "pip install x" in found.fix
+    assert found.path == (path if there else None)
+    assert not found.encodes
+    assert found.cause
+    assert "IMAGEIO_FFMPEG_EXE" in found.fix
 
 
 @pytest.mark.parametrize(
@@ -303,6 +261,9 @@ def test_a_package_that_is_not_installed() -> None:
 )
 def test_a_package_that_does_not_work(program: str, cause: str, fix: str) -> None:
     """A failure in a child process has a cause and a fix; even a crash."""
+    lacking = examine_package("mjrec-there-is-no-such", "import nothing", "pip get x")
+    assert (lacking.version, lacking.works) == (None, None)
+    assert "pip get x" in lacking.fix
     found = examine_package("numpy", program, "pip install y")
     assert found.works is False
     assert cause in found.cause

@@ -32,7 +32,7 @@ from mjrec.evidence.verifying.environment_replay import action_kinds
 from mjrec.evidence.verifying.step_checks import follow_steps
 from mjrec.formats.trajectory import Array
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.simulation.state_steps import StateSteps
+from mjrec.simulation.replay import StateSteps
 
 TELEPORTING, NAMED, OBLIVIOUS = "Teleporting-v0", "Named-v0", "Oblivious-v0"
 

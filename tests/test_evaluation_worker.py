@@ -24,9 +24,11 @@ from conftest import Corridor
 from evaluated import FOLDER, PENDULUM, facts_of, plan_of, run_job, states_of, worker_of
 from mjrec.carried_errors import unpacked
 from mjrec.environments.episode_seeds import episode_seeds
+from mjrec.environments.options import EnvironmentOptions
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.ledger import read_ledgers
 from mjrec.evaluation.plan import EvaluationPlan
+from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session
 from mjrec.signals import Terminated
 
@@ -107,11 +109,9 @@ def test_a_unit_is_the_episode_that_a_session_records(
         directory=recorded,
         seed=4,
         episodes=3,
-        max_steps=8,
         schedule="all",
-        workers=0,
-        height=32,
-        width=32,
+        made=EnvironmentOptions(max_steps=8, height=32, width=32),
+        monitor=RecorderOptions(workers=0),
     )
     with closing(record_session(session)) as episodes:
         expected = list(episodes)

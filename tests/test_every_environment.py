@@ -14,6 +14,7 @@ import gymnasium
 import pytest
 from parts import parametrize
 
+from mjrec.environments.options import EnvironmentOptions
 from mjrec.sessions import Session, record_session
 
 GYMNASIUM = sorted(
@@ -37,9 +38,7 @@ def record(name: str, directory: Path, *, steps: int = 3) -> dict[str, Any]:
         environment=name,
         directory=directory,
         seed=0,
-        max_steps=steps,
-        height=48,
-        width=64,
+        made=EnvironmentOptions(max_steps=steps, height=48, width=64),
     )
     [episode] = record_session(session)
     assert episode.length <= steps

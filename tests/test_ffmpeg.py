@@ -95,31 +95,23 @@ def test_no_program_at_all_is_a_missing_dependency(
         sys.modules.pop("imageio_ffmpeg", None)
 
 
+@pytest.mark.parametrize("is_named", [True, False])
 def test_a_program_that_cannot_be_started_is_told_from_one_that_failed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_named: bool
 ) -> None:
-    """A file that is executable and no program: no exit status, but the reason."""
-    broken = tmp_path / "broken"
+    """A file that is executable and no program: the reason, and how to get another."""
+    broken = script(tmp_path / "broken", "")
     broken.write_bytes(b"\0\0\0\0")
-    broken.chmod(0o755)
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(broken))
-    reason = r"IMAGEIO_FFMPEG_EXE is '.*broken', .* Exec format error\. Unset it"
-    with pytest.raises(InvalidArgument, match=reason):
-        run_ffmpeg(["-version"])
-    with pytest.raises(InvalidArgument, match=reason):
-        FfmpegProcess(["-version"], what="It failed.")
-
-
-def test_a_broken_program_that_nobody_named_is_a_missing_dependency(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The one that is there is named, and how to get another."""
-    broken = tmp_path / "broken"
-    broken.write_bytes(b"\0\0\0\0")
-    broken.chmod(0o755)
-    monkeypatch.delenv("IMAGEIO_FFMPEG_EXE", raising=False)
-    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(broken))
-    with pytest.raises(MissingDependency, match=r"broken \(Exec format error\)"):
+    error: type[Exception] = MissingDependency
+    reason = r"broken \(Exec format error\)"
+    if is_named:
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(broken))
+        error = InvalidArgument
+        reason = r"IMAGEIO_FFMPEG_EXE is '.*broken', .* Exec format error\. Unset it"
+    else:
+        monkeypatch.delenv("IMAGEIO_FFMPEG_EXE", raising=False)
+        monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(broken))
+    with pytest.raises(error, match=reason):
         run_ffmpeg(["-version"])
 
 

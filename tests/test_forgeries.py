@@ -25,10 +25,10 @@ from forged_videos import drawn, forge, metadata, say, swap, video
 from packed_runs import edit_json, make_bag_fit, record_pendulum, the, unpacked
 from parts import parametrize
 from recordings import edit_journal
+from trajectory_contents import TrajectoryContent, content_of
 
 import mjrec
 from mjrec.evidence.verification import Level, Verdict
-from mjrec.formats.trajectory import TrajectoryContent
 from mjrec.formats.trajectory_file import open_trajectory
 
 EPISODES = 4
@@ -55,7 +55,7 @@ def recordings(bag: Path) -> Path:
 
 def trajectory(path: Path) -> TrajectoryContent:
     with open_trajectory(path) as reader:
-        return reader.content()
+        return content_of(reader)
 
 
 def episode(bag: Path, number: int) -> Path:

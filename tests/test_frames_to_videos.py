@@ -89,73 +89,43 @@ def test_step_videos_begin_at_their_step_and_leave_out_the_reset(
     assert shown(tmp_path / "rl-video-step-103.mp4") == [4, 5, 6, 7]
 
 
-def test_video_length_counts_frames(tmp_path: Path) -> None:
-    """Episode and step videos end after that many frames, or with the last one."""
+def reused(count: int, made: list[int]) -> Iterator[Frame]:
+    """Yield one buffer again and again, and note the frames that are made."""
+    buffer = shade(0)
+    for number in range(count):
+        made.append(number)
+        buffer[:] = shade(number)
+        yield buffer
+
+
+@pytest.mark.parametrize("kind", ["list", "array", "generator"])
+def test_both_triggers_may_be_used(tmp_path: Path, kind: str) -> None:
+    """Videos end after `video_length` frames, or with the last one."""
+    frames: Any = {"list": shades(8), "array": np.array(shades(8))}.get(kind)
+    frames = reused(8, []) if frames is None else frames
     mjrec.save_video(
-        shades(8),
-        tmp_path,
-        always,
-        lambda step: step in (1, 5),
-        video_length=3,
-        fps=30,
+        frames, tmp_path, always, lambda step: step in (1, 5), video_length=3, fps=30
     )
     assert shown(tmp_path / "rl-video-episode-0.mp4") == [0, 1, 2]
     assert shown(tmp_path / "rl-video-step-1.mp4") == [2, 3, 4]
     assert shown(tmp_path / "rl-video-step-5.mp4") == [6, 7]
 
 
-@pytest.mark.parametrize(
-    ("length", "read"), [(3, [0, 1, 2]), (None, list(range(9))), (50, list(range(9)))]
-)
+@pytest.mark.parametrize(("length", "count"), [(3, 3), (None, 9), (50, 9)])
 def test_a_generator_is_streamed_and_read_no_further_than_needed(
-    tmp_path: Path, length: int | None, read: list[int]
+    tmp_path: Path, length: int | None, count: int
 ) -> None:
-    """One buffer is reused for all frames, and only the asked-for ones are made."""
+    """Only the asked-for frames are made."""
     made: list[int] = []
-
-    def frames() -> Iterator[Frame]:
-        buffer = shade(0)
-        for number in range(9):
-            made.append(number)
-            buffer[:] = shade(number)
-            yield buffer
-
-    mjrec.save_video(frames(), tmp_path, always, video_length=length, fps=30)
-    assert made == read == shown(tmp_path / "rl-video-episode-0.mp4")
-
-
-def test_a_generator_serves_both_triggers(tmp_path: Path) -> None:
-    """With a step trigger the frames are kept, also those of one reused buffer."""
-
-    def frames() -> Iterator[Frame]:
-        buffer = shade(0)
-        for number in range(5):
-            buffer[:] = shade(number)
-            yield buffer
-
-    mjrec.save_video(frames(), tmp_path, always, lambda step: step == 2, fps=30)
-    assert shown(tmp_path / "rl-video-episode-0.mp4") == [0, 1, 2, 3, 4]
-    assert shown(tmp_path / "rl-video-step-2.mp4") == [3, 4]
-
-
-def test_an_array_of_frames_is_an_iterable(tmp_path: Path) -> None:
-    """A (frames, height, width, 3) array works for both kinds of videos."""
-    mjrec.save_video(
-        np.array(shades(4)), tmp_path, always, lambda step: step == 1, fps=30
-    )
-    assert shown(tmp_path / "rl-video-episode-0.mp4") == [0, 1, 2, 3]
-    assert shown(tmp_path / "rl-video-step-1.mp4") == [2, 3]
+    mjrec.save_video(reused(9, made), tmp_path, always, video_length=length, fps=30)
+    assert made == shown(tmp_path / "rl-video-episode-0.mp4") == [*range(count)]
 
 
 def test_nothing_is_read_when_no_video_is_due(tmp_path: Path) -> None:
     """A trigger that says no leaves a generator untouched."""
-
-    def frames() -> Iterator[Frame]:
-        pytest.fail("a frame was made")
-        yield shade(0)
-
-    mjrec.save_video(frames(), tmp_path, never, fps=30)
-    assert names(tmp_path) == []
+    made: list[int] = []
+    mjrec.save_video(reused(3, made), tmp_path, never, fps=30)
+    assert made == names(tmp_path) == []
 
 
 def test_no_frames_no_file(tmp_path: Path) -> None:
@@ -163,13 +133,6 @@ def test_no_frames_no_file(tmp_path: Path) -> None:
     mjrec.save_video([], tmp_path, always, always, fps=30)
     mjrec.save_video(shades(1), tmp_path, step_trigger=always, fps=30)
     assert names(tmp_path) == []
-
-
-def test_an_existing_video_is_replaced(tmp_path: Path) -> None:
-    """The second call's frames are in the file."""
-    mjrec.save_video(shades(5), tmp_path, fps=30)
-    mjrec.save_video(shades(2), tmp_path, fps=30)
-    assert shown(tmp_path / "rl-video-episode-0.mp4") == [0, 1]
 
 
 def test_the_frames_before_an_error_are_kept(tmp_path: Path) -> None:
@@ -187,33 +150,29 @@ def test_the_frames_before_an_error_are_kept(tmp_path: Path) -> None:
 def test_further_options_are_the_writers(tmp_path: Path) -> None:
     """The options frame_hashes, crf and the rest reach the writer."""
     mjrec.save_video(shades(2), tmp_path, fps=30, frame_hashes=True, crf=30)
-    assert names(tmp_path) == [
-        "rl-video-episode-0.framehash",
-        "rl-video-episode-0.mp4",
-    ]
+    stem = "rl-video-episode-0"
+    assert names(tmp_path) == [f"{stem}.framehash", f"{stem}.mp4"]
 
 
-def test_fps_is_required(tmp_path: Path) -> None:
-    """Without fps, with a wrong one or a duration instead, nothing is touched."""
-    folder = tmp_path / "videos"
-    with pytest.raises(InvalidArgument, match="needs fps"):
-        mjrec.save_video(shades(2), folder)
-    with pytest.raises(InvalidArgument, match="fps must be"):
-        mjrec.save_video(shades(2), folder, never, fps=0)
-    assert not folder.exists()
-
-
-def test_an_unknown_option_is_an_error_that_names_the_known(tmp_path: Path) -> None:
-    """MoviePy's options are not ours, and the error says which are."""
-    with pytest.raises(UnknownName, match=r"'duration'.*fps.*crf"):
-        mjrec.save_video(shades(2), tmp_path, fps=30, duration=0.1)
-
-
-@pytest.mark.parametrize("length", [0, -1, True, 2.5])
-def test_video_length_is_checked(tmp_path: Path, length: Any) -> None:
-    """A video of no frames, or of a part of one, cannot be."""
-    with pytest.raises(InvalidArgument, match="video_length"):
-        mjrec.save_video(shades(2), tmp_path, fps=30, video_length=length)
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({}, InvalidArgument, "needs fps"),
+        ({"fps": 0}, InvalidArgument, "fps must be"),
+        ({"fps": 30, "duration": 0.1}, UnknownName, r"'duration'.*fps.*crf"),
+        *(
+            ({"fps": 30, "video_length": length}, InvalidArgument, "video_length")
+            for length in (0, -1, True, 2.5)
+        ),
+    ],
+)
+def test_options_are_checked_first(
+    tmp_path: Path, options: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    """Before the folder is made."""
+    with pytest.raises(error, match=message):
+        mjrec.save_video(shades(2), tmp_path / "videos", **options)
+    assert names(tmp_path) == []
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:

@@ -55,93 +55,64 @@ def error_of(code: str, **variables: str) -> str:
     return done.stdout
 
 
-def test_importing_it_is_inert() -> None:
-    """No simulator, no OpenGL, no variable."""
-    code = (
-        "before = dict(os.environ); import mjrec.gl\n"
-        "assert not {'mujoco', 'OpenGL', 'glfw', 'dm_control'} & set(sys.modules)\n"
-        "assert dict(os.environ) == before"
-    )
-    done = run(code)
-    assert done.returncode == 0, done.stderr
-
-
-def test_egl_is_tried_first() -> None:
-    """With nothing said, the first that renders, for PyOpenGL too."""
-    assert answer_of("answer = mjrec.use_gl()") == "egl egl egl"
-
-
-@parametrize("text", ["egl", " EGL "])
-def test_the_argument_in_any_spelling(text: str) -> None:
-    """What is set is the spelling that every program understands."""
-    assert answer_of(f"answer = mjrec.use_gl({text!r})") == "egl egl egl"
-
-
-def test_the_variable_in_any_spelling() -> None:
-    """`MUJOCO_GL=EGL`, which Gymnasium refuses, becomes `egl`."""
-    assert answer_of("answer = mjrec.use_gl()", MUJOCO_GL="EGL") == "egl egl egl"
-
-
-def test_the_argument_before_the_variable() -> None:
-    """The variable is not even looked at."""
-    code = "answer = mjrec.use_gl('egl')"
-    assert answer_of(code, MUJOCO_GL="nonsense") == "egl egl egl"
-
-
-@parametrize("text", ["", "on"])
-def test_a_variable_that_names_no_backend(text: str) -> None:
-    """Rendering is on, by which backend is left open."""
-    assert answer_of("answer = mjrec.use_gl()", MUJOCO_GL=text) == "egl egl egl"
-
-
-def test_a_contradicting_platform_is_put_right() -> None:
-    """`PYOPENGL_PLATFORM` follows."""
-    code = "answer = mjrec.use_gl()"
-    assert answer_of(code, PYOPENGL_PLATFORM="osmesa") == "egl egl egl"
+@parametrize(
+    ("code", "variables"),
+    [
+        ("answer = mjrec.use_gl()", {}),
+        ("answer = mjrec.use_gl(' EGL ')", {}),
+        # What is set is the spelling that every program understands.
+        ("answer = mjrec.use_gl()", {"MUJOCO_GL": "EGL"}),
+        ("answer = mjrec.use_gl('egl')", {"MUJOCO_GL": "nonsense"}),
+        # Rendering is on, by which backend is left open.
+        ("answer = mjrec.use_gl()", {"MUJOCO_GL": "on"}),
+        ("answer = mjrec.use_gl()", {"PYOPENGL_PLATFORM": "osmesa"}),
+        ("import mujoco; answer = mjrec.use_gl('egl')", {"MUJOCO_GL": "egl"}),
+    ],
+)
+def test_a_backend_is_taken(code: str, variables: dict[str, str]) -> None:
+    """The argument, else the variable, else the first that renders; both variables."""
+    assert answer_of(code, **variables) == "egl egl egl"
 
 
 def test_mujoco_then_takes_the_choice() -> None:
-    """What is imported afterwards draws by it."""
-    code = "mjrec.use_gl('egl'); import mujoco; answer = mujoco.GLContext.__module__"
+    """What is imported afterwards draws by it; importing mjrec.gl imports none."""
+    code = (
+        "import mjrec.gl\n"
+        "assert not {'mujoco', 'OpenGL', 'glfw', 'dm_control'} & set(sys.modules)\n"
+        "mjrec.use_gl('egl'); import mujoco; answer = mujoco.GLContext.__module__"
+    )
     assert answer_of(code).startswith("mujoco.egl ")
 
 
-@pytest.mark.parametrize("text", ["nonsense", "", "off", "cuda"])
-def test_unknown_argument(text: str) -> None:
-    """The backends that there are are listed."""
-    said = error_of(f"mjrec.use_gl({text!r})")
-    assert said.startswith("UnknownName There is no OpenGL backend")
-    assert "egl, osmesa, glfw" in said
-
-
-def test_unknown_variable() -> None:
-    """The message says that the name comes from the environment."""
-    said = error_of("mjrec.use_gl()", MUJOCO_GL="nonsense")
-    assert said.startswith("UnknownName There is no OpenGL backend 'nonsense'")
-    assert "egl, osmesa, glfw" in said
-    assert "environment variable MUJOCO_GL" in said
-
-
-@pytest.mark.parametrize("text", ["off", "Disable", "0"])
-def test_rendering_turned_off(text: str) -> None:
-    """It is said, and not overruled."""
-    said = error_of("mjrec.use_gl()", MUJOCO_GL=text)
-    assert f"GLError The environment variable MUJOCO_GL is {text!r}" in said
-    assert "turns rendering off" in said
-
-
-def test_an_asked_backend_that_does_not_render() -> None:
-    """The error comes at once, with cause and fix, and nothing is set."""
-    said = error_of("mjrec.use_gl('glfw')")
-    assert "GLError OpenGL backend glfw (asked for) cannot be used here." in said
-    assert "DISPLAY is not set" in said
-    assert "xvfb-run" in said
-
-
-def test_a_named_backend_that_does_not_render() -> None:
-    """The error says that the variable named it."""
-    said = error_of("mjrec.use_gl()", MUJOCO_GL="glfw")
-    assert "OpenGL backend glfw (MUJOCO_GL names it) cannot be used here." in said
+@pytest.mark.parametrize(
+    ("code", "variables", "said"),
+    [
+        ("mjrec.use_gl('cuda')", {}, ["UnknownName There is no OpenGL backend 'cuda'"]),
+        ("mjrec.use_gl('')", {}, ["egl, osmesa, glfw"]),
+        (
+            "mjrec.use_gl()",
+            {"MUJOCO_GL": "nonsense"},
+            ["UnknownName There is no OpenGL backend", "variable MUJOCO_GL names it"],
+        ),
+        ("mjrec.use_gl()", {"MUJOCO_GL": "Off"}, ["GLError", "turns rendering off"]),
+        (
+            "mjrec.use_gl('glfw')",
+            {},
+            ["backend glfw (asked for) cannot", "DISPLAY is not set", "xvfb-run"],
+        ),
+        (
+            "mjrec.use_gl()",
+            {"MUJOCO_GL": "glfw"},
+            ["OpenGL backend glfw (MUJOCO_GL names it) cannot be used here."],
+        ),
+    ],
+)
+def test_what_cannot_be_taken(
+    code: str, variables: dict[str, str], said: list[str]
+) -> None:
+    """The error has the cause and what to do, and no variable changes."""
+    error = error_of(code, **variables)
+    assert all(each in error for each in said), error
 
 
 def test_the_next_one_where_the_first_crashes(tmp_path: Path) -> None:
@@ -173,55 +144,52 @@ def test_nothing_renders(tmp_path: Path) -> None:
     assert "apt-get install -y libosmesa6 " in said
 
 
-def test_mujoco_imported_with_another_backend() -> None:
-    """The one that it took and the one asked for are named, and the way out."""
-    said = error_of("import mujoco\nmjrec.use_gl('egl')")
-    assert "mujoco was imported with glfw in this process" in said
-    assert "cannot change to egl" in said
-    assert "before anything imports them" in said
-
-
-def test_a_variable_set_after_the_import() -> None:
-    """What mujoco took counts, not what the variable says since."""
-    code = (
-        "import mujoco\nos.environ['MUJOCO_GL'] = 'osmesa'\nbefore = dict(os.environ)"
-    )
-    said = error_of(f"{code}\nmjrec.use_gl()", MUJOCO_GL="egl")
-    assert "mujoco was imported with egl in this process" in said
-
-
-def test_mujoco_imported_with_the_same_backend() -> None:
-    """Nothing has to change, so there is nothing to say."""
-    code = "import mujoco; answer = mjrec.use_gl('egl')"
-    assert answer_of(code, MUJOCO_GL="egl") == "egl egl egl"
-
-
-def test_mujoco_imported_without_rendering() -> None:
-    """Rendering that was off at the import cannot be turned on."""
-    code = "import mujoco\ndel os.environ['MUJOCO_GL']\nbefore = dict(os.environ)"
-    said = error_of(f"{code}\nmjrec.use_gl()", MUJOCO_GL="off")
-    assert "mujoco was imported without a backend" in said
-
-
-def test_mujoco_imported_leaves_one_backend_to_try() -> None:
-    """With nothing asked for, what mujoco took is tried, and all reasons are given."""
-    said = error_of("import mujoco\nmjrec.use_gl()")
-    assert "egl: mujoco was imported with glfw" in said
-    assert "glfw: GLFW needs a display" in said
-
-
-def test_pyopengl_imported_before() -> None:
-    """PyOpenGL, too, chooses once."""
-    code = "import OpenGL.GL\nbefore = dict(os.environ)\nmjrec.use_gl('egl')"
-    said = error_of(code, PYOPENGL_PLATFORM="glx")
-    assert "PyOpenGL was imported with glx in this process" in said
-
-
-def test_dm_control_imported_with_another_backend() -> None:
-    """dm_control's choice is found too, where mujoco has none yet."""
-    code = (
-        "import types\nmodule = types.ModuleType('dm_control._render')\n"
-        "module.BACKEND = 'osmesa'\nsys.modules['dm_control._render'] = module\n"
-        "mjrec.use_gl('egl')"
-    )
-    assert "dm_control was imported with osmesa" in error_of(code)
+@pytest.mark.parametrize(
+    ("code", "variables", "said"),
+    [
+        (
+            "import mujoco\nmjrec.use_gl('egl')",
+            {},
+            ["mujoco was imported with glfw", "change to egl", "before anything"],
+        ),
+        # What mujoco took counts, not what the variable says since.
+        (
+            "import mujoco\nos.environ['MUJOCO_GL'] = 'osmesa'\n"
+            "before = dict(os.environ)\nmjrec.use_gl()",
+            {"MUJOCO_GL": "egl"},
+            ["mujoco was imported with egl in this process"],
+        ),
+        (
+            "import mujoco\ndel os.environ['MUJOCO_GL']\n"
+            "before = dict(os.environ)\nmjrec.use_gl()",
+            {"MUJOCO_GL": "off"},
+            ["mujoco was imported without a backend"],
+        ),
+        # What mujoco took is tried, and all reasons are given.
+        (
+            "import mujoco\nmjrec.use_gl()",
+            {},
+            ["egl: mujoco was imported with glfw", "glfw: GLFW needs a display"],
+        ),
+        (
+            "import OpenGL.GL\nbefore = dict(os.environ)\nmjrec.use_gl('egl')",
+            {"PYOPENGL_PLATFORM": "glx"},
+            ["PyOpenGL was imported with glx in this process"],
+        ),
+        # Stands for dm_control with OSMesa, which not every machine has.
+        (
+            "import types\nmodule = types.ModuleType('dm_control._render')\n"
+            "module.BACKEND = 'osmesa'\nsys.modules['dm_control._render'] = module\n"
+            "mjrec.use_gl('egl')",
+            {},
+            ["dm_control was imported with osmesa"],
+        ),
+    ],
+    ids=["other", "later variable", "off", "any", "PyOpenGL", "dm_control"],
+)
+def test_what_was_imported_before(
+    code: str, variables: dict[str, str], said: list[str]
+) -> None:
+    """A backend is taken once; the one that was is named, and the way out."""
+    error = error_of(code, **variables)
+    assert all(each in error for each in said), error

@@ -31,7 +31,6 @@ from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.selection import UNDECIDED
 from mjrec.recorder.tracking import FinishedVideo, Tracker
 from mjrec.rendering.finish import finish
-from mjrec.rendering.recordings import recorded_episodes
 
 # Of the episodes of `pendulum`, in their order.
 RETURNS = [5.0, 2.0, 4.0, 1.0, 4.0, 2.0, 3.0, 6.0]
@@ -109,7 +108,7 @@ def facts_of(directory: Path, episode: int) -> dict[str, Any]:
 
 def render(directory: Path) -> None:
     """Render what is pending."""
-    outcomes = finish(directory, recorded_episodes(directory), workers=1)
+    outcomes = finish(directory, workers=1)
     assert [each.failure for each in outcomes if each.failure] == []
 
 

@@ -10,60 +10,47 @@ import pytest
 
 from mjrec.machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
 
-
-def groups(folder: Path, own: str, files: dict[str, str]) -> dict[str, Path]:
-    """Write a cgroup file system and return where it is."""
-    root = folder / "cgroup"
-    for name, content in files.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content)
-    (folder / "own").write_text(own)
-    return {"root": root, "own": folder / "own"}
-
-
-def test_version_2(tmp_path: Path) -> None:
-    """A quota of 2.5 CPUs."""
-    where = groups(tmp_path, "0::/\n", {"cpu.max": "250000 100000\n"})
-    assert cgroup_cpu_quota(**where) == 2.5
-
-
-def test_version_1(tmp_path: Path) -> None:
-    """The same with the older files."""
-    files = {
-        "cpu,cpuacct/job/cpu.cfs_quota_us": "150000\n",
-        "cpu,cpuacct/job/cpu.cfs_period_us": "100000\n",
-    }
-    where = groups(tmp_path, "4:cpu,cpuacct:/job\n0::/\n", files)
-    assert cgroup_cpu_quota(**where) == 1.5
-
-
-def test_a_group_above_may_be_narrower(tmp_path: Path) -> None:
-    """The least quota on the way up counts."""
-    files = {
-        "a/cpu.max": "100000 100000\n",
-        "a/b/cpu.max": "400000 100000\n",
-        "a/b/c/cpu.max": "max 100000\n",
-    }
-    where = groups(tmp_path, "0::/a/b/c\n", files)
-    assert cgroup_cpu_quota(**where) == 1.0
+_OLD = {"cpu.cfs_quota_us": "150000\n", "cpu.cfs_period_us": "100000\n"}
+_DEEP = {
+    "a/cpu.max": "100000 100000\n",
+    "a/b/cpu.max": "400000 100000\n",
+    "a/b/c/cpu.max": "max 100000\n",
+}
 
 
 @pytest.mark.parametrize(
-    ("own", "files"),
+    ("own", "files", "expected"),
     [
-        ("0::/\n", {"cpu.max": "max 100000\n"}),
-        ("0::/\n", {}),
+        ("0::/\n", {"cpu.max": "250000 100000\n"}, 2.5),
+        # The same with the files of version 1.
+        (
+            "4:cpu,cpuacct:/job\n0::/\n",
+            {f"cpu,cpuacct/job/{name}": text for name, text in _OLD.items()},
+            1.5,
+        ),
+        # The least quota on the way up counts.
+        ("0::/a/b/c\n", _DEEP, 1.0),
+        # No limit is said, or none is to be found.
+        ("0::/\n", {"cpu.max": "max 100000\n"}, None),
+        ("0::/\n", {}, None),
         (
             "1:cpu:/\n",
             {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"},
+            None,
         ),
-        ("", {}),
+        ("", {}, None),
     ],
 )
-def test_no_limit(own: str, files: dict[str, str], tmp_path: Path) -> None:
-    """None, whether it is said or not to be found."""
-    assert cgroup_cpu_quota(**groups(tmp_path, own, files)) is None
+def test_cpus_that_the_cgroup_grants(
+    own: str, files: dict[str, str], expected: float | None, tmp_path: Path
+) -> None:
+    """Of both versions; None where nothing limits them."""
+    root = tmp_path / "cgroup"
+    for name, content in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(content)
+    (tmp_path / "own").write_text(own)
+    assert cgroup_cpu_quota(root=root, own=tmp_path / "own") == expected
 
 
 def test_usable_cpus_follow_the_affinity() -> None:

@@ -61,7 +61,7 @@ def test_there_are_sixty_frames_to_the_second(
     write: Callable[..., Path], timestep: float
 ) -> None:
     """No frame is more than half a timestep off, and nothing adds up."""
-    simulation = MjcfSimulation(write(timestep=timestep))
+    simulation = MjcfSimulation(load_mjcf(write(timestep=timestep)))
     assert simulation.frame_rate == 60
     for frame in range(1, 301):
         simulation.advance(np.zeros(2))

@@ -29,6 +29,7 @@ from mjrec.rendering.engine_jobs import VideoWorker
 from mjrec.simulation.model_store import load_model
 from mjrec.simulation.model_trust import (
     TRUST_VARIABLE,
+    directory_digest,
     is_stored,
     is_trusted,
     note_models,
@@ -229,8 +230,9 @@ def test_what_is_stored_in_a_block_is_reported(directory: Path) -> None:
         stored(directory)
         note_models([OTHER])
     note_models([DIGEST])
-    assert first == [facts["sha256"]]
-    assert second == [facts["sha256"], OTHER]
+    noted = [facts["sha256"], directory_digest(directory)]
+    assert first == noted
+    assert second == [*noted, OTHER]
 
 
 # --- where there can be no list ------------------------------------------------------

@@ -27,6 +27,7 @@ from forged_episodes import (
 )
 from parts import parametrize
 from trajectories_by_hand import write_log
+from trajectory_contents import content_of
 
 from mjrec.evidence.verification import Verdict
 from mjrec.formats.trajectory import ModelChange
@@ -286,7 +287,7 @@ def test_a_state_that_was_cut_out_is_found(tmp_path: Path) -> None:
     env = gymnasium.make("InvertedPendulum-v5")
     forged = record_gymnasium(tmp_path / "run", env, episodes=1, steps=12, size=0)
     with first_episode(forged) as reader:
-        content = reader.content()
+        content = content_of(reader)
     names = ("states", "actions", "rewards", "terminated", "truncated", "observations")
     arrays = {name: np.delete(getattr(content, name), 5, axis=0) for name in names}
     taken = content.frame_steps < len(arrays["states"])

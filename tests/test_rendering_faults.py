@@ -20,7 +20,7 @@ import gymnasium
 import pytest
 from full_disk import file_size_limit
 from parts import parametrize
-from recordings import frames_of, metadata_of
+from recordings import frames_in, frames_of, manifest_of, metadata_of
 from trajectories_by_hand import Painter, write_log, write_pending_manifest
 
 from mjrec import (
@@ -61,8 +61,7 @@ def two(tmp_path: Path, painter: Painter) -> Path:
 
 
 def finish(directory: Path, **options: Any) -> list[Outcome]:
-    keys = recorded_episodes(directory)
-    return list(module.finish(directory, keys, workers=1, **options))
+    return list(module.finish(directory, workers=1, **options))
 
 
 def reasons_in(directory: Path) -> dict[str, str | None]:
@@ -362,50 +361,37 @@ def test_a_killed_encoder_beside_a_simulation(
     assert reasons_in(directory) == {}
 
 
+@pytest.mark.parametrize("render", ["deferred", "live"])
 def test_a_dark_scene_is_suspect_whichever_way_it_is_drawn(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    render: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Deferred or live: the metadata says so, and the log warns."""
-    for render, folder in (("deferred", "later"), ("live", "now")):
+    """The metadata says so, and the log warns; with `strict` it is an error.
+
+    Drawn live as its episode ends, else as the monitor closes. The video is there.
+    """
+    for strict in (False, True):
+        directory = tmp_path / str(strict)
         env = pendulum(tmp_path, render_mode="rgb_array")
-        caplog.clear()
-        with Monitor(
-            env, tmp_path / folder, lambda _: True, render=render, workers=1
-        ) as monitor:
+        monitor = Monitor(
+            env, directory, lambda _: True, render=render, strict=strict, workers=1
+        )
+        kind = BlankVideo if render == "live" else RenderError
+        with (
+            pytest.raises(kind, match="frames are black")
+            if strict
+            else contextlib.nullcontext()
+        ):
             run(monitor, episodes=1)
-        assert metadata_of(tmp_path / folder, 0)["suspect_black"] is True
-        assert "frames are black" in caplog.text
-
-
-def test_with_strict_a_dark_scene_is_an_error(tmp_path: Path) -> None:
-    """As the monitor closes; the video and its metadata are there."""
-    directory = tmp_path / "run"
-    monitor = Monitor(
-        pendulum(tmp_path), directory, lambda _: True, strict=True, workers=1
-    )
-    run(monitor, episodes=1)
-    with pytest.raises(RenderError, match="frames are black"):
+            monitor.close()
         monitor.close()
-    assert metadata_of(directory, 0)["suspect_black"] is True
-    assert reasons_in(directory) == {}
-    [video] = directory.glob("*.mp4")
-    assert len(frames_of(video)) >= 2
+        assert metadata_of(directory, 0)["suspect_black"] is True
+        assert len(manifest_of(directory)["videos"]) == 1
+        assert len(frames_in(directory, 0)) >= 2
+    assert "frames are black" in caplog.text
 
 
-def test_with_strict_a_dark_live_scene_is_an_error(tmp_path: Path) -> None:
-    """As its episode ends; the video counts as finished."""
-    live = Monitor(
-        pendulum(tmp_path, render_mode="rgb_array"),
-        tmp_path / "run",
-        lambda _: True,
-        render="live",
-        strict=True,
-    )
-    with pytest.raises(BlankVideo, match="frames are black"):
-        run(live, episodes=1)
-    live.close()
-    [manifest] = (tmp_path / "run").glob("*.manifest.json")
-    assert len(json.loads(manifest.read_text())["videos"]) == 1
+def test_with_strict_a_dark_video_of_a_recorder_is_an_error(tmp_path: Path) -> None:
+    """As it closes."""
     env = pendulum(tmp_path, render_mode="rgb_array")
     recorder = VideoRecorder(env, tmp_path / "v.mp4", strict=True)
     env.reset(seed=0)

@@ -23,7 +23,7 @@ from trajectories_by_hand import (
     write_pending_manifest,
 )
 
-from mjrec import GLError, UnreadableFile, load_results
+from mjrec import UnreadableFile, load_results
 from mjrec.formats.in_flight import add_facts, is_in_flight
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import (
@@ -36,7 +36,6 @@ from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
 from mjrec.rendering.finish import Finisher, note_failure
 from mjrec.rendering.jobs import Outcome, VideoJob
-from mjrec.rendering.progress import Progress
 from mjrec.rendering.recorded_facts import open_for_rendering
 from mjrec.rendering.recordings import (
     RecordingKey,
@@ -45,7 +44,6 @@ from mjrec.rendering.recordings import (
     look_at,
     may_be_left,
     recorded_episodes,
-    recordings,
 )
 from mjrec.results.listing import write_listing, write_listings
 
@@ -58,7 +56,7 @@ ENDS = ("framehash", "meta.json", "mp4")
 
 def finish(directory: Path, **options: Any) -> list[Outcome]:
     options = {"workers": 1, **options}
-    return list(module.finish(directory, recordings(directory), **options))
+    return list(module.finish(directory, **options))
 
 
 def manifest_in(directory: Path) -> dict[str, Any]:
@@ -152,7 +150,8 @@ def test_a_trajectory_that_is_not_kept_goes_with_its_video_only(
     log = write_log(tmp_path, 1, kept=False, frames=False)
     assert [bool(outcome.failure) for outcome in finish(tmp_path)] == [False, True]
     assert is_in_flight(log)
-    assert [name for name in names(tmp_path) if "states" not in name] == [
+    others = ("states", "failed")
+    assert [n for n in names(tmp_path) if not any(o in n for o in others)] == [
         f"{VIDEO}.{end}" for end in ENDS
     ]
 
@@ -255,33 +254,6 @@ def test_what_cannot_be_rendered_stops_nothing_else(
     assert "Traceback" in caplog.text
     assert fourth.is_video
     assert len(finish(tmp_path)) == 3
-
-
-def test_without_gl_every_video_fails_at_once(tmp_path: Path, painter: Painter) -> None:
-    """One try is enough; trajectories get their final form all the same."""
-
-    def fail(*_: object) -> None:
-        raise GLError("nothing renders here")
-
-    painter.breaks_at = fail
-    logs = [write_log(tmp_path, episode_id) for episode_id in range(3)]
-    outcomes = finish(tmp_path)
-    assert [outcome.failure for outcome in outcomes] == ["nothing renders here"] * 3
-    assert len(painter.asked) == 1
-    assert [log.exists() for log in logs] == [True] * 3
-
-
-def test_progress_counts_videos_and_frames(tmp_path: Path) -> None:
-    """Those that fail count as done; trajectories without a video do not count."""
-    write_finished(tmp_path, 0)
-    write_finished(tmp_path, 1, frames=False)
-    write_log(tmp_path, 2, video=None)
-    seen: list[Progress] = []
-    finish(tmp_path, on_progress=seen.append)
-    assert seen[-1] == Progress(videos_done=2, videos=2, frames_done=5, frames=5)
-    drawn = [progress.frames_done for progress in seen]
-    assert drawn == sorted(drawn)
-    assert {0, 1, 2, 3, 4, 5} == set(drawn)
 
 
 # The manifest

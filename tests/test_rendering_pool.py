@@ -89,6 +89,21 @@ def use_process(monkeypatch: pytest.MonkeyPatch, script: str) -> None:
     monkeypatch.setattr(child_python, "python_command", lambda _: command)
 
 
+def draw_otherwise(monkeypatch: pytest.MonkeyPatch, body: str) -> None:
+    """Let workers draw with other code, which may call `draw(self, index, **rest)`."""
+    code = f"""
+import logging, os, pathlib, signal, sys, threading, time
+import mjrec.rendering.worker as worker
+from mjrec.rendering import drawing
+draw = drawing.Drawing.draw
+def draw_otherwise(self, index, **rest):
+{textwrap.indent(textwrap.dedent(body), "    ")}
+drawing.Drawing.draw = draw_otherwise
+worker.main()
+"""
+    use_process(monkeypatch, code)
+
+
 # In order, whoever draws
 
 
@@ -233,25 +248,15 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Nothing of it is missing or comes twice."""
-    use_process(
+    hung = tmp_path / "hung"
+    draw_otherwise(
         monkeypatch,
         f"""
-        import pathlib, threading
-        import mjrec.rendering.worker as worker
-        from mjrec.rendering import drawing
-        draw = drawing.Drawing.draw
-        hung = pathlib.Path({str(tmp_path / "hung")!r})
-        def wait_for_a_driver_that_hangs():
+        hung = pathlib.Path({str(hung)!r})
+        if index == 3 and not hung.exists():
             hung.touch()
-            lock = threading.Lock()
-            lock.acquire()
-            lock.acquire()
-        def hang_once(self, index, **options):
-            if index == 3 and not hung.exists():
-                wait_for_a_driver_that_hangs()
-            return draw(self, index, **options)
-        drawing.Drawing.draw = hang_once
-        worker.main()
+            threading.Event().wait()
+        return draw(self, index, **rest)
         """,
     )
     with WorkerPool(1) as pool:
@@ -259,7 +264,7 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
         be_impatient(pool)
         assert np.array_equal(list(frames), ride.frames)
     assert "it has drawn nothing for 0.5 seconds" in caplog.text
-    assert "in wait_for_a_driver_that_hangs" in caplog.text
+    assert "in draw_otherwise" in caplog.text
 
 
 @pytest.mark.thorough
@@ -267,20 +272,7 @@ def test_a_slow_worker_does_not_hang(
     ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """However long all takes: the time counts from picture to picture."""
-    use_process(
-        monkeypatch,
-        """
-        import time
-        import mjrec.rendering.worker as worker
-        from mjrec.rendering import drawing
-        draw = drawing.Drawing.draw
-        def slowly(self, index, **options):
-            time.sleep(0.3)
-            return draw(self, index, **options)
-        drawing.Drawing.draw = slowly
-        worker.main()
-        """,
-    )
+    draw_otherwise(monkeypatch, "time.sleep(0.3); return draw(self, index, **rest)")
     with WorkerPool(1) as pool:
         frames = pool.frames(ride.path, range(FRAMES))
         pool._workers[0].patience.seconds = 2
@@ -292,20 +284,14 @@ def test_a_worker_that_dies_twice_is_an_error(
     ride: Ride, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It names the signal, the file, and what the worker said, with Python's stack."""
-    use_process(
+    draw_otherwise(
         monkeypatch,
         """
-        import os, signal, sys
-        import mjrec.rendering.worker as worker
-        from mjrec.rendering import drawing
-        def crash_in_the_driver(*arguments, **options):
-            print("llvm: out of registers", file=sys.stderr, flush=True)
-            os.kill(os.getpid(), signal.SIGSEGV)
-        drawing.Drawing.draw = crash_in_the_driver
-        worker.main()
+        print("llvm: out of registers", file=sys.stderr, flush=True)
+        os.kill(os.getpid(), signal.SIGSEGV)
         """,
     )
-    words = r"(?s)SIGSEGV.*out of registers.*in crash_in_the_driver"
+    words = r"(?s)SIGSEGV.*out of registers.*in draw_otherwise"
     with WorkerPool(2) as pool, pytest.raises(Error, match=words) as caught:
         pool.frames(ride.path, range(FRAMES))
     assert str(ride.path) in str(caught.value)
@@ -315,20 +301,13 @@ def test_what_a_worker_says_is_heard(
     ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Warnings are logged here; what a driver prints is not, however much."""
-    use_process(
+    draw_otherwise(
         monkeypatch,
         """
-        import logging, os
-        import mjrec.rendering.worker as worker
-        from mjrec.rendering import drawing
-        draw = drawing.Drawing.draw
-        def loud(*arguments, **options):
-            os.write(1, b"x" * 100_000)
-            print("a driver speaks")
-            logging.getLogger("x").error("no %s", "GPU")
-            return draw(*arguments, **options)
-        drawing.Drawing.draw = loud
-        worker.main()
+        os.write(1, b"x" * 100_000)
+        print("a driver speaks")
+        logging.getLogger("x").error("no %s", "GPU")
+        return draw(self, index, **rest)
         """,
     )
     with WorkerPool(1) as pool:

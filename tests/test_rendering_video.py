@@ -42,8 +42,8 @@ from mjrec.formats.trajectory import StateComponent
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.unfinished_video import VideoFile
 from mjrec.formats.video_metadata import is_done, metadata_path
-from mjrec.rendering.finish import Finisher, finish
-from mjrec.rendering.jobs import VideoJob
+from mjrec.rendering.finish import Finisher, bring_up_to_date, finish
+from mjrec.rendering.jobs import Variant, VideoJob
 from mjrec.rendering.recorded_facts import video_path
 from mjrec.rendering.recorded_frames import captions
 from mjrec.rendering.recordings import RecordingKey, look_at
@@ -55,9 +55,16 @@ ENDS = ("framehash", "meta.json", "mp4")
 KEY = RecordingKey(INFIX, 0)
 
 
-def render(trajectory: Path, painter: Painter | None = None, **options: Any) -> Path:
+def render(
+    trajectory: Path,
+    painter: Painter | None = None,
+    *,
+    variant: Variant | None = None,
+    **options: Any,
+) -> Path:
     """Render the video of an episode, and return it."""
-    file = render_video([trajectory], workers=painter or Painter(), **options)
+    workers = painter or Painter()
+    file = render_video([trajectory], variant, workers=workers, **options)
     assert isinstance(file, VideoFile)
     return file.path
 
@@ -137,7 +144,7 @@ def test_the_rate_asked_for_counts(tmp_path: Path) -> None:
     """At the recording or now; it is written into the file and selects nothing."""
     trajectory = write_log(tmp_path, fps="5/2")
     for asked, expected in ((None, Fraction(5, 2)), (50, 50)):
-        video = render(trajectory, fps=asked)
+        video = render(trajectory, variant=Variant(fps=asked))
         assert rate_of(video) == expected
         assert shown(video) == [0, 1, 2, 3, 4]
 
@@ -155,7 +162,8 @@ def test_max_fps_leaves_frames_out(
     stride: int, max_fps: float, steps: list[list[int]], fps: int, tmp_path: Path
 ) -> None:
     """At the recording or now: playback stays real time."""
-    video = render(write_finished(tmp_path, steps=5, stride=stride), max_fps=max_fps)
+    trajectory = write_finished(tmp_path, steps=5, stride=stride)
+    video = render(trajectory, variant=Variant(max_fps=max_fps))
     metadata = metadata_of(video)
     assert metadata["frame_steps"] == steps
     assert metadata["playback_speed"] == 1.0
@@ -166,7 +174,8 @@ def test_another_view_is_asked_of_the_workers_and_told(tmp_path: Path) -> None:
     """The metadata has the camera and the quality that were asked for."""
     painter, out = Painter(), tmp_path / "front.mp4"
     view = View(camera="front", quality="draft")
-    assert render(write_finished(tmp_path), painter, view=view, out=out) == out
+    variant = Variant(view=view)
+    assert render(write_finished(tmp_path), painter, variant=variant, out=out) == out
     assert painter.asked[0][2] == view
     metadata = metadata_of(out)
     assert (metadata["camera"], metadata["quality"]) == ("front", "draft")
@@ -364,7 +373,7 @@ def test_the_rule_of_the_choice_is_told(tmp_path: Path) -> None:
     trajectory = write_with_cameras(tmp_path, selection={"rule": "worst:3"})
     out = tmp_path / "x.mp4"
     render(trajectory)
-    render(trajectory, view=View(camera="top"), out=out)
+    render(trajectory, variant=Variant(view=View(camera="top")), out=out)
     for video in (tmp_path / FIRST, tmp_path / SIDE, out):
         assert metadata_of(video)["selection"] == {"rule": "worst:3"}
 
@@ -384,6 +393,7 @@ def test_all_videos_of_an_episode_are_counted_and_listed(
     assert [progress.frames_done for progress in seen] == [0, *range(1, 16), 15]
     assert seen[-1].videos_done == 3
     assert look_at(tmp_path, KEY) is None
+    bring_up_to_date(tmp_path)
     for _ in range(2):
         content = json.loads(manifest.read_text())
         listed = [video for video, _ in content["videos"]]
@@ -420,7 +430,8 @@ def test_an_unknown_camera_is_named_with_those_there_are(tmp_path: Path) -> None
     record_ride(tmp_path, facts={"video": video})
     rendered = render_videos(tmp_path, workers=1)
     assert "side, rider" in rendered.failures[name]
-    assert not list(tmp_path.glob("*video*"))
+    [said] = tmp_path.glob("*video*")
+    assert said.name == name.replace(".mp4", ".failed.json")
 
 
 # Captions

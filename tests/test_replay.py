@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,10 @@ import pytest
 from parts import parametrize
 
 import mjrec
+from mjrec.errors import InvalidArgument
+from mjrec.formats.trajectory import StateComponent
+from mjrec.simulation.layout import read_state, state_components
+from mjrec.simulation.replay import set_state
 
 GYMNASIUM = ["HalfCheetah-v5", "Humanoid-v5", "Pusher-v5"]
 GYMNASIUM += ["Ant-v5", "Hopper-v5", "HumanoidStandup-v5", "Swimmer-v5"]
@@ -84,3 +89,68 @@ def test_suite_states_follow_bit_for_bit(name: str, tmp_path: Path) -> None:
     for path in tmp_path.glob("*.h5"):
         recorded, followed = replayed(path, substeps)
         assert recorded.tobytes() == followed.tobytes()
+
+
+# Something of every component that MuJoCo 3.3 knows, but plugins'.
+EVERYTHING = """
+<mujoco>
+  <size nuserdata="2"/>
+  <worldbody>
+    <body name="hand" mocap="true" pos="0 0 1"><geom size=".1"/></body>
+    <body name="ball" pos="0 0 2"><freejoint/><geom size=".1"/></body>
+    <body><joint name="hinge"/><geom size=".1" pos="0 0 .3"/></body>
+  </worldbody>
+  <equality><weld body1="hand" body2="ball"/></equality>
+  <actuator><general joint="hinge" dyntype="filter" dynprm="1"/></actuator>
+</mujoco>
+"""
+
+
+def simulated() -> tuple[Any, Any]:
+    model = mujoco.MjModel.from_xml_string(EVERYTHING)
+    data = mujoco.MjData(model)
+    data.ctrl[:], data.xfrc_applied[:], data.userdata[:] = 0.3, 0.1, [7, 8]
+    mujoco.mj_step(model, data, nstep=20)
+    return model, read_state(model, data)
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_a_state_comes_back_by_the_names_of_its_parts(is_reversed: bool) -> None:
+    """Also in the order in which another MuJoCo, with other bits, would write it."""
+    model, row = simulated()
+    moved, numbers = [], []
+    for part in state_components(model)[:: -1 if is_reversed else 1]:
+        moved.append(dataclasses.replace(part, offset=sum(map(len, numbers))))
+        numbers.append(row[part.offset : part.offset + part.length])
+    data = mujoco.MjData(model)
+    set_state(model, data, moved, np.concatenate(numbers))
+    np.testing.assert_array_equal(read_state(model, data), row)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda c: [p for p in c if p.name != "act"], "act: 0, and this model has 1"),
+        (
+            lambda c: [
+                dataclasses.replace(p, length=p.length + (p.name == "qpos")) for p in c
+            ],
+            "qpos: 9, and this model has 8",
+        ),
+        (
+            lambda c: [*c, StateComponent("aura", 0, 1)],
+            "aura, which MuJoCo .* not know",
+        ),
+        (lambda c: [*c, c[0]], "some twice"),
+    ],
+)
+def test_a_state_of_another_model_is_refused_whole(change: Any, said: str) -> None:
+    """The message names what differs, and nothing is set."""
+    model, row = simulated()
+    data = mujoco.MjData(model)
+    before = read_state(model, data)
+    with pytest.raises(InvalidArgument, match=said):
+        set_state(model, data, change(state_components(model)), np.append(row, 0.0))
+    with pytest.raises(InvalidArgument, match=r"is \d+ numbers, got .* \(3,\)"):
+        set_state(model, data, state_components(model), row[:3])
+    np.testing.assert_array_equal(read_state(model, data), before)

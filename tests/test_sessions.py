@@ -16,19 +16,25 @@ from recordings import manifest_of, videos_in
 
 from mjrec import sessions
 from mjrec.commands import main
+from mjrec.environments.options import EnvironmentOptions
 from mjrec.errors import GLError, InvalidArgument
+from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session
 
 
-def session(directory: Path, **options: Any) -> Session:
-    defaults: dict[str, Any] = {
-        "environment": "InvertedPendulum-v5",
-        "seed": 0,
-        "max_steps": 2,
-        "height": 32,
-        "width": 32,
-    }
-    return Session(directory=directory, **{**defaults, **options})
+def session(
+    directory: Path, *, name: str = "InvertedPendulum-v5", **options: Any
+) -> Any:
+    """Return a session of two steps an episode; options of the session or monitor."""
+    own = {k: options.pop(k) for k in ("episodes", "schedule") if k in options}
+    return Session(
+        environment=name,
+        directory=directory,
+        seed=0,
+        made=EnvironmentOptions(max_steps=2, height=32, width=32),
+        monitor=RecorderOptions(**options),
+        **own,
+    )
 
 
 @pytest.fixture
@@ -102,7 +108,7 @@ def test_options_are_checked_before_anything_is_made(
 ) -> None:
     """Not after an environment was."""
     with pytest.raises(InvalidArgument):
-        list(record_session(session(tmp_path / "out", environment="X-v0", **options)))
+        list(record_session(session(tmp_path / "out", name="X-v0", **options)))
 
 
 def test_an_iterator_that_is_left_waits_for_nothing(tmp_path: Path) -> None:

@@ -177,7 +177,7 @@ def test_it_goes_on_where_it_was_killed(
 def test_the_videos_are_rendered_of_what_was_chosen(folder: Path) -> None:
     """Manifest and metadata say so, and nothing is pending any more."""
     best = settle_best(folder)
-    outcomes = list(finish(folder, recorded_episodes(folder), workers=1))
+    outcomes = list(finish(folder, workers=1))
     assert [outcome.failure for outcome in outcomes] == [None]
     assert videos_in(folder) == [best.episode_id]
     assert all(not each["pending"] for each in manifests_of(folder).values())
@@ -289,7 +289,7 @@ def test_a_settled_folder_can_be_packed_and_verified(
 ) -> None:
     """Nothing fails; who chose among all monitors' episodes is not proved."""
     settle_best(folder)
-    list(finish(folder, recorded_episodes(folder), workers=1))
+    list(finish(folder, workers=1))
     archive = tmp_path / "run.zip"
     mjrec.pack(folder, archive)
     checks = mjrec.verify(archive, level="stats").checks

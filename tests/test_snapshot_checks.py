@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from forged_episodes import copied, episode, forge, physics_of
 from parts import parametrize
+from trajectory_contents import content_of
 
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment
@@ -209,7 +210,7 @@ def test_snapshots_that_are_not_of_the_model_fail(pusher: Path, tmp_path: Path) 
     directory = copied(pusher, tmp_path / "run")
     path = episode(directory)
     with open_trajectory(path) as reader:
-        content = reader.content()
+        content = content_of(reader)
     kept = [f for f in content.header.snapshot.fields if f.name != "geom_xpos"]
     layout = RowLayout.packed((field.name, field.array) for field in kept)
     rows = np.concatenate(

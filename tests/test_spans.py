@@ -6,15 +6,12 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-import gc
 import itertools
 import os
-import random
 import shutil
 import signal
 import struct
 import threading
-import tracemalloc
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,16 +22,14 @@ import pytest
 from full_disk import file_size_limit
 from processes import forked, kill_self
 from trajectories_by_hand import add_row, new_logs
+from trajectory_contents import TrajectoryContent, content_of
 
-import mjrec.formats.span_reader as span_reader
 import mjrec.formats.span_writer as span_writer
-import mjrec.formats.spans as spans_module
-from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
+from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
 from mjrec.formats import in_flight
 from mjrec.formats.in_flight import (
     add_facts,
     drop_recording,
-    find_recording,
     is_in_flight,
     list_paths,
     read_list,
@@ -48,7 +43,7 @@ from mjrec.formats.monitor_directory import (
     lock_name,
     trajectory_prefix,
 )
-from mjrec.formats.row_log import RowLogReader, tail_path
+from mjrec.formats.row_log import tail_path
 from mjrec.formats.span_reader import SpanReader, rows_size
 from mjrec.formats.span_writer import LOOK_PREFIX, SpanLogs, SpanWriter
 from mjrec.formats.spans import append_line, row_dtype
@@ -58,7 +53,6 @@ from mjrec.formats.trajectory import (
     ModelChange,
     RowLayout,
     StateComponent,
-    TrajectoryContent,
     TrajectoryHeader,
 )
 
@@ -134,7 +128,7 @@ def write(
 
 def read(path: Path) -> TrajectoryContent:
     with SpanReader(path) as reader:
-        return reader.content()
+        return content_of(reader)
 
 
 def check(content: TrajectoryContent, steps: int, *, every: int = 1) -> None:
@@ -206,60 +200,6 @@ def test_recordings_follow_each_other_in_one_log(tmp_path: Path) -> None:
         assert rows_size(found[episode]) == (steps + 1) * ROW
 
 
-@pytest.mark.parametrize(
-    "bounds", [(0, 0), (0, 8), (5, 521), (1022, 1026), (1499, 1500)]
-)
-def test_any_range_can_be_read(path: Path, bounds: tuple[int, int]) -> None:
-    """Wherever its rows are by now."""
-    write(small_logs(path.parent), 1500, every=2)
-    start, stop = bounds
-    with SpanReader(path) as reader:
-        states = [
-            pattern(k, 3, Array("<f8", (3,))).tobytes() for k in range(start, stop)
-        ]
-        assert reader.states(start, stop).tobytes() == b"".join(states)
-        first, last = start // 2, stop // 2
-        frames = reader.snapshots(first, last)
-        expected = [snapshot_of(2 * k) for k in range(first, last)]
-        inside = np.delete(np.arange(HEADER.snapshot.size), HEADER.snapshot.padding)
-        assert frames[:, inside].tobytes() == b"".join(
-            one[inside].tobytes() for one in expected
-        )
-
-
-@pytest.mark.parametrize("bounds", [(-1, 1), (2, 1), (0, 11)])
-def test_a_range_that_is_not_there_is_refused(
-    path: Path, bounds: tuple[int, int]
-) -> None:
-    """The error says how many there are."""
-    write(new_logs(path.parent, INFIX), 9)
-    with (
-        SpanReader(path) as reader,
-        pytest.raises(InvalidArgument, match="has 10 snapshots"),
-    ):
-        reader.snapshots(*bounds)
-
-
-def test_few_frames_of_many_steps_take_little_memory(path: Path) -> None:
-    """What lies between them is never there at once, and neither is all of a log."""
-    size = 1 << 16
-    header = TrajectoryHeader(
-        facts={}, snapshot=RowLayout.packed([("a", Array("|u1", (size,)))])
-    )
-    span = new_logs(path.parent, INFIX).begin(path.stem, header)
-    for step in range(600):
-        add_row(span, step, **({"snapshot": step % 251} if step % 100 == 0 else {}))
-    tracemalloc.start()
-    try:
-        with SpanReader(path) as reader:
-            frames = reader.snapshots(0, reader.frame_count)
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert frames[:, 0].tolist() == [k % 251 for k in range(0, 600, 100)]
-    assert peak < 16 << 20
-
-
 # --- facts ---------------------------------------------------------------------------
 
 
@@ -288,22 +228,6 @@ def test_facts_of_one_recording_are_not_those_of_the_next(tmp_path: Path) -> Non
         span.note({"a": 9})
 
 
-def test_facts_that_json_does_not_know_are_written_as_text(path: Path) -> None:
-    """What a user gave as options of a reset never stops a recording."""
-    facts = {"options": {1, 2}, "seed": np.int64(3), "line": "a\nb\u2028c"}
-    new_logs(path.parent, INFIX).begin(path.stem, TrajectoryHeader(facts=facts))
-    expected = {"options": [1, 2], "seed": 3, "line": "a\nb\u2028c"}
-    assert read(path).header.facts == expected
-
-
-def test_facts_of_what_is_not_in_flight_are_refused(path: Path) -> None:
-    """Nor is anything made where nothing is."""
-    with pytest.raises(UnreadableFile, match="no such file, and no log of it"):
-        add_facts(path, {"candidate": False})
-    assert list(path.parent.iterdir()) == []
-    drop_recording(path)
-
-
 @pytest.mark.parametrize("room", [0, 1, 30])
 def test_facts_on_a_full_disk_leave_the_list_as_it_was(path: Path, room: int) -> None:
     """Half a line would be nobody's; the error names the file."""
@@ -325,19 +249,6 @@ def test_facts_on_a_full_disk_leave_the_list_as_it_was(path: Path, room: int) ->
     facts = read(path).header.facts
     assert (facts["noted"], facts["complete"]) == (1, True)
     assert "candidate" not in facts
-
-
-def test_a_line_that_nobody_would_read_is_not_written(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All that comes after it would be lost with it."""
-    monkeypatch.setattr(spans_module, "_LONGEST_LINE", 5000)
-    logs = new_logs(path.parent, INFIX)
-    span = write(logs, 3)
-    with pytest.raises(FileNotWritten, match=r"\.spans: File too large"):
-        add_facts(path, {"text": "x" * 5000})
-    span.end({"complete": True})
-    assert read(path).header.facts["complete"]
 
 
 # --- changes of the model ------------------------------------------------------------
@@ -384,26 +295,6 @@ def test_a_change_is_that_of_the_row_that_shows_it(path: Path) -> None:
     assert [c.step for c in read(path).model_changes] == [4]
 
 
-def test_changes_that_come_while_it_is_opened_are_not_missed(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No row is read without the change that it shows."""
-    logs = new_logs(path.parent, INFIX)
-    span = write(logs, 3)
-
-    def find(reader: SpanReader, spans: Any) -> Any:
-        monkeypatch.undo()
-        span.add_change(ModelChange(step=4, fields={"a": np.ones(2)}))
-        write_step(span, 4)
-        return reader._open_looks(spans)
-
-    monkeypatch.setattr(SpanReader, "_open_looks", find)
-    content = read(path)
-    check(content, 3)
-    assert content.model_changes == ()
-    assert len(read(path).model_changes) == 1
-
-
 @pytest.mark.parametrize("size", [8, 3 << 20])
 def test_a_change_on_a_full_disk_can_be_added_again(path: Path, size: int) -> None:
     """The error names the file; what was added before stays, and nothing of this."""
@@ -447,7 +338,7 @@ def test_what_no_file_can_hold_is_refused_as_a_change(
     [
         (
             {"snapshot": RowLayout((Field("geom_xpos", Array("<f8", (1,)), 8),))},
-            "geom_xpos is said to begin at 8",
+            "do not lie one behind the other",
         ),
         ({"action": Array(">f8", (1,))}, "'>f8' is no dtype"),
     ],
@@ -473,18 +364,6 @@ def test_a_recording_without_steps_can_be_read(path: Path) -> None:
     assert content.snapshots.shape == (0, HEADER.snapshot.size)
     write_step(span, 0)
     check(read(path), 0)
-
-
-def test_rows_without_any_arrays_can_be_read(path: Path) -> None:
-    """Where no simulation can be seen, rewards are recorded all the same."""
-    logs = new_logs(path.parent, INFIX)
-    span = logs.begin(path.stem, TrajectoryHeader(facts={}))
-    for step in range(3):
-        add_row(span, step, reward=step)
-    content = read(path)
-    assert content.rewards.tolist() == [1, 2]
-    assert content.states.shape == (3, 0)
-    assert content.actions is None
 
 
 def test_a_frame_may_follow_its_step(path: Path) -> None:
@@ -520,34 +399,14 @@ def test_a_living_recording_can_be_read(path: Path) -> None:
     with SpanReader(path) as reader:
         for step in range(3, 20):
             write_step(span, step)
-        check(reader.content(), 2)
+        check(content_of(reader), 2)
         logs.close()
-        check(reader.content(), 2)
+        check(content_of(reader), 2)
     check(read(path), 19)
 
 
-def test_what_is_begun_while_one_is_opened_is_not_its_own(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Between the look at the list and the look at the log anything may happen."""
-    logs = new_logs(path.parent, INFIX)
-    span = write(logs, 5)
-
-    def open_late(*arguments: Any) -> RowLogReader:
-        write_step(span, 6)
-        span.end({"complete": True})
-        write(logs, 9, episode=28)
-        return RowLogReader(*arguments)
-
-    monkeypatch.setattr(span_reader, "RowLogReader", open_late)
-    content = read(path)
-    check(content, 6)
-    assert content.dropped == 0
-    assert content.header.facts["complete"]
-
-
 def test_readers_beside_a_writer_see_whole_recordings(tmp_path: Path) -> None:
-    """Of another process, whose tail wraps with every fourth row."""
+    """With all changes of the model, though the tail wraps with every fourth row."""
     episodes, steps = 3, 3000
     go = tmp_path / "go"
 
@@ -557,6 +416,8 @@ def test_readers_beside_a_writer_see_whole_recordings(tmp_path: Path) -> None:
             header = TrajectoryHeader(facts={}, state=HEADER.state)
             span = logs.begin(trajectory_prefix(INFIX, episode), header)
             for step in range(steps + 1):
+                if step % 100 == 0:
+                    span.add_change(ModelChange(step=step, fields={}))
                 add_row(span, step, state=step, reward=step)
             span.end({"complete": True})
         logs.close()
@@ -586,6 +447,8 @@ def test_readers_beside_a_writer_see_whole_recordings(tmp_path: Path) -> None:
                 assert reader.rewards.tolist() == list(range(1, count))
                 states = reader.states(0, count)
                 assert (states == np.arange(count)[:, None]).all()
+                changes = [change.step for change in reader.model_changes]
+                assert changes == list(range(0, count, 100))
         assert count == steps + 1
     assert os.waitpid(process, 0)[1] == 0
     assert len(looks) > episodes
@@ -734,7 +597,7 @@ def test_a_log_torn_anywhere_keeps_the_whole_rows(path: Path) -> None:
     logs.close()
     _, log, *_ = files_of(path.parent)
     assert log.stat().st_size == 6 * ROW
-    for size in reversed(range(5 * ROW, 6 * ROW)):
+    for size in reversed(range(5 * ROW, 6 * ROW, 8)):
         os.truncate(log, size)
         check(read(path), 4)
 
@@ -780,21 +643,6 @@ def test_a_stale_tail_ends_a_recording(
     assert read(path).dropped == (3 if stale == "zeros behind the head" else 0)
 
 
-@pytest.mark.parametrize("member", ["row", "step", "flags"])
-def test_a_damaged_row_ends_a_recording(path: Path, member: str) -> None:
-    """What comes after damage is not trusted, and counted."""
-    logs = new_logs(path.parent, INFIX)
-    write(logs, 9)
-    logs.close()
-    _, log, *_ = files_of(path.parent)
-    rows = np.memmap(log, row_dtype(HEADER), "r+")
-    rows[member][4] = 0
-    del rows
-    content = read(path)
-    check(content, 3)
-    assert content.dropped == 6
-
-
 @pytest.mark.parametrize(
     ("rows", "states", "frames"),
     [
@@ -817,41 +665,6 @@ def test_rows_out_of_order_end_a_recording(
     assert content.frame_steps.tolist() == frames
 
 
-def test_random_damage_is_an_error_or_what_is_whole(tmp_path: Path) -> None:
-    """Whatever happens to the bytes of a file, rows without damage are as they were."""
-    sound = tmp_path / "sound"
-    sound.mkdir()
-    span = write(small_logs(sound), 9)
-    span.add_change(ModelChange(step=10, fields={"a": np.arange(9)}))
-    write_step(span, 10)
-    states = read(sound / f"{NAME}.h5").states
-    # At most three bytes of one file are other than they were.
-    chance = random.Random(1)
-    refused = read_on = 0
-    for number in range(300):
-        directory = Path(shutil.copytree(sound, tmp_path / str(number)))
-        file = chance.choice(files_of(directory))
-        data = file.read_bytes()
-        damaged = bytearray(data[: chance.randrange(len(data))] or data)
-        for _ in range(chance.randrange(4)):
-            damaged[chance.randrange(len(damaged))] = chance.randrange(256)
-        file.write_bytes(damaged)
-        try:
-            content = read(directory / f"{NAME}.h5")
-        except UnreadableFile:
-            refused += 1
-            continue
-        read_on += 1
-        same = [
-            a.tobytes() == b.tobytes()
-            for a, b in zip(content.states, states, strict=False)
-        ]
-        assert len(content.states) <= len(states)
-        assert same.count(False) <= 3 * file.name.endswith(("log", "tail"))
-    assert refused > 50
-    assert read_on > 50
-
-
 # --- a full disk ---------------------------------------------------------------------
 
 
@@ -869,16 +682,21 @@ def test_a_full_disk_when_a_log_is_made_leaves_nothing(path: Path) -> None:
     check(read(path), 3)
 
 
-def test_a_full_disk_when_a_recording_is_begun_can_be_tried_again(path: Path) -> None:
-    """The log and what is in it stay."""
+def test_what_a_full_disk_did_not_let_be_said_is_said_later(path: Path) -> None:
+    """The end of a recording, also behind the next one, which it did not let begin."""
     logs = new_logs(path.parent, INFIX)
-    write(logs, 3).end({"complete": True})
+    span = write(logs, 3)
     spans, *_ = files_of(path.parent)
-    with file_size_limit(spans.stat().st_size + 20), pytest.raises(FileNotWritten):
-        write(logs, 3, episode=28)
-    assert len(recordings_in_flight(path.parent)) == 1
+    with file_size_limit(spans.stat().st_size + 20):
+        with pytest.raises(FileNotWritten):
+            span.end({"complete": True})
+        with pytest.raises(FileNotWritten):
+            write(logs, 3, episode=28)
     write(logs, 5, episode=28)
-    check(read(path), 3)
+    span.end({"complete": False})
+    content = read(path)
+    check(content, 3)
+    assert (content.header.facts["complete"], content.dropped) == (True, 0)
     check(read(logs.path_of(trajectory_prefix(INFIX, 28))), 5)
 
 
@@ -919,39 +737,6 @@ def test_a_log_that_could_be_closed_but_for_its_last_line_takes_no_row(
     assert read_list(spans).is_closed
 
 
-def test_an_end_that_could_not_be_said_is_where_it_was(path: Path) -> None:
-    """Also where it is said after the next recording has begun."""
-    logs = new_logs(path.parent, INFIX)
-    span = write(logs, 3)
-    spans, *_ = files_of(path.parent)
-    with file_size_limit(spans.stat().st_size), pytest.raises(FileNotWritten):
-        span.end({"complete": True})
-    write(logs, 5, episode=28)
-    check(read(path), 3)
-    span.end({"complete": False})
-    content = read(path)
-    check(content, 3)
-    assert (content.header.facts["complete"], content.dropped) == (True, 0)
-
-
-def test_a_directory_that_is_gone_is_one_clear_error(tmp_path: Path) -> None:
-    """The error names the file, not an operating system call; closing ends."""
-    directory = tmp_path / "gone"
-    logs = new_logs(tmp_path, INFIX)
-    logs.directory = directory
-    with pytest.raises(FileNotWritten, match=r"\.spans: No such file or directory"):
-        logs.begin(NAME, HEADER)
-    directory.mkdir()
-    span = write(logs, 3)
-    shutil.rmtree(directory)
-    write_step(span, 4)
-    with pytest.raises(FileNotWritten, match=r"\.spans: No such file or directory"):
-        span.end({"complete": True})
-    with pytest.raises(FileNotWritten, match=r"\.spans: No such file or directory"):
-        logs.close()
-    logs.close()
-
-
 # --- logs and their lists ------------------------------------------------------------
 
 
@@ -985,27 +770,18 @@ def test_rows_of_another_kind_get_another_log(
 def test_a_long_log_is_followed_by_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It can be removed when its recordings are files; what is in it is not moved."""
+    """It can be removed when its recordings are files; textures count as rows do."""
     monkeypatch.setattr(span_writer, "_LONG", 10 * ROW)
     logs = new_logs(tmp_path, INFIX)
-    for episode in range(5):
+    for episode in range(4):
         write(logs, 5, episode=episode)
-    assert [len(read_list(p).recordings) for p in list_paths(tmp_path)] == [2, 2, 1]
+    texture = ModelChange(step=6, fields={"t": np.zeros(2 * ROW)})
+    write(logs, 0, episode=4).add_change(texture)
+    write(logs, 5, episode=5)
+    lengths = [len(read_list(p).recordings) for p in list_paths(tmp_path)]
+    assert lengths == [2, 2, 1, 1]
     for each in recordings_in_flight(tmp_path):
-        check(read(each.path), 5)
-
-
-def test_changes_of_the_model_make_a_log_long_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A texture in each episode."""
-    monkeypatch.setattr(span_writer, "_LONG", 1000)
-    logs = new_logs(tmp_path, INFIX)
-    for episode in range(2):
-        span = write(logs, -1, episode=episode)
-        span.add_change(ModelChange(step=0, fields={"t": np.zeros(200)}))
-        write_step(span, 0)
-    assert len(list(list_paths(tmp_path))) == 2
+        check(read(each.path), 0 if each.name.endswith("4") else 5)
 
 
 def test_what_may_be_deleted_alone_has_a_log_of_its_own(tmp_path: Path) -> None:
@@ -1081,20 +857,6 @@ def test_a_list_that_an_open_monitor_writes_is_not_removed(
     assert list(path.parent.iterdir()) == []
 
 
-def test_a_closed_list_is_removed_though_its_monitor_is_open(
-    path: Path, monitor_lock: Lock
-) -> None:
-    """It writes another one by now."""
-    logs = new_logs(path.parent, INFIX)
-    write(logs, 3)
-    first, *_ = files_of(path.parent)
-    header = TrajectoryHeader(facts={})
-    logs.begin(trajectory_prefix(INFIX, 28), header)
-    drop_recording(path)
-    assert not first.exists()
-    assert len(recordings_in_flight(path.parent)) == 1
-
-
 def test_a_list_whose_monitor_ends_while_it_is_looked_at_is_not_removed(
     path: Path, monitor_lock: Lock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1147,24 +909,6 @@ def test_whoever_finds_a_log_half_removed_has_an_error(path: Path) -> None:
             read(directory / path.name)
 
 
-def test_a_log_that_is_removed_while_it_is_opened_is_an_error(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where its changes of the model are gone, it is not read without them."""
-    span = write(small_logs(path.parent), 5)
-    span.add_change(ModelChange(step=6, fields={"a": np.ones(1)}))
-    write_step(span, 6)
-
-    def open_late(reader: SpanReader, spans: Any) -> Any:
-        monkeypatch.undo()
-        in_flight.remove_list(spans.path)
-        return reader._open_looks(spans)
-
-    monkeypatch.setattr(SpanReader, "_open_looks", open_late)
-    with pytest.raises(UnreadableFile, match="No such file"):
-        read(path)
-
-
 def test_a_list_that_is_removed_meanwhile_is_passed_over(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1178,43 +922,6 @@ def test_a_list_that_is_removed_meanwhile_is_passed_over(
     files = list(list_paths(path.parent))
     in_flight.remove_list(first)
     check(read(path), 5)
-
-
-def test_many_monitors_share_a_directory(tmp_path: Path) -> None:
-    """Each finds its own recordings; that one is closed is nothing to the others."""
-    infixes = [Infix(number, "run") for number in range(64)]
-    name = trajectory_prefix
-    all_logs = {infix: new_logs(tmp_path, infix) for infix in infixes}
-    spans = {
-        infix: logs.begin(name(infix, 3), HEADER) for infix, logs in all_logs.items()
-    }
-    for step in range(4):
-        for span in spans.values():
-            write_step(span, step)
-    for infix in infixes[::2]:
-        all_logs[infix].close()
-    for infix in infixes[1::2]:
-        write_step(spans[infix], 4)
-    for number, infix in enumerate(infixes):
-        [found] = recordings_in_flight(tmp_path, infix)
-        check(read(found.path), 3 + number % 2)
-    assert len(recordings_in_flight(tmp_path)) == 64
-    for infix in infixes:
-        all_logs[infix].close()
-        drop_recording(tmp_path / f"{name(infix, 3)}.h5")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_clips_are_found_by_their_names(tmp_path: Path) -> None:
-    """They never become files of that name."""
-    logs = new_logs(tmp_path, INFIX)
-    name = clip_part_name(INFIX, 137, 0)
-    span = logs.begin(name, HEADER)
-    write_step(span, 0)
-    [found] = recordings_in_flight(tmp_path)
-    assert found.path == tmp_path / name
-    assert is_in_flight(found.path)
-    check(read(found.path), 0)
 
 
 def test_a_forked_child_does_not_write_into_its_parents_log(path: Path) -> None:
@@ -1237,62 +944,6 @@ def test_a_forked_child_does_not_write_into_its_parents_log(path: Path) -> None:
     write_step(span, 4)
     logs.close()
     check(read(path), 4)
-
-
-def test_dropped_twice_is_dropped_once(path: Path) -> None:
-    """Also where nothing is left of it."""
-    logs = new_logs(path.parent, INFIX)
-    span = write(logs, 3)
-    span.drop()
-    logs.close()
-    span.drop()
-    assert list(path.parent.iterdir()) == []
-    assert find_recording(path) is None
-    with pytest.raises(UnreadableFile, match="no such file, and no log of it"):
-        read(path)
-
-
-def descriptors() -> int:
-    gc.collect()
-    return len(list(Path("/proc/self/fd").iterdir()))
-
-
-def test_no_descriptor_stays(path: Path) -> None:
-    """Of logs that were closed, and readers that were closed or refused."""
-    before = descriptors()
-    logs = new_logs(path.parent, INFIX)
-    span = write(logs, 3)
-    span.add_change(ModelChange(step=3, fields={"a": np.ones(1)}))
-    write_step(span, 4)
-    with SpanReader(path) as reader:
-        reader.content()
-    *_, looks = files_of(path.parent)
-    looks.rename(looks.with_suffix(".kept"))
-    looks.mkdir()
-    with pytest.raises(UnreadableFile):
-        SpanReader(path)
-    looks.rmdir()
-    logs.close()
-    del logs, span
-    assert descriptors() == before
-
-
-def test_a_closed_reader_says_so(path: Path) -> None:
-    """What is in memory stays."""
-    span = write(new_logs(path.parent, INFIX), 3)
-    span.add_change(ModelChange(step=4, fields={"a": np.ones(1)}))
-    write_step(span, 4)
-    reader = SpanReader(path)
-    reader.close()
-    reader.close()
-    for use in (
-        lambda: reader.snapshots(0, 1),
-        lambda: reader.states(0, 1),
-        lambda: reader.model_changes,
-    ):
-        with pytest.raises(ClosedError, match="is closed"):
-            use()
-    assert (reader.frame_count, reader.change_count) == (5, 1)
 
 
 def test_a_log_that_changes_while_it_is_read_is_an_error(path: Path) -> None:
@@ -1338,42 +989,26 @@ def head(rows: str = ROWS, facts: str = "{}", version: str = "1") -> str:
     ("header", "reason"),
     [
         ("", "it is not whole JSON"),
-        ("something else", "it is not whole JSON"),
         ("{" * 100_000, "JSON"),
         ("[]", "an object belongs there, not a list"),
         ("{}", "it is no list of spans"),
         (head(version="0"), "no format version 0"),
-        (head(version='"a"'), "'version' is wrong"),
         (head(facts="1"), "'facts' is wrong"),
-        ('{"format": "mjrec spans", "version": 1, "rows": {}}', "it has no 'facts'"),
-        (head('"state": 3'), "'state' is wrong"),
-        (head('"state": [["a", 0]]'), "name, offset and length"),
-        (head('"state": [["a", 1, 1]]'), "begin at 1, not at 0"),
-        (head('"state": [["a", 0, -1]]'), "cannot be a number"),
-        (head('"state": [["a/b", 0, 1]]'), "cannot name an array"),
-        (head('"state": [["a", 0, 1], ["a", 1, 1]]'), "the same name"),
+        (head('"state": [["a"]]'), "its name and its length"),
+        (head('"state": [["a", -1]]'), "cannot be a number"),
+        (head('"state": [["a/b", 1]]'), "cannot name an array"),
+        (head('"snapshot": [], "state": [["a", 1], ["a", 1]]'), "the same name"),
         (head(f'{ACTION}{{"dtype": "|O", "shape": []}}'), r"'\|O' is no dtype"),
-        (
-            head(f'{ACTION}{{"dtype": "<f8", "shape": [4294967296, 4294967296, 1]}}'),
-            "cannot be a number",
-        ),
-        (
-            head(f'{ACTION}{{"dtype": "<f8", "shape": [200000000, 200000000]}}'),
-            "too large",
-        ),
+        (head(f'{ACTION}{{"dtype": "<f8", "shape": [4294967296, 1]}}'), "C int"),
     ],
 )
 def test_a_hostile_header_is_refused(path: Path, header: str, reason: str) -> None:
-    """Each is one clear error, before any memory is taken, as often as it is read."""
+    """Each is one clear error, as often as it is read."""
     put(path, header)
-    tracemalloc.start()
-    for _ in range(4):
+    for _ in range(2):
         with pytest.raises(UnreadableFile, match=reason) as error:
             read(path)
         assert error.value.path.suffix == ".spans"
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 8 << 20
     assert recordings_in_flight(path.parent) == []
 
 
@@ -1422,32 +1057,6 @@ def test_only_names_of_the_monitor_are_believed(path: Path, name: str) -> None:
     remove_if_done(files_of(path.parent)[0])
 
 
-NUMBERS = ["-1", "1e400", "1e30", "9223372036854775807", "4611686018427387904", '"a"']
-
-
-@pytest.mark.parametrize("number", NUMBERS)
-@pytest.mark.parametrize("key", ["row", "look", "stop"])
-def test_hostile_numbers_lead_nowhere(path: Path, key: str, number: str) -> None:
-    """An error, or a recording without what is not there."""
-    values = {"row": "0", "look": "0", "stop": "2", key: number}
-    put(
-        path,
-        head(),
-        f'{{"begin": "{path.stem}", "row": {values["row"]}, '
-        f'"look": {values["look"]}, "facts": {{}}}}',
-        f'{{"end": "{path.stem}", "row": {values["stop"]}, "facts": {{}}}}',
-        log=b"".join(struct.pack("=qqdQ", k, k, 1.0, 4) for k in range(2)),
-    )
-    try:
-        content = read(path)
-    except UnreadableFile:
-        assert find_recording(path) is None
-        return
-    assert len(content.states) <= 2
-    [found] = recordings_in_flight(path.parent)
-    assert rows_size(found) in (0, 32, 64)
-
-
 @pytest.mark.parametrize(
     "line",
     [
@@ -1470,58 +1079,37 @@ def test_a_line_that_says_nothing_is_passed_over(path: Path, line: str) -> None:
     assert not read_list(spans).is_closed
 
 
+def change_with(header: str, values: bytes = b"", *, step: int = 0) -> bytes:
+    """Return a change of a model whose record has a header of somebody's own."""
+    start = struct.pack("<q", step) + b"\x93NUMPY\1\0"
+    return start + struct.pack("<H", len(header)) + header.encode() + values
+
+
+RECORD = "{{'descr': [('a', {})], 'fortran_order': False, 'shape': {}}}"
+
+
 @pytest.mark.parametrize(
     "payload",
     [
         b"x",
-        struct.pack("<qQ", 0, 1 << 40),
-        struct.pack("<qQ", 0, (1 << 64) - 1),
-        struct.pack("<qQ", -1, 2) + b"[]",
-        struct.pack("<qQ", 0, 3) + b"[{]",
-        struct.pack("<qQ", 0, 2) + b"[]x",
-        struct.pack("<qQ", 0, 44)
-        + b'[{"name": "a", "dtype": "|O", "shape": [1]}]'
-        + bytes(8),
-        struct.pack("<qQ", 0, 51)
-        + b'[{"name": "a", "dtype": "<f8", "shape": [10000000]}]'[:51],
-        struct.pack("<qQ", 0, 100_000) + b"[" * 100_000,
+        change_with(RECORD.format("'<f8'", "()"), bytes(8), step=-1),
+        change_with(RECORD.format("'<f8'", "()"), bytes(9)),
+        change_with(RECORD.format("'<f8'", "(2,)"), bytes(16)),
+        change_with(RECORD.format("'|O'", "()"), bytes(8)),
+        change_with(RECORD.format("'<f8', (10000000,)", "()")),
+        change_with(RECORD.format("'<f8', (1 << 62,)", "()")),
+        change_with("[" * 60_000),
+        change_with("__import__('os')"),
     ],
 )
 def test_a_hostile_model_change_is_refused(path: Path, payload: bytes) -> None:
-    """Its table is believed only where it fits what is there."""
+    """Its header is believed only where it fits what is there."""
     write(new_logs(path.parent, INFIX), 0)
     *_, looks = files_of(path.parent)
     looks.write_bytes(LOOK_PREFIX.pack(0, len(payload)) + payload)
     with pytest.raises(UnreadableFile, match="change of the model") as error:
         read(path)
     assert error.value.path == looks
-
-
-@pytest.mark.parametrize("length", [0, 17, 1 << 40, (1 << 64) - 1])
-def test_a_length_beyond_the_file_is_not_believed(path: Path, length: int) -> None:
-    """No memory is taken for what is not there."""
-    write(new_logs(path.parent, INFIX), 0)
-    *_, looks = files_of(path.parent)
-    looks.write_bytes(LOOK_PREFIX.pack(0, length) + bytes(16))
-    assert read(path).model_changes == ()
-
-
-def test_in_place_of_a_file_there_may_be_something_else(path: Path) -> None:
-    """A directory, a pipe and a link out are errors, none of them a wait."""
-    logs = new_logs(path.parent, INFIX)
-    span = write(logs, 3)
-    span.add_change(ModelChange(step=4, fields={"a": np.ones(1)}))
-    write_step(span, 4)
-    outside = path.parent.with_name("outside")
-    for file in files_of(path.parent):
-        file.rename(outside)
-        for make in (os.mkfifo, Path.mkdir, lambda name: name.symlink_to(outside)):
-            make(file)
-            with pytest.raises(UnreadableFile, match=r"not a regular|out of its dir"):
-                read(path)
-            file.rmdir() if file.is_dir() else file.unlink()
-        outside.rename(file)
-    check(read(path), 4)
 
 
 # --- what was read before is kept ----------------------------------------------------
@@ -1547,47 +1135,6 @@ def test_a_list_by_the_name_of_one_that_was_removed_is_another(
     assert found == [
         ([k + 10 * episode for episode in range(4 + more * k)], k) for k in range(4)
     ]
-
-
-def test_a_list_that_was_cut_is_read_anew(path: Path) -> None:
-    """What it does not say any more does not count."""
-    logs = new_logs(path.parent, INFIX)
-    write(logs, 3)
-    spans, *_ = files_of(path.parent)
-    size = spans.stat().st_size
-    write(logs, 3, episode=28)
-    assert len(recordings_in_flight(path.parent)) == 2
-    os.truncate(spans, size)
-    assert len(recordings_in_flight(path.parent)) == 1
-
-
-def test_a_list_whose_reading_was_interrupted_is_read_to_its_end(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """After Ctrl-C in any of its lines; none is passed over."""
-    logs = new_logs(path.parent, INFIX)
-    for episode in range(3):
-        write(logs, 3, episode=episode).end({"complete": True})
-    spans, *_ = files_of(path.parent)
-    real = spans_module.json_object
-    for stop in range(8):
-        calls = itertools.count()
-
-        def parse(line: bytes, calls: Any = calls, stop: int = stop) -> Any:
-            if next(calls) == stop:
-                raise KeyboardInterrupt
-            return real(line)
-
-        copy = path.parent / str(stop)
-        copy.mkdir()
-        shutil.copy(spans, copy)
-        with monkeypatch.context() as patch:
-            patch.setattr(spans_module, "json_object", parse)
-            if stop < 7:
-                with pytest.raises(KeyboardInterrupt):
-                    recordings_in_flight(copy)
-        assert len(recordings_in_flight(copy)) == 3
-        assert all("complete" in each.facts for each in recordings_in_flight(copy))
 
 
 def test_a_line_is_added_behind_what_others_add(path: Path) -> None:

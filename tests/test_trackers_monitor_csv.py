@@ -59,10 +59,14 @@ def test_header_and_rows(run: Run) -> None:
     assert float(cells[2][2]) == pytest.approx(before + 100 - start["t_start"])
 
 
-def test_each_run_has_a_file_of_its_own(run: Run, tmp_path: Path) -> None:
-    """Sub-environments in one directory, at the same time."""
+def test_each_run_has_a_file_of_its_own(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sub-environments in one directory, wherever the script has gone meanwhile."""
     (tmp_path / "logs").mkdir()
-    tracker = MonitorCsvTracker(tmp_path / "logs")
+    monkeypatch.chdir(tmp_path)
+    tracker = MonitorCsvTracker("logs")
+    monkeypatch.chdir(tmp_path / "logs")
     runs = [dataclasses.replace(run, env_index=i, infix=f"{i}.4711") for i in range(2)]
     for one in runs:
         tracker.begin(one)
@@ -92,25 +96,8 @@ def test_file_that_is_there_is_never_written_to(
         begin_and_end(MonitorCsvTracker(tmp_path / path), run)
     assert names(tmp_path / "logs") == made
     assert first.read_text() == "precious"
-
-
-def test_relative_path_stays_where_it_was_named(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Though the script goes elsewhere before the first monitor."""
-    monkeypatch.chdir(tmp_path)
-    tracker = MonitorCsvTracker("a")
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    begin_and_end(tracker, run)
-    assert (tmp_path / "a.monitor.csv").is_file()
-
-
-def test_directory_that_cannot_be_made_is_named(run: Run, tmp_path: Path) -> None:
-    """A file has its name."""
-    (tmp_path / "taken").write_text("")
-    with pytest.raises(DirectoryNotWritable, match="taken"):
-        MonitorCsvTracker(tmp_path / "taken" / "a").begin(run)
+    with pytest.raises(DirectoryNotWritable, match="monitor"):
+        MonitorCsvTracker(first / "a").begin(run)
 
 
 def test_full_disk_is_named_and_tears_no_row(run: Run) -> None:

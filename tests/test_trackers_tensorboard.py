@@ -65,17 +65,6 @@ def test_scalars_stand_over_the_steps_of_the_run(finished: Finished) -> None:
     assert [(e.step, e.value) for e in events.Scalars("evaluation/return")] == [(30, 3)]
 
 
-def test_events_are_there_at_once(finished: Finished) -> None:
-    """A killed process loses none."""
-    tracker = TensorBoardTracker()
-    tracker.begin(finished.run)
-    tracker.episode(finished.run, episode())
-    assert read(finished.run.directory / "tensorboard" / "0.4711").Scalars(
-        "training/return"
-    )
-    tracker.end(finished.run)
-
-
 def test_video_is_played_as_a_gif_of_the_file(finished: Finished) -> None:
     """It shows the whole episode, moves on, and stands at its episode's step."""
     tracker, run = TensorBoardTracker(), finished.run
@@ -83,8 +72,11 @@ def test_video_is_played_as_a_gif_of_the_file(finished: Finished) -> None:
     tracker.episode(run, episode(0))
     tracker.episode(run, episode(5))
     tracker.video(run, finished.video)
+    # One that was cut off, for instance, stands at the last step.
+    tracker.video(run, dataclasses.replace(finished.video, episode=None, view="side"))
     tracker.end(run)
     events = read(run.directory / "tensorboard" / "0.4711")
+    assert [image.step for image in events.Images("training/video_side")] == [60]
     [image] = events.Images("training/video")
     assert (image.step, image.height, image.width) == (10, 32, 48)
     gif = image.encoded_image_string
@@ -123,17 +115,6 @@ def test_monitor_tells_it_everything(
     assert directory.name in manifest.name
 
 
-def test_video_of_no_episode_stands_at_the_last_step(finished: Finished) -> None:
-    """One that was cut off, for instance."""
-    tracker, run = TensorBoardTracker(), finished.run
-    tracker.begin(run)
-    tracker.episode(run, episode(3))
-    tracker.video(run, dataclasses.replace(finished.video, episode=None))
-    tracker.end(run)
-    events = read(run.directory / "tensorboard" / "0.4711")
-    assert [image.step for image in events.Images("training/video")] == [40]
-
-
 def test_runs_are_told_apart(finished: Finished, tmp_path: Path) -> None:
     """Sub-environments, and two directories with one infix, in one `log_dir`."""
     first = finished.run
@@ -161,51 +142,26 @@ def test_runs_are_told_apart(finished: Finished, tmp_path: Path) -> None:
     }
 
 
-def test_two_trackers_never_share_an_event_file(finished: Finished) -> None:
-    """TensorBoard would stop reading the first."""
-    for _ in range(2):
-        tracker = TensorBoardTracker()
-        tracker.begin(finished.run)
-        tracker.end(finished.run)
-    parent = finished.run.directory / "tensorboard"
-    assert sorted(path.name for path in parent.iterdir()) == ["0.4711", "0.4711-2"]
-    assert len(list(parent.glob("*/events.out.tfevents.*"))) == 2
-
-
-def test_damaged_video_is_ffmpegs_error(finished: Finished) -> None:
-    """It comes home at the end at the latest, and the events before it stay."""
+def test_damaged_files_are_named(finished: Finished, tmp_path: Path) -> None:
+    """Ffmpeg's error comes home at the end at the latest; events before it stay."""
     finished.video.path.write_bytes(b"no video")
     tracker, run = TensorBoardTracker(), finished.run
     tracker.begin(run)
     tracker.episode(run, episode())
+    # Events are there at once: a killed process loses none.
+    assert read(run.directory / "tensorboard" / "0.4711").Scalars("training/return")
     tracker.video(run, finished.video)
-    with pytest.raises(
-        EncoderError, match=r"(?s)No preview .*mp4.*Invalid data"
-    ) as caught:
+    finished.video.metadata_path.write_text(json.dumps({"fps": "10"}))
+    with pytest.raises(UnreadableFile, match=r"meta\.json: it has no 'frame_count'"):
+        tracker.video(run, finished.video)
+    with pytest.raises(EncoderError, match=r"(?s)No preview .*mp4.*Invalid data"):
         tracker.end(run)
-    assert caught.value.returncode != 0
     events = read(run.directory / "tensorboard" / "0.4711")
     assert events.Tags()["scalars"] == ["training/return", "training/length"]
     assert events.Tags()["images"] == []
-
-
-def test_damaged_metadata_is_named(finished: Finished) -> None:
-    """Without it nobody knows how long the video is."""
-    finished.video.metadata_path.write_text(json.dumps({"fps": "10"}))
-    tracker = TensorBoardTracker()
-    tracker.begin(finished.run)
-    with pytest.raises(UnreadableFile, match=r"meta\.json: it has no 'frame_count'"):
-        tracker.video(finished.run, finished.video)
-    tracker.end(finished.run)
-
-
-def test_directory_that_cannot_be_made_is_named(
-    finished: Finished, tmp_path: Path
-) -> None:
-    """A file has its name."""
     (tmp_path / "taken").write_text("")
     with pytest.raises(DirectoryNotWritable, match="taken"):
-        TensorBoardTracker(tmp_path / "taken").begin(finished.run)
+        TensorBoardTracker(tmp_path / "taken").begin(run)
 
 
 def test_gif_of_a_long_video_is_bounded(finished: Finished) -> None:

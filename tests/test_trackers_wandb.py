@@ -110,45 +110,21 @@ def test_own_run_ends_with_the_last_monitor(finished: Finished, tmp_path: Path) 
     assert logged(tmp_path, "training/return") == [1.5]
 
 
-def test_given_run_stays_open(finished: Finished, tmp_path: Path) -> None:
-    """Its owner goes on logging."""
-    given = wandb.init(**offline(tmp_path))
-    tracker = WandbTracker(given)
-    tracker.begin(finished.run)
-    tracker.episode(finished.run, episode(1))
-    tracker.end(finished.run)
-    given.log({"loss": 0.5})
-    given.finish()
-    assert logged(tmp_path, "training/return") == [1.5]
-    assert logged(tmp_path, "loss") == [0.5]
-
-
-def test_active_run_is_used_and_stays_open(finished: Finished, tmp_path: Path) -> None:
-    """Where a tracker is told nothing."""
-    active = wandb.init(**offline(tmp_path))
-    tracker = WandbTracker()
-    tracker.begin(finished.run)
-    tracker.episode(finished.run, episode(1))
-    tracker.end(finished.run)
-    active.log({"loss": 0.5})
-    active.finish()
-    assert logged(tmp_path, "training/return") == [1.5]
-    assert logged(tmp_path, "loss") == [0.5]
-
-
-def test_asked_for_a_run_it_makes_one_beside_the_active(
-    finished: Finished, tmp_path: Path
+@pytest.mark.parametrize("how", ["given", "active", "beside"])
+def test_a_run_of_others_stays_open(
+    how: str, finished: Finished, tmp_path: Path
 ) -> None:
-    """And finishes only its own."""
+    """One that is given, or is active; asked for another, it makes and ends that."""
     for name in ("theirs", "ours"):
         (tmp_path / name).mkdir()
-    active = wandb.init(**offline(tmp_path / "theirs"))
-    tracker = WandbTracker(**offline(tmp_path / "ours"))
+    theirs = wandb.init(**offline(tmp_path / "theirs"))
+    options = offline(tmp_path / "ours") if how == "beside" else {}
+    tracker = WandbTracker(theirs if how == "given" else None, **options)
     tracker.begin(finished.run)
     tracker.episode(finished.run, episode(1))
     tracker.end(finished.run)
-    active.log({"loss": 0.5})
-    active.finish()
-    assert logged(tmp_path / "ours", "training/return") == [1.5]
-    assert logged(tmp_path / "theirs", "training/return") == []
+    theirs.log({"loss": 0.5})
+    theirs.finish()
     assert logged(tmp_path / "theirs", "loss") == [0.5]
+    place = tmp_path / ("ours" if how == "beside" else "theirs")
+    assert logged(place, "training/return") == [1.5]

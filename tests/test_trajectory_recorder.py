@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from trajectories_by_hand import INFIX, new_logs
+from trajectory_contents import TrajectoryContent, content_of
 
 from mjrec.errors import FileNotWritten, PicturesDiffer
 from mjrec.formats.in_flight import recordings_in_flight
@@ -20,13 +20,10 @@ from mjrec.formats.trajectory import (
     Array,
     RowLayout,
     StateComponent,
-    TrajectoryContent,
 )
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.recorder.stats_recorder import StatsRecorder
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
-from mjrec.simulation.gathering import words_of
-from mjrec.simulation.state_source import EpisodeStart, MomentMemory
+from mjrec.simulation.capture import EpisodeStart
 
 
 class Counter:
@@ -77,32 +74,9 @@ class Counter:
     def close(self) -> None: ...
 
 
-class Remembered(Counter):
-    """The same with memory of its own, where asking is needed only now and then."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.asked: list[int] = []
-        self.numbers = np.zeros(6)
-        memory = MomentMemory(
-            words=words_of([self.numbers]),
-            owners=self.numbers,
-            is_current=self.is_current,
-        )
-        self.start = dataclasses.replace(Counter.start, memory=memory)
-
-    def is_current(self) -> bool:
-        self.numbers[:] = (self.time(), self.step, -self.step, *[self.step] * 3)
-        return self.step not in self.changes and self.step < self.hidden_from
-
-    def capture_state(self, out: Any) -> None:
-        self.asked.append(self.step)
-        super().capture_state(out)
-
-
 def recorder(
     path: Path,
-    states: Counter | None,
+    states: Any,
     *,
     max_fps: Any = None,
     observation: Any = None,
@@ -145,7 +119,7 @@ NAME = f"{trajectory_prefix(INFIX, 3)}.h5"
 def content(path: Path) -> TrajectoryContent:
     """Return what a log has of a trajectory."""
     with open_trajectory(path) as reader:
-        return reader.content()
+        return content_of(reader)
 
 
 def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:
@@ -170,126 +144,6 @@ def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:
     assert trajectory.frame_count == 4
 
 
-def stats_of_an_episode(directory: Path) -> StatsRecorder:
-    """Return what counts the steps of an episode that has begun."""
-    stats = StatsRecorder(str(directory), "stats")
-    stats.before_reset()
-    stats.after_reset()
-    return stats
-
-
-def take_usual_step(
-    trajectory: TrajectoryRecorder, states: Counter, step: int, stats: StatsRecorder
-) -> None:
-    """Take a step as the recorder of an episode does, the fast way if it can."""
-    action, fast = np.full(2, step, np.float32), trajectory.fast_path(stats)
-    if fast is None or not fast.before_step(action):
-        trajectory.before_step(action)
-    states.step = step
-    if fast is None or not fast.step(step / 2):
-        trajectory.step(step / 2, False, False, None, False, True)
-
-
-@pytest.mark.parametrize(("max_fps", "hidden_from"), [(None, 99), (25, 99), (None, 7)])
-def test_memory_of_the_simulation_gives_the_same(
-    tmp_path: Path, max_fps: Any, hidden_from: int
-) -> None:
-    """It is asked at the reset, at the first step, and where something has changed."""
-    logs = []
-    for states in (Counter(), Remembered()):
-        states.changes[5] = {"geom_rgba": np.zeros((1, 4), np.float32)}
-        states.hidden_from = hidden_from
-        path = tmp_path / type(states).__name__ / NAME
-        path.parent.mkdir()
-        trajectory = recorder(path, states, max_fps=max_fps)
-        stats = stats_of_an_episode(tmp_path)
-        for step in range(1, 10):
-            try:
-                take_usual_step(trajectory, states, step, stats)
-            except PicturesDiffer as error:
-                trajectory.stop_frames(str(error))
-        trajectory.take_frame()
-        trajectory.end({})
-        logs.append(path)
-    read, expected = content(logs[1]), content(logs[0])
-    assert read.states.tobytes() == expected.states.tobytes()
-    assert read.actions is not None
-    assert expected.actions is not None
-    assert read.actions.tobytes() == expected.actions.tobytes()
-    assert read.rewards.tolist() == expected.rewards.tolist()
-    assert read.snapshots.tobytes() == expected.snapshots.tobytes()
-    assert read.frame_steps.tolist() == expected.frame_steps.tolist()
-    assert read.header.facts == expected.header.facts
-    assert [change.step for change in read.model_changes] == [
-        change.step for change in expected.model_changes
-    ]
-    assert isinstance(states, Remembered)
-    assert states.asked == [0, 1, 5, *range(hidden_from, 10)]
-
-
-def test_there_is_a_fast_path_from_the_second_step_on(tmp_path: Path) -> None:
-    """As long as frames are taken: the first step tells how long one is."""
-    states, stats = Remembered(), stats_of_an_episode(tmp_path)
-    trajectory = recorder(tmp_path / NAME, states, max_fps=25)
-    assert trajectory.fast_path(stats) is None
-    play(trajectory, states, 1, done=False)
-    assert trajectory.fast_path(stats) is not None
-    trajectory.stop_frames("a marker is in the way")
-    assert trajectory.fast_path(stats) is None
-    trajectory.discard()
-
-
-def test_there_is_no_fast_path_after_a_stop(tmp_path: Path) -> None:
-    """Nothing more is recorded, by whichever way."""
-    states, stats = Remembered(), stats_of_an_episode(tmp_path)
-    trajectory = recorder(tmp_path / NAME, states)
-    play(trajectory, states, 1, done=False)
-    assert trajectory.fast_path(stats) is not None
-    trajectory.stop("the disk is full")
-    assert trajectory.fast_path(stats) is None
-    trajectory.discard()
-
-
-@pytest.mark.parametrize("observation", [None, np.zeros(2)])
-def test_what_needs_a_closer_look_has_no_fast_path(
-    tmp_path: Path, observation: Any
-) -> None:
-    """A simulation without memory that is known, and observations of its steps."""
-    states = Counter() if observation is None else Remembered()
-    trajectory = recorder(tmp_path / NAME, states, observation=observation)
-    play(trajectory, states, 2, done=False, observe=lambda _: observation)
-    assert trajectory.fast_path(stats_of_an_episode(tmp_path)) is None
-    trajectory.discard()
-
-
-def test_an_odd_action_is_none_of_the_fast_path(tmp_path: Path) -> None:
-    """`before_step` is to be asked, which notes it."""
-    states = Remembered()
-    trajectory = recorder(tmp_path / NAME, states)
-    play(trajectory, states, 1, done=False)
-    fast = trajectory.fast_path(stats_of_an_episode(tmp_path))
-    assert fast is not None
-    assert fast.before_step(np.zeros(2, np.float32)) is True
-    assert fast.before_step(np.zeros(5)) is False
-    trajectory.discard()
-
-
-def test_the_step_of_the_last_frame_is_known(tmp_path: Path) -> None:
-    """None is taken twice, and -1 is none."""
-    states = Counter()
-    trajectory = recorder(tmp_path / NAME, states, max_fps=25)
-    seen = [trajectory.last_frame]
-    for step in range(1, 4):
-        trajectory.before_step(np.full(2, step, np.float32))
-        states.step = step
-        trajectory.step(0.0, False, False, None, False, True)
-        seen.append(trajectory.last_frame)
-    trajectory.take_frame()
-    assert [*seen, trajectory.last_frame] == [-1, 0, 2, 2, 3]
-    assert trajectory.frame_count == 3
-    trajectory.discard()
-
-
 @pytest.mark.parametrize(
     ("max_fps", "steps", "frames"),
     [
@@ -312,19 +166,6 @@ def test_every_nth_step_and_the_last(
     assert read.states[:, 1].tolist() == list(range(steps + 1))
 
 
-def test_last_frame_of_an_episode_that_is_not_over(tmp_path: Path) -> None:
-    """It is taken when somebody asks, and only once."""
-    states, path = Counter(), tmp_path / NAME
-    trajectory = recorder(path, states, max_fps=10)
-    play(trajectory, states, 3, done=False)
-    trajectory.take_frame()
-    trajectory.take_frame()
-    trajectory.end({"complete": False, "reason": "close"})
-    read = content(path)
-    assert read.frame_steps.tolist() == [0, 3]
-    assert read.header.facts["reason"] == "close"
-
-
 def test_reset_alone_leaves_nothing_until_the_end(tmp_path: Path) -> None:
     """A reset that is replaced has no log; one that is the end has a frame."""
     states, path = Counter(), tmp_path / NAME
@@ -343,17 +184,6 @@ def test_reset_alone_leaves_nothing_until_the_end(tmp_path: Path) -> None:
     assert read.header.facts["complete"] is False
 
 
-def test_model_changes_go_with_their_steps(tmp_path: Path) -> None:
-    """Those since the model was stored at step 0, later ones at theirs."""
-    states, path = Counter(), tmp_path / NAME
-    states.changes[2] = {"site_rgba": np.zeros((1, 4), np.float32)}
-    trajectory = recorder(path, states)
-    play(trajectory, states, 3)
-    trajectory.end({})
-    changes = [(c.step, list(c.fields)) for c in content(path).model_changes]
-    assert changes == [(0, ["geom_rgba"]), (2, ["site_rgba"])]
-
-
 def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> None:
     """For environments whose state nobody can see."""
     path = tmp_path / NAME
@@ -367,17 +197,6 @@ def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> N
     assert (read.actions.tolist(), read.rewards.tolist()) == ([1], [1.0])
     assert read.frame_steps.size == 0
     assert read.header.facts["timestep"] is None
-
-
-def test_observations_where_they_are_asked_for(tmp_path: Path) -> None:
-    """That of the reset is the first."""
-    states, path = Counter(), tmp_path / NAME
-    trajectory = recorder(path, states, observation=np.zeros(2))
-    play(trajectory, states, 2, observe=lambda step: np.full(2, step))
-    trajectory.end({})
-    read = content(path)
-    assert read.observations is not None
-    assert read.observations.tolist() == [[0, 0], [1, 1], [2, 2]]
 
 
 def test_dictionaries_say_what_they_were_made_from(tmp_path: Path) -> None:
@@ -394,24 +213,6 @@ def test_dictionaries_say_what_they_were_made_from(tmp_path: Path) -> None:
     assert parts == [["goal", [2]], ["speed", []]]
 
 
-def test_odd_action_is_noted_and_nothing_stops(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """An environment may take what the first action was not like."""
-    states, path = Counter(), tmp_path / NAME
-    trajectory = recorder(path, states)
-    play(trajectory, states, 1, done=False)
-    for _ in range(2):
-        trajectory.before_step(np.zeros(5))
-        trajectory.step(0.0, False, False, None, False, True)
-    trajectory.end({})
-    read = content(path)
-    assert read.actions is not None
-    assert read.actions.tolist() == [[1, 1], [0, 0], [0, 0]]
-    assert read.header.facts["irregular_actions_from"] == 1
-    assert caplog.text.count("not like those before") == 1
-
-
 def test_state_after_an_environments_own_reset_is_not_a_number(tmp_path: Path) -> None:
     """It belongs to the next episode; there is no frame of it either."""
     states, path = Counter(), tmp_path / NAME
@@ -425,34 +226,23 @@ def test_state_after_an_environments_own_reset_is_not_a_number(tmp_path: Path) -
 
 
 def test_frames_stop_where_they_would_differ(tmp_path: Path) -> None:
-    """States go on; the facts say why there are no more frames."""
+    """States and changes of the model go on; the facts say why frames do not."""
     states, path = Counter(), tmp_path / NAME
     states.hidden_from = 2
+    states.changes[3] = {"site_rgba": np.zeros((1, 4), np.float32)}
     trajectory = recorder(path, states)
     with pytest.raises(PicturesDiffer):
         play(trajectory, states, 2, done=False)
     trajectory.stop_frames("a marker is in the way")
     trajectory.before_step(np.zeros(2))
+    states.step = 3
     trajectory.step(0.0, True, False, None, True, True)
     trajectory.end({})
     read = content(path)
     assert (len(read.rewards), read.frame_steps.tolist()) == (3, [0, 1])
+    changes = [(c.step, list(c.fields)) for c in read.model_changes]
+    assert changes == [(0, ["geom_rgba"]), (3, ["site_rgba"])]
     assert read.header.facts["broken_reason"] == "a marker is in the way"
-
-
-def test_what_changes_is_noted_without_frames_too(tmp_path: Path) -> None:
-    """After the frames have stopped the model of a step is still known."""
-    states, path = Counter(), tmp_path / NAME
-    trajectory = recorder(path, states)
-    play(trajectory, states, 1, done=False)
-    trajectory.stop_frames("a marker is in the way")
-    states.changes[2] = {"site_rgba": np.zeros((1, 4), np.float32)}
-    trajectory.before_step(np.zeros(2))
-    states.step = 2
-    trajectory.step(0.0, True, False, None, True, True)
-    trajectory.end({})
-    changes = [(c.step, list(c.fields)) for c in content(path).model_changes]
-    assert changes == [(0, ["geom_rgba"]), (2, ["site_rgba"])]
 
 
 def test_step_without_a_state_is_a_step_all_the_same(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import contextlib
+import functools
 import gc
 import hashlib
 import json
@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
 from processes import children
 from vector_environments import (
@@ -32,20 +32,27 @@ from vector_environments import (
 )
 
 import mjrec
-from mjrec import Error, InvalidArgument, NoPictures, ResetNeeded, ResetNotAllowed
+from mjrec import (
+    Error,
+    InvalidArgument,
+    NoPictures,
+    PicturesDiffer,
+    ResetNeeded,
+    ResetNotAllowed,
+)
+from mjrec.recorder.tracking import Tracker
 
 LENGTHS = (2, 3)
 
 
 @pytest.fixture
 def corridors(make_corridor: Any) -> Any:
-    """Make a `SyncVectorEnv` of corridors that are 2 and 3 steps long."""
+    """Make corridors that are 2 and 3 steps long, in a list or in one object."""
 
-    def make(mode: Any = NEXT_STEP, **arguments: Any) -> Any:
-        each = [
-            lambda length=length: make_corridor(length, **arguments)
-            for length in LENGTHS
-        ]
+    def make(mode: Any = NEXT_STEP, *, inside: bool = True) -> Any:
+        if not inside:
+            return VectorCorridor(LENGTHS, mode)
+        each = [functools.partial(make_corridor, length) for length in LENGTHS]
         return SyncVectorEnv(each, autoreset_mode=mode)
 
     return make
@@ -67,48 +74,62 @@ def hoppers(mode: Any, *, max_episode_steps: int = 3, count: int = 2) -> Any:
 # --- whole episodes, each of its own ---------------------------------------------
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("inside", "mode"),
+    [*((True, mode) for mode in MODES), (False, NEXT_STEP), (False, DISABLED)],
+)
 def test_every_sub_environment_has_whole_videos(
-    corridors: Any, tmp_path: Path, mode: Any
+    corridors: Any, tmp_path: Path, inside: bool, mode: Any
 ) -> None:
     """Each shows its reset and all its steps, the terminal one included."""
-    with mjrec.Monitor(corridors(mode), tmp_path) as env:
+    with mjrec.Monitor(corridors(mode, inside=inside), tmp_path) as env:
         play(env, 8)
     for monitor, length in zip(env.monitors, LENGTHS, strict=True):
         for episode in (0, 1):
             path = path_of(monitor, episode, "mp4")
-            assert shown(path) == list(range(length + 1))
+            assert shown(path, step=4 if inside else 16) == list(range(length + 1))
             assert "final_frame" not in metadata_at(path.with_suffix(".meta.json"))
+
+
+def test_a_frame_that_nobody_sees_is_said_to_be_missing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In SAME_STEP the metadata says so, and one warning for all."""
+    with mjrec.Monitor(VectorCorridor(LENGTHS, SAME_STEP), tmp_path) as env:
+        play(env, 8)
+    for monitor, length in zip(env.monitors, LENGTHS, strict=True):
+        path = path_of(monitor, 1, "mp4")
+        assert shown(path, step=16) == list(range(length))
+        assert metadata_at(path.with_suffix(".meta.json"))["final_frame"] == "missing"
+    [warning] = [r.message for r in caplog.records if "last frame" in r.message]
+    assert "Monitor inside each of the functions" in warning
+    caplog.clear()
+    vector = VectorCorridor(LENGTHS, SAME_STEP)
+    with mjrec.Monitor(vector, tmp_path / "no videos", False) as env:
+        play(env, 4)
+    assert "frame" not in caplog.text
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_statistics_are_those_of_gymnasium(tmp_path: Path, mode: Any) -> None:
     """Lengths and returns are those that RecordEpisodeStatistics has."""
-    arguments = {"vector_kwargs": {"autoreset_mode": mode}}
-    inner = gymnasium.make_vec("CartPole-v1", 3, "sync", **arguments)
-    with mjrec.Monitor(inner, tmp_path, video_callable=False) as env:
-        counted = RecordEpisodeStatistics(env)
-        ended: list[list[tuple[float, int]]] = [[], [], []]
-        counted.reset(seed=1)
-        counted.action_space.seed(1)
-        for _ in range(80):
-            *_, terminations, _, infos = counted.step(counted.action_space.sample())
-            for index in np.flatnonzero(terminations):
-                episode = infos["episode"]
-                ended[index].append((episode["r"][index], episode["l"][index]))
-            if mode == DISABLED and terminations.any():
-                env.reset(options={"reset_mask": terminations.copy()})
-                # Gymnasium's own reset would find no mask any more.
-                counted.episode_returns[terminations] = 0
-                counted.episode_lengths[terminations] = 0
-                counted.prev_dones[terminations] = False
-    assert sum(map(len, ended)) > 5
-    assert env.get_episode_rewards() == [[r for r, _ in each] for each in ended]
-    assert env.get_episode_lengths() == [[n for _, n in each] for each in ended]
-    assert env.get_total_steps() == sum(m.get_total_steps() for m in env.monitors)
+    counted = RecordEpisodeStatistics(VectorCorridor((2, 3, 5), mode))
+    with mjrec.Monitor(counted, tmp_path, False) as env:
+        play(env, 12)
+    ours = sorted(
+        (length, reward)
+        for monitor in env.monitors
+        for length, reward in zip(
+            monitor.get_episode_lengths(), monitor.get_episode_rewards(), strict=True
+        )
+    )
+    if mode != DISABLED:  # whose mask Gymnasium's own wrapper loses
+        theirs = zip(counted.length_queue, counted.return_queue, strict=True)
+        assert ours == sorted((int(n), float(r)) for n, r in theirs)
+    expected = {NEXT_STEP: 4 + 3 + 2, SAME_STEP: 6 + 4 + 2, DISABLED: 6 + 4 + 2}
+    assert len(ours) == expected[mode]
 
 
-# Takes more than five seconds: each sub-environment is drawn alone, too.
 def test_terminal_frames_are_those_of_render(tmp_path: Path) -> None:
     """In SAME_STEP the deferred frames are byte for byte those of one environment."""
     with mjrec.Monitor(hoppers(SAME_STEP), tmp_path) as env:
@@ -128,18 +149,21 @@ def test_terminal_frames_are_those_of_render(tmp_path: Path) -> None:
     alone.close()
 
 
-def test_trajectories_have_states_in_every_mode(tmp_path: Path) -> None:
-    """They are of the sub-environment, with a state for the terminal step."""
-    with mjrec.Monitor(
-        hoppers(SAME_STEP), tmp_path, render="off", mode="evaluation"
-    ) as e:
-        play(e, 4, seed=2)
-    for monitor in e.monitors:
+def test_sub_environments_share_one_budget_of_tails(tmp_path: Path) -> None:
+    """Each of 64 is recorded, and their logs' tails have 4 MiB together."""
+    make = functools.partial(gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2)
+    vector = SyncVectorEnv([make] * 64)
+    with mjrec.Monitor(vector, tmp_path, False, mode="evaluation", render="off") as env:
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+        tails = [path.stat().st_size for path in tmp_path.glob("*.tail")]
+        assert len(tails) == 64
+        assert sum(tails) < 5 << 20
+        env.step(env.action_space.sample())
+    assert env.get_episode_lengths() == [[2]] * 64
+    for monitor in env.monitors:
         name = f"openaigym.trajectory.{monitor.infix}.episode000000.h5"
-        trajectory = mjrec.load_trajectory(tmp_path / name)
-        assert trajectory.states.shape[0] == 4
-        assert np.isfinite(trajectory.states).all()
-        assert trajectory.truncated[-1]
+        assert len(mjrec.load_trajectory(tmp_path / name).actions) == 2
 
 
 def test_numbers_and_schedules_are_each_ones_own(
@@ -157,58 +181,6 @@ def test_numbers_and_schedules_are_each_ones_own(
         path = tmp_path / f"openaigym.manifest.{monitor.infix}.manifest.json"
         [[video, _]] = metadata_at(path)["videos"]
         assert video == path_of(monitor, 1, "mp4").name
-
-
-def test_seeds_are_those_that_each_was_given(corridors: Any, tmp_path: Path) -> None:
-    """A whole number counts on from one to the next, as SyncVectorEnv does."""
-    with mjrec.Monitor(corridors(DISABLED), tmp_path, False) as env:
-        play(env, 3, seed=40)
-    seeds = []
-    for monitor in env.monitors:
-        journal = tmp_path / f"openaigym.episodes.{monitor.infix}.jsonl"
-        entries = map(json.loads, journal.read_text().splitlines())
-        seeds.append(next(e["seed"] for e in entries if "seed" in e))
-    assert seeds == [40, 41]
-
-
-def test_rewards_are_those_below_vector_wrappers(
-    corridors: Any, tmp_path: Path
-) -> None:
-    """Below other wrappers the environments are found too."""
-    scaled = TransformReward(corridors(), lambda rewards: 10 * rewards)
-    with mjrec.Monitor(scaled, tmp_path, False) as env:
-        env.reset()
-        _, rewards, *_ = env.step(np.array([0, 0]))
-        assert list(rewards) == [5.0, 5.0]
-        env.step(np.array([0, 0]))
-    assert env.get_episode_rewards() == [[1.0], []]
-
-
-def test_calls_still_reach_the_sub_environments(corridors: Any, tmp_path: Path) -> None:
-    """Attributes are read and set through the monitors."""
-    vector = corridors()
-    with mjrec.Monitor(vector, tmp_path, False):
-        assert vector.get_attr("length") == LENGTHS
-        vector.set_attr("marked", [1, 2])
-        assert vector.call("marked") == (1, 2)
-        assert len(vector.render()) == 2
-
-
-def test_a_name_prefix_names_the_sub_environment(
-    corridors: Any, tmp_path: Path
-) -> None:
-    """Links of two sub-environments have different names."""
-    with mjrec.Monitor(corridors(), tmp_path, name_prefix="walk") as env:
-        options = [monitor._options.name_prefix for monitor in env.monitors]
-    assert options == ["walk-env-0", "walk-env-1"]
-
-
-def test_mode_is_that_of_all(corridors: Any, tmp_path: Path) -> None:
-    """`set_monitor_mode` is for each of them."""
-    with mjrec.Monitor(corridors(), tmp_path, False) as env:
-        env.set_monitor_mode("evaluation")
-        play(env, 3)
-    assert [m.stats_recorder.episode_types for m in env.monitors] == [["e"], ["e"]]
 
 
 # --- one rendering for all ---------------------------------------------------------
@@ -251,17 +223,32 @@ def test_whoever_does_not_wait_leaves_videos_pending(tmp_path: Path) -> None:
 
 
 def test_closing_puts_the_environments_back(corridors: Any, tmp_path: Path) -> None:
-    """Each is closed once, and the list is as it was."""
+    """Each is closed once; until then calls reach them through their monitors."""
     vector = corridors()
     originals = list(vector.envs)
-    env = mjrec.Monitor(vector, tmp_path, False)
+    scaled = TransformReward(vector, lambda rewards: 10 * rewards)
+    env = mjrec.Monitor(scaled, tmp_path, False, name_prefix="walk")
     assert all(a is b for a, b in zip(vector.envs, env.monitors, strict=True))
-    play(env, 2)
+    env.set_monitor_mode("evaluation")
+    env.reset(seed=40)
+    assert list(env.step(np.array([0, 0]))[1]) == [5.0, 5.0]
+    env.step(np.array([0, 0]))
+    assert vector.get_attr("length") == LENGTHS
+    assert len(vector.render()) == 2
     env.close()
     env.close()
     assert vector.envs == originals
     assert [each.closed for each in originals] == [1, 1]
-    assert vector.closed
+    env.reset()
+    env.step(np.array([0, 0]))
+    # Rewards are those below vector wrappers; after close nothing is recorded.
+    assert env.get_episode_rewards() == [[1.0], []]
+    assert [m.stats_recorder.episode_types for m in env.monitors] == [["e"], []]
+    for index, monitor in enumerate(env.monitors):
+        # Links of two sub-environments have different names.
+        assert monitor._options.name_prefix == f"walk-env-{index}"
+        journal = tmp_path / f"openaigym.episodes.{monitor.infix}.jsonl"
+        assert ('"seed": 40' in journal.read_text()) is (index == 0)
 
 
 def test_closing_the_inner_environment_finishes_the_recordings(
@@ -276,33 +263,26 @@ def test_closing_the_inner_environment_finishes_the_recordings(
     env.close()
 
 
+@pytest.mark.parametrize("resume", [False, True])
 def test_a_failing_constructor_leaves_no_trace(
-    corridors: Any, make_corridor: Any, tmp_path: Path
+    make_corridor: Any, tmp_path: Path, names: Any, resume: bool
 ) -> None:
     """The last sub-environment cannot be drawn: nothing was made of the first."""
+    target = tmp_path / "a" / "b"
+    if resume:
+        with mjrec.Monitor(make_corridor(), target) as env:
+            env.reset()
+    before = names(target) if resume else None
     vector = SyncVectorEnv([make_corridor, lambda: make_corridor(render_mode=None)])
     originals = list(vector.envs)
-    target = tmp_path / "a" / "b"
     with pytest.raises(NoPictures, match="render_mode"):
-        mjrec.Monitor(vector, target)
+        mjrec.Monitor(vector, target, resume=resume)
     assert vector.envs == originals
     assert [each.closed for each in originals] == [0, 0]
-    assert not list(tmp_path.iterdir())
-    with mjrec.Monitor(vector, target, False) as env:
-        play(env, 2)
-
-
-def test_a_failing_constructor_keeps_other_recordings(
-    make_corridor: Any, tmp_path: Path, names: Any
-) -> None:
-    """With `resume`, only what this monitor has made is removed."""
-    with mjrec.Monitor(make_corridor(), tmp_path) as env:
-        env.reset()
-    there = names(tmp_path)
-    vector = SyncVectorEnv([make_corridor, lambda: make_corridor(render_mode=None)])
-    with pytest.raises(NoPictures):
-        mjrec.Monitor(vector, tmp_path, resume=True)
-    assert names(tmp_path) == there
+    if resume:
+        assert names(target) == before
+    else:
+        assert not list(tmp_path.iterdir())
 
 
 def test_recordings_are_resumed_together(corridors: Any, tmp_path: Path) -> None:
@@ -352,43 +332,29 @@ def test_a_program_that_ends_without_closing_loses_nothing(tmp_path: Path) -> No
     assert all(len(m["mjrec"]["pending"]) + len(m["videos"]) == 1 for m in manifests)
 
 
-def test_after_close_nothing_is_recorded(corridors: Any, tmp_path: Path) -> None:
-    """Calls go on to the environment."""
-    env = mjrec.Monitor(corridors(), tmp_path, False)
-    env.close()
-    env.reset()
-    env.step(np.array([0, 0]))
-    assert env.get_total_steps() == 0
-
-
-def test_it_cannot_be_pickled(corridors: Any, tmp_path: Path) -> None:
-    """The error says where to make one."""
-    with (
-        mjrec.Monitor(corridors(), tmp_path, False) as env,
-        pytest.raises(mjrec.NotPicklable, match="VectorMonitor"),
-    ):
-        pickle.dumps(env)
-
-
 # --- errors and wrong use ------------------------------------------------------------
 
 
-def test_errors_of_the_environment_are_noted_in_all_episodes(
-    corridors: Any, tmp_path: Path
+@pytest.mark.parametrize("inside", [True, False])
+def test_errors_are_noted_in_all_running_episodes(
+    corridors: Any, tmp_path: Path, inside: bool
 ) -> None:
-    """The videos of those that run say what has ended them."""
-    vector = corridors()
-    with (
-        contextlib.suppress(RuntimeError),
-        mjrec.Monitor(vector, tmp_path, lambda n: True) as env,
-    ):
-        env.reset()
+    """Their videos say what has ended them; nothing can be pickled or misused."""
+    vector = corridors(inside=inside)
 
-        def explode(action: Any) -> None:
-            raise RuntimeError("the motor burns")
+    def explode(action: Any) -> None:
+        raise RuntimeError("the motor burns")
 
-        vector.envs[1].unwrapped.step = explode
+    env = mjrec.Monitor(vector, tmp_path)
+    with pytest.raises(mjrec.NotPicklable, match="VectorMonitor"):
+        pickle.dumps(env)
+    with pytest.raises(ResetNeeded):
         env.step(np.array([0, 0]))
+    env.reset()
+    (vector.envs[1].unwrapped if inside else vector).step = explode
+    with pytest.raises(RuntimeError):
+        env.step(np.array([0, 0]))
+    env.close()
     for monitor in env.monitors:
         said = metadata_at(path_of(monitor, 0, "meta.json"))
         assert said["exception"]["message"] == "the motor burns"
@@ -417,14 +383,6 @@ def test_an_early_reset_can_be_forbidden(corridors: Any, tmp_path: Path) -> None
         assert [m.episode_id for m in env.monitors] == [1, 1]
         env.reset(options={"reset_mask": np.array([True, False])})
         assert [m.episode_id for m in env.monitors] == [2, 1]
-
-
-def test_a_step_before_the_first_reset_is_refused(
-    corridors: Any, tmp_path: Path
-) -> None:
-    """As for one environment."""
-    with mjrec.Monitor(corridors(), tmp_path) as env, pytest.raises(ResetNeeded):
-        env.step(np.array([0, 0]))
 
 
 @pytest.mark.parametrize("mode", [None, "NextStep"])
@@ -459,6 +417,180 @@ def test_a_list_that_is_not_stepped_is_noticed(
         pytest.raises(Error, match="envs"),
     ):
         env.reset()
+
+
+# --- seen from outside ---
+
+
+def test_it_draws_once_a_step_and_only_for_videos(tmp_path: Path) -> None:
+    """One call of `render` is for all; without a running video there is none."""
+    vector = VectorCorridor((3, 3), NEXT_STEP)
+    with mjrec.Monitor(vector, tmp_path, lambda n: n == 0) as env:
+        play(env, 3)
+        assert vector.rendered == 4
+        for _ in range(8):
+            env.step(np.array([0, 0]))
+    assert vector.rendered == 4
+
+
+def test_trajectories_hold_what_can_be_seen(tmp_path: Path) -> None:
+    """Actions, rewards and observations; the last one is the episode's own."""
+    vector = VectorCorridor(LENGTHS, SAME_STEP)
+    with mjrec.Monitor(
+        vector, tmp_path, False, mode="evaluation", observations=True
+    ) as env:
+        env.reset()
+        for step in range(3):
+            env.step(np.array([step, 8 - step]))
+    first, second = (
+        mjrec.load_trajectory(
+            tmp_path / f"openaigym.trajectory.{m.infix}.episode000000.h5"
+        )
+        for m in env.monitors
+    )
+    assert first.actions.tolist() == [0, 1]
+    assert second.actions.tolist() == [8, 7, 6]
+    assert second.rewards.tolist() == [0.5] * 3
+    assert second.observations[:, 0].tolist() == [0, 1, 2, 3]
+    assert second.terminated.tolist() == [False, False, True]
+
+
+def test_success_is_read_from_the_final_info(tmp_path: Path) -> None:
+    """Trackers are told what the environment says of an episode that is over."""
+    told = []
+
+    class Listening(Tracker):
+        def episode(self, run: Any, episode: Any) -> None:
+            told.append((run.env_index, episode.success))
+
+    vector = VectorCorridor(LENGTHS, SAME_STEP)
+    with mjrec.Monitor(vector, tmp_path, False, trackers=Listening()) as env:
+        play(env, 3)
+    assert told == [(0, True), (1, True)]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_episode_info_is_that_of_gymnasium(tmp_path: Path, mode: Any) -> None:
+    """The step that ends episodes says their return and length, as a wrapper does."""
+    arguments = {"episode_info": True, "video_callable": False}
+    ours = mjrec.Monitor(VectorCorridor(LENGTHS, mode), tmp_path, **arguments)
+    theirs = RecordEpisodeStatistics(VectorCorridor(LENGTHS, mode))
+    with ours:
+        for env in (ours, theirs):
+            env.reset()
+            env.step(np.array([0, 0]))
+        infos = [env.step(np.array([0, 0]))[4] for env in (ours, theirs)]
+    for name in ("r", "l"):
+        assert list(infos[0]["episode"][name]) == list(infos[1]["episode"][name])
+    assert list(infos[0]["_episode"]) == list(infos[1]["_episode"]) == [True, False]
+    assert infos[0]["episode"]["t"].shape == (2,)
+
+
+def test_a_list_of_seeds_is_told_one_by_one(tmp_path: Path) -> None:
+    """A single seed, for one generator of all, is what each is told."""
+    with mjrec.Monitor(VectorCorridor((2, 2), DISABLED), tmp_path, False) as env:
+        for seed in ([5, 9], 3):
+            env.reset(seed=seed, options={"reset_mask": np.array([True, True]), "a": 1})
+            for _ in range(2):
+                env.step(np.array([0, 0]))
+    said = []
+    for monitor in env.monitors:
+        lines = (tmp_path / f"openaigym.episodes.{monitor.infix}.jsonl").read_text()
+        entries = [json.loads(line) for line in lines.splitlines()]
+        said.append([e["seed"] for e in entries if "seed" in e])
+        assert [e["options"] for e in entries if "seed" in e] == [{"a": 1}] * 2
+    assert said == [[5, 3], [9, 3]]
+
+
+def test_a_masked_reset_leaves_the_others_alone(tmp_path: Path) -> None:
+    """Their episodes go on."""
+    with mjrec.Monitor(VectorCorridor(LENGTHS, DISABLED), tmp_path) as env:
+        env.reset()
+        for _ in range(2):
+            env.step(np.array([0, 0]))
+        with pytest.raises(ResetNeeded):
+            env.step(np.array([0, 0]))
+        env.reset(options={"reset_mask": np.array([True, False])})
+        env.step(np.array([0, 0]))
+    assert env.get_episode_lengths() == [[2], [3]]
+    assert shown(path_of(env.monitors[1], 0, "mp4"), step=16) == [0, 1, 2, 3]
+
+
+def test_the_environment_is_closed_as_asked(tmp_path: Path) -> None:
+    """Arguments of its own `close` are passed on."""
+    vector = VectorCorridor()
+    env = mjrec.Monitor(vector, tmp_path, False)
+    env.close(reason="done")
+    env.close()
+    assert vector.closings == [{"reason": "done"}]
+
+
+def test_pictures_must_be_one_for_each(tmp_path: Path) -> None:
+    """Said at the first reset."""
+    vector = VectorCorridor()
+    vector.render = lambda: (np.zeros((8, 8, 3), np.uint8),)  # type: ignore[method-assign]
+    with (
+        mjrec.Monitor(vector, tmp_path) as env,
+        pytest.raises(InvalidArgument, match="each of its 2 sub-environments"),
+    ):
+        env.reset()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"render": "deferred"}, PicturesDiffer, "inside"),
+        ({"camera": 0}, InvalidArgument, "Make them with the camera and size"),
+        ({"height": 64, "width": 64}, InvalidArgument, "height, width cannot"),
+        ({}, NoPictures, "render_mode"),
+    ],
+)
+def test_what_cannot_be_had_from_outside(
+    tmp_path: Path, options: dict[str, Any], error: type[Error], message: str
+) -> None:
+    """The error says where it can be had, and nothing is left."""
+    vector = VectorCorridor(render_mode="rgb_array" if options else None)
+    with pytest.raises(error, match=message):
+        mjrec.Monitor(vector, tmp_path / "run", **options)
+    assert not list(tmp_path.iterdir())
+    with mjrec.Monitor(vector, tmp_path / "run", render="off") as env:
+        play(env, 2)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_environments_of_other_processes(
+    make_corridor: Any, tmp_path: Path, mode: Any
+) -> None:
+    """Videos of all their frames, but the last where nobody sees it."""
+    each = [lambda length=n: make_corridor(length) for n in LENGTHS]
+    vector = AsyncVectorEnv(each, autoreset_mode=mode)
+    with mjrec.Monitor(vector, tmp_path) as env:
+        play(env, 3, seed=8)
+    for index, (monitor, length) in enumerate(zip(env.monitors, LENGTHS, strict=True)):
+        frames = length if mode == SAME_STEP else length + 1
+        path = path_of(monitor, 0, "mp4")
+        assert shown(path) == list(range(frames))
+        assert metadata_at(path.with_suffix(".meta.json"))["seed"] == 8 + index
+    assert vector.closed
+
+
+def test_what_other_processes_know(tmp_path: Path) -> None:
+    """Their name and the time of their steps are asked for."""
+    vector = AsyncVectorEnv(
+        [
+            lambda: gymnasium.make(
+                "Hopper-v5", render_mode="rgb_array", width=64, height=64
+            )
+        ],
+        # What was forked from a process with an OpenGL context hangs in its own.
+        context="spawn",
+    )
+    with mjrec.Monitor(vector, tmp_path) as env:
+        play(env, 2, seed=1)
+    said = metadata_at(path_of(env.monitors[0], 0, "meta.json"))
+    assert said["env_id"] == "Hopper-v5"
+    assert said["fps"] == "125"
+    assert said["recording_reason"].endswith("not objects in this process")
 
 
 @pytest.fixture(autouse=True)

@@ -101,35 +101,17 @@ def test_the_frame_that_a_reset_hides_is_said_to_be_missing(
         assert (said["complete"], said["length"]) == (True, 2)
 
 
-def test_it_follows_the_schedule(corridors: Any, tmp_path: Path) -> None:
-    """Of the first sub-environment only."""
-    with mjrec.Monitor(
-        corridors(DISABLED, inside=True), tmp_path, lambda n: n == 1, tiled=True
-    ) as env:
-        play(env, 7)
-    names = sorted(path.name for path in tmp_path.glob("*.tiled.mp4"))
-    assert names == [path_of(env.monitors[0], 1, "tiled.mp4").name]
-
-
-def test_a_reset_of_others_adds_no_frame(tmp_path: Path) -> None:
-    """Frames belong to the steps of the first."""
+def test_a_second_reset_replaces_the_picture(tmp_path: Path) -> None:
+    """It leaves no video of its own; one of others adds no frame."""
     vector = VectorCorridor((3, 2), DISABLED)
-    with mjrec.Monitor(vector, tmp_path, tiled=True) as env:
-        env.reset()
-        for _ in range(2):
-            env.step(np.array([0, 0]))
-        env.reset(options={"reset_mask": np.array([False, True])})
-        env.step(np.array([0, 0]))
-    frames = frames_of(path_of(env.monitors[0], 0, "tiled.mp4"))
-    assert len(frames) == 4
-
-
-def test_a_second_reset_replaces_the_picture(corridors: Any, tmp_path: Path) -> None:
-    """A reset before any step leaves no video of its own."""
-    with mjrec.Monitor(corridors(NEXT_STEP, inside=True), tmp_path, tiled=True) as env:
+    with mjrec.Monitor(vector, tmp_path, lambda n: n == 0, tiled=True) as env:
         env.reset()
         play(env, 2)
-    assert len(frames_of(path_of(env.monitors[0], 0, "tiled.mp4"))) == 3
+        env.reset(options={"reset_mask": np.array([False, True])})
+        play(env, 6)
+    [path] = tmp_path.glob("*.tiled.mp4")
+    assert path == path_of(env.monitors[0], 0, "tiled.mp4")
+    assert len(frames_of(path)) == 3
     assert not list(tmp_path.glob(".*"))
 
 
@@ -205,21 +187,16 @@ def test_it_needs_pictures_of_all(tmp_path: Path) -> None:
     vector.close()
 
 
-def test_pictures_must_be_of_one_size(tmp_path: Path) -> None:
-    """Said at the first reset, with the way out."""
-    vector = VectorCorridor(heights=(32, 48))
-    with (
-        mjrec.Monitor(vector, tmp_path, tiled=True) as env,
-        pytest.raises(InvalidArgument, match="64x32, 64x48"),
-    ):
-        env.reset()
-
-
 def test_a_bad_picture_can_be_tolerated(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """With `on_error="warn"` everything else is recorded."""
+    """Sizes that differ are an error, or with `on_error="warn"` no tiled video."""
     vector = VectorCorridor(heights=(32, 48))
+    with (
+        mjrec.Monitor(vector, tmp_path / "raise", tiled=True) as env,
+        pytest.raises(InvalidArgument, match="64x32, 64x48"),
+    ):
+        env.reset()
     with mjrec.Monitor(vector, tmp_path, tiled=True, on_error="warn") as env:
         play(env, 3)
     assert "64x32, 64x48" in caplog.text
@@ -235,14 +212,6 @@ def test_it_follows_whole_episodes(tmp_path: Path, choice: dict[str, Any]) -> No
     with pytest.raises(InvalidArgument, match="video_callable"):
         mjrec.Monitor(VectorCorridor(), tmp_path / "run", tiled=True, **choice)
     assert not list(tmp_path.iterdir())
-
-
-def test_without_videos_there_is_none(tmp_path: Path) -> None:
-    """Nothing is drawn."""
-    vector = VectorCorridor(render_mode=None)
-    with mjrec.Monitor(vector, tmp_path, False, tiled=True) as env:
-        play(env, 3)
-    assert not list(tmp_path.glob("*.mp4"))
 
 
 KILLED = """

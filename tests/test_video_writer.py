@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import itertools
 import os
 import select
 import signal
@@ -16,13 +15,12 @@ import tracemalloc
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import av
 import numpy as np
 import pytest
-from interruption import ctrl_c_soon
+from interruption import ctrl_c_once_there_is, ctrl_c_soon
 from processes import children
 
 from mjrec.errors import (
@@ -42,7 +40,6 @@ from mjrec.formats.ffmpeg import (
 )
 from mjrec.formats.video_writer import VideoFile, VideoWriter
 from mjrec.frames import Frame
-from mjrec.worker_thread import WorkerThread
 
 BITS = 8
 
@@ -110,43 +107,27 @@ def ffmpeg_under(
 
 
 @pytest.mark.parametrize(
-    "fps",
-    [20, 30, 40, 50, 125, 29.97, Fraction(30000, 1001), Fraction(1000000, 33333), 0.5],
+    ("fps", "count"),
+    [
+        *[(fps, 101) for fps in (20, 30, 40, 50, 125, 29.97, 0.5, 2000)],
+        *[(fps, 101) for fps in (Fraction(1000000, 33333), Fraction(2003, 999983))],
+        # Left alone, ffmpeg takes some rates of few frames for usual ones: 125 for 120.
+        *[(fps, n) for fps in (125, 241, Fraction(1000, 7)) for n in (1, 3, 9)],
+    ],
 )
-def test_every_frame_is_there_once_in_order(tmp_path: Path, fps: Any) -> None:
-    """The numbers drawn into the frames are read back, the last one included."""
-    result = record(tmp_path / "a.mp4", map(numbered, range(101)), fps=fps)
-    shown = [number_of(frame) for frame in read(result.path)]
-    assert shown == list(range(101))
-    assert result.frame_count == 101
-
-
-@pytest.mark.parametrize(
-    "fps",
-    [40, 2000, Fraction(30000, 1001), Fraction(1000000, 33333), Fraction(2003, 999983)],
-)
-def test_the_rate_is_exact(tmp_path: Path, fps: Any) -> None:
-    """Another reader finds the very fraction, and frame n at n times its duration."""
-    result = record(tmp_path / "a.mp4", map(numbered, range(20)), fps=fps)
-    with av.open(str(result.path)) as container:
-        stream = container.streams.video[0]
-        assert stream.average_rate == fps == result.fps
-        times = [frame.pts * frame.time_base for frame in container.decode(stream)]
-    assert times == [number / Fraction(fps) for number in range(20)]
-
-
-@pytest.mark.parametrize("fps", [125, 119, 241, Fraction(1000, 7)])
-@pytest.mark.parametrize("frames", [1, 3, 9])
-def test_the_rate_of_few_frames_is_not_rounded(
-    tmp_path: Path, fps: Any, frames: int
+def test_every_frame_is_there_once_in_order_at_the_exact_rate(
+    tmp_path: Path, fps: Any, count: int
 ) -> None:
-    """Left alone, ffmpeg takes some rates for usual ones: 125 for 120."""
-    result = record(tmp_path / "a.mp4", map(numbered, range(frames)), fps=fps)
+    """The numbers drawn into the frames are read back, with the times of each."""
+    result = record(tmp_path / "a.mp4", map(numbered, range(count)), fps=fps)
+    assert [number_of(frame) for frame in read(result.path)] == list(range(count))
+    assert result.frame_count == count
+    rate = Fraction(str(fps))
     with av.open(str(result.path)) as container:
         stream = container.streams.video[0]
         packets = [p for p in container.demux(stream) if p.pts is not None]
-        shown = sorted((p.pts * p.time_base, p.duration * p.time_base) for p in packets)
-    assert shown == [(n / Fraction(fps), 1 / Fraction(fps)) for n in range(frames)]
+    shown = sorted((p.pts * p.time_base, p.duration * p.time_base) for p in packets)
+    assert shown == [(n / rate, 1 / rate) for n in range(count)]
 
 
 def test_a_rate_that_ffmpeg_would_round_is_not_given_to_it(tmp_path: Path) -> None:
@@ -304,28 +285,19 @@ def test_the_callers_buffer_may_be_reused(tmp_path: Path) -> None:
     assert shown == list(range(64))
 
 
-def test_there_is_no_file_before_the_end(tmp_path: Path) -> None:
-    """Until close, there is only a temporary name; afterwards, only the final one."""
+def test_a_file_has_its_name_at_the_end(tmp_path: Path) -> None:
+    """An older one stays until then, or if the new one is given up."""
     path = tmp_path / "a.mp4"
-    video = VideoWriter(path, fps=40, frame_hashes=True)
-    for number in range(10):
-        video.write(numbered(number))
-    assert not path.exists()
-    video.close()
+    with VideoWriter(path, fps=40, frame_hashes=True) as video:
+        video.write(numbered(0))
+        assert not path.exists()
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a.framehash", "a.mp4"]
-
-
-def test_an_existing_file_is_replaced_at_the_end(tmp_path: Path) -> None:
-    """The old file stays while the new one is written, and if it is given up."""
-    path = tmp_path / "a.mp4"
-    record(path, map(numbered, range(3)), frame_hashes=True)
     old = path.read_bytes()
     given_up = VideoWriter(path, fps=40)
     given_up.write(numbered(0))
     given_up.abort()
     assert path.read_bytes() == old
-    assert record(path, map(numbered, range(5))).frame_count == 5
-    assert len(read(path)) == 5
+    assert record(path, map(numbered, range(5))).frame_count == len(read(path)) == 5
     # The old video's hashes went with it.
     assert [one.name for one in tmp_path.iterdir()] == ["a.mp4"]
 
@@ -419,8 +391,9 @@ def test_memory_does_not_grow_with_the_video(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_process_stays")
-def test_a_killed_encoder_is_one_error(tmp_path: Path) -> None:
-    """The error has command, signal and no second error follows; nothing is left."""
+@pytest.mark.parametrize("more", [0, 5000])
+def test_a_killed_encoder_is_one_error(tmp_path: Path, more: int) -> None:
+    """Of `write`, or of `close` where all was written. Nothing is left."""
     before = children()
     video = VideoWriter(tmp_path / "a.mp4", fps=40, frame_hashes=True)
     video.write(scene(0))
@@ -429,7 +402,7 @@ def test_a_killed_encoder_is_one_error(tmp_path: Path) -> None:
 
     def write_on() -> None:
         with video:
-            for number in range(5000):
+            for number in range(more):
                 video.write(scene(number % 7))
 
     with pytest.raises(EncoderError, match="could not be encoded") as caught:
@@ -441,20 +414,6 @@ def test_a_killed_encoder_is_one_error(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(ClosedError):
         video.write(scene(0))
-
-
-@pytest.mark.usefixtures("no_process_stays")
-def test_an_encoder_killed_at_the_end_is_an_error_of_close(tmp_path: Path) -> None:
-    """All frames are handed over; the unfinished file does not pass for a video."""
-    before = children()
-    video = VideoWriter(tmp_path / "a.mp4", fps=40)
-    video.write(scene(0))
-    (encoder,) = children() - before
-    os.kill(encoder, signal.SIGKILL)
-    with pytest.raises(EncoderError):
-        video.close()
-    video.close()
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures("no_process_stays")
@@ -516,27 +475,22 @@ def test_lossless_codecs_keep_every_pixel(tmp_path: Path, codec: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("codec", "suffix"),
-    [("mpeg4", ".mp4"), ("mpeg4", ".avi"), ("libx264", ".mov"), ("libx264", ".mkv")],
+    ("name", "options"),
+    [
+        *(("a.mp4", {"codec": "mpeg4"}), ("a.avi", {"codec": "mpeg4"})),
+        # Lossless x264 is no profile High.
+        *(("a.mov", {}), ("a.mkv", {}), ("a.mp4", {"crf": 0})),
+        *((name, {}) for name in ("http:a b.mp4", "-y.mp4", "%03d.mp4", "ü|'\".mp4")),
+    ],
 )
-def test_other_codecs_and_files_work(tmp_path: Path, codec: str, suffix: str) -> None:
-    """What ffmpeg can encode is written by the same rules."""
-    result = record(tmp_path / f"a{suffix}", map(numbered, range(30)), codec=codec)
+def test_other_codecs_files_and_names_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, options: dict[str, Any]
+) -> None:
+    """What ffmpeg can encode; what a name holds means nothing to it."""
+    monkeypatch.chdir(tmp_path)
+    result = record(Path(name), map(numbered, range(30)), **options)
+    assert result.path == tmp_path / name
     assert [number_of(frame) for frame in read(result.path)] == list(range(30))
-
-
-def test_crf_0_is_allowed(tmp_path: Path) -> None:
-    """Lossless x264 is no profile High, and works all the same."""
-    result = record(tmp_path / "a.mp4", map(scene, range(3)), crf=0)
-    assert result.frame_count == 3
-
-
-@pytest.mark.usefixtures("no_process_stays")
-def test_an_unknown_codec_is_named_before_any_frame(tmp_path: Path) -> None:
-    """The error has the name asked for and the encoders there are."""
-    with pytest.raises(UnknownName, match="libx265x") as caught:
-        VideoWriter(tmp_path / "a.mp4", fps=40, codec="libx265x")
-    assert "libx264" in caught.value.available
 
 
 @pytest.mark.parametrize(
@@ -577,21 +531,14 @@ def test_the_path_is_checked_first(tmp_path: Path) -> None:
 
 
 def test_what_ffmpeg_cannot_do_fails_before_any_frame(tmp_path: Path) -> None:
-    """A codec that does not go into the kind of file, and a wrong argument."""
+    """A codec that is not there or does not go into the file, a wrong argument."""
+    with pytest.raises(UnknownName, match="libx265x") as caught:
+        VideoWriter(tmp_path / "a.mp4", fps=40, codec="libx265x")
+    assert "libx264" in caught.value.available
     with pytest.raises(EncoderError, match="libx264 into a webm file"):
         VideoWriter(tmp_path / "a.webm", fps=40)
     with pytest.raises(EncoderError, match="nonsense"):
         VideoWriter(tmp_path / "a.mp4", fps=40, encoder_arguments=("-nonsense", "1"))
-
-
-def test_strange_names_are_only_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Colons, dashes, percent signs and spaces in a relative path mean nothing."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("http:a b.mp4", "-y.mp4", "%03d.mp4", "ü|'\".mp4"):
-        assert record(Path(name), [numbered(1)]).path == tmp_path / name
-        assert (tmp_path / name).is_file()
 
 
 def test_frame_hashes_are_of_the_frames_as_given(tmp_path: Path) -> None:
@@ -610,10 +557,11 @@ def test_frame_hashes_are_of_the_frames_as_given(tmp_path: Path) -> None:
 
 # Shell, before the real ffmpeg runs. The encoder is known by its output's name.
 ENCODES = '[[ "${@: -1}" == *.part ]]'
+DECODES = '[[ "$*" == *" -xerror "* ]]'
 HELD = {
     "the thread feeds": f"if {ENCODES}; then read -r < GATE; fi",
     "ffmpeg encodes": f'if {ENCODES}; then REAL "$@"; read -r < GATE; exit; fi',
-    "the file is decoded": 'if [[ "$*" == *" -xerror "* ]]; then read -r < GATE; fi',
+    "the file is decoded": f"if {DECODES}; then touch HELD; read -r < GATE; fi",
 }
 
 
@@ -624,12 +572,12 @@ HELD = {
 def test_an_interrupted_close_can_be_called_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held: str, end: str
 ) -> None:
-    """Ctrl-C while close waits, twice; then it finishes, or abort leaves nothing."""
-    out, gate = tmp_path / "out", tmp_path / "gate"
+    """Ctrl-C while close waits; then it finishes, or abort leaves nothing."""
+    out, gate, is_held = tmp_path / "out", tmp_path / "gate", tmp_path / "held"
     out.mkdir()
     os.mkfifo(gate)
-    prelude = HELD[held].replace("GATE", str(gate)).replace("REAL", ffmpeg_executable())
-    ffmpeg_under(monkeypatch, tmp_path, prelude)
+    prelude = HELD[held].replace("GATE", str(gate)).replace("HELD", str(is_held))
+    ffmpeg_under(monkeypatch, tmp_path, prelude.replace("REAL", ffmpeg_executable()))
     # Open at both ends, so that what is written stays until it is read.
     opened = os.open(gate, os.O_RDWR)
     video = VideoWriter(out / "a.mp4", fps=40, frame_hashes=True)
@@ -637,12 +585,13 @@ def test_an_interrupted_close_can_be_called_again(
         # More than the pipe holds.
         for number in range(60):
             video.write(numbered(number, height=120, width=160))
-        for _ in range(2):
-            with ctrl_c_soon(), pytest.raises(KeyboardInterrupt):
-                video.close()
-            assert not video.closed
-            assert not video.path.exists()
-        with pytest.raises(ClosedError, match="not finished after 60 frames"):
+        is_soon = "decoded" not in held
+        ctrl_c = ctrl_c_soon() if is_soon else ctrl_c_once_there_is(is_held)
+        with ctrl_c, pytest.raises(KeyboardInterrupt):
+            video.close()
+        assert not video.closed
+        assert not video.path.exists()
+        with pytest.raises(ClosedError, match="closed after 60 frames"):
             video.write(numbered(1, height=120, width=160))
         if end == "close":
             os.write(opened, b"go\n" * 9)
@@ -657,81 +606,6 @@ def test_an_interrupted_close_can_be_called_again(
     assert video.result.frame_count == 60
     assert [number_of(frame) for frame in read(video.path)] == list(range(60))
     assert sorted(one.name for one in out.iterdir()) == ["a.framehash", "a.mp4"]
-
-
-@pytest.mark.usefixtures("default_signals")
-@pytest.mark.usefixtures("no_process_stays")
-# What an interruption keeps the decoder's pipes from, garbage collection does.
-@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
-def test_close_goes_on_wherever_ctrl_c_came(tmp_path: Path) -> None:
-    """SIGINT at the end of each function of the writer that close calls."""
-    plain = record(tmp_path / "plain.mp4", map(numbered, range(9)), frame_hashes=True)
-    points = 0
-    while True:
-        path = tmp_path / f"{points}.mp4"
-        video = VideoWriter(path, fps=40, frame_hashes=True)
-        for number in range(9):
-            video.write(numbered(number))
-        if not close_interrupted_at(video, points):
-            break
-        assert not video.closed
-        video.close()
-        assert path.read_bytes() == plain.path.read_bytes()
-        assert path.with_suffix(".framehash").exists()
-        points += 1
-    assert points > 10
-    assert not list(tmp_path.glob(".*"))
-
-
-def close_interrupted_at(video: VideoWriter, point: int) -> bool:
-    """Close with SIGINT at the end of a function; False if there are not as many."""
-    returns = itertools.count()
-    modules = ("video_writer", "worker_thread", "frame_hashes", "ffmpeg")
-    # After the first there is nothing to go on with, after the others nobody has the
-    # process yet.
-    left_out = (
-        VideoWriter.close.__code__,
-        FfmpegProcess.__init__.__code__,
-        FfmpegProcess.__enter__.__code__,
-    )
-
-    def at_event(frame: FrameType, event: str, argument: object) -> None:
-        ours = Path(frame.f_code.co_filename).stem in modules
-        if not ours or event != "return" or frame.f_code in left_out:
-            return
-        if next(returns) == point:
-            sys.setprofile(None)
-            signal.raise_signal(signal.SIGINT)
-
-    sys.setprofile(at_event)
-    try:
-        video.close()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.setprofile(None)
-    return False
-
-
-@pytest.mark.usefixtures("default_signals")
-@pytest.mark.usefixtures("no_process_stays")
-def test_an_interrupted_abort_can_be_called_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A close that comes instead does not finish what was given up."""
-    video = VideoWriter(tmp_path / "a.mp4", fps=40, frame_hashes=True)
-    video.write(numbered(1))
-    with monkeypatch.context() as patched:
-        patched.setattr(
-            WorkerThread, "abort", lambda _: signal.raise_signal(signal.SIGINT)
-        )
-        with pytest.raises(KeyboardInterrupt):
-            video.abort()
-    assert not video.closed
-    video.close()
-    assert video.closed
-    assert video.result is None
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures("no_process_stays")
@@ -766,28 +640,6 @@ def test_a_video_is_written_in_an_exit_hook(tmp_path: Path) -> None:
     assert shown == list(range(20))
 
 
-@pytest.mark.usefixtures("default_signals")
-@pytest.mark.usefixtures("no_process_stays")
-def test_ctrl_c_within_a_frame_gives_the_video_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where no thread encodes, half a frame would shift all that follow."""
-
-    def refuse(thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
-    monkeypatch.setattr(threading.Thread, "start", refuse)
-    video = VideoWriter(tmp_path / "a.mp4", fps=40, frame_hashes=True)
-    video.write(numbered(1))
-    monkeypatch.setattr(
-        FfmpegProcess, "write", lambda *_: signal.raise_signal(signal.SIGINT)
-    )
-    with pytest.raises(KeyboardInterrupt):
-        video.write(numbered(2))
-    assert video.closed
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.usefixtures("no_process_stays")
 def test_close_on_the_encoders_thread_leaves_the_rest_to_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -800,8 +652,8 @@ def test_close_on_the_encoders_thread_leaves_the_rest_to_another(
         video.close()
         closes.set()
 
-    monkeypatch.setattr(FfmpegProcess, "write", write_and_close)
     video = VideoWriter(tmp_path / "a.mp4", fps=40)
+    monkeypatch.setattr(FfmpegProcess, "write", write_and_close)
     video.write(numbered(1))
     assert closes.wait(30)
     assert not video.closed

@@ -21,10 +21,6 @@ class Boom(Exception):
     pass
 
 
-def fail(item: object) -> None:
-    raise Boom(item)
-
-
 def before_waiting(worker: WorkerThread[Any], act: Callable[[], object]) -> None:
     """Call `act` when a `put` is about to wait for room."""
     condition, consumer = worker._changed, worker._thread
@@ -45,16 +41,43 @@ def until_error(worker: WorkerThread[int]) -> None:
 
 
 def test_items_are_consumed_in_order_on_one_other_thread() -> None:
-    """Everything put before close is consumed, once, in order, by one thread."""
-    seen: list[tuple[int, int]] = []
+    """Everything put before close, once, then the finish; after it nothing is taken."""
+    seen: list[tuple[int, str]] = []
+
+    def consume(item: int) -> None:
+        seen.append((item, threading.current_thread().name))
+
     worker = WorkerThread[int](
-        lambda item: seen.append((item, threading.get_ident())), capacity=3, name="w"
+        consume, capacity=3, name="w", finish=lambda: consume(100)
     )
     for number in range(100):
         worker.put(number)
     worker.close()
-    assert [number for number, _ in seen] == list(range(100))
-    assert len({thread for _, thread in seen} | {threading.get_ident()}) == 2
+    worker.close()
+    assert seen == [(number, "mjrec-w") for number in range(101)]
+    with pytest.raises(ClosedError, match="w is closed"):
+        worker.put(1)
+
+
+@pytest.mark.parametrize("error", [Boom, SystemExit])
+def test_the_consumers_own_error_comes_home(error: type[BaseException]) -> None:
+    """Each put raises the very exception, else close does, once."""
+
+    def fail(item: int) -> None:
+        raise error(item)
+
+    worker = WorkerThread[int](fail, capacity=2, name="w")
+    with pytest.raises(error) as first:
+        until_error(worker)
+    with pytest.raises(error) as second:
+        worker.put(1)
+    assert first.value is second.value
+    worker.close()
+    worker = WorkerThread[int](fail, capacity=2, name="w")
+    worker.put(1)
+    with pytest.raises(error):
+        worker.close()
+    worker.close()
 
 
 def test_put_waits_while_the_queue_is_full() -> None:
@@ -83,26 +106,6 @@ def test_put_waits_while_the_queue_is_full() -> None:
     assert seen == [1, 2, 3]
 
 
-def test_the_consumers_own_error_is_raised_by_put() -> None:
-    """A put after the failure raises the very exception, and so does the next."""
-    worker = WorkerThread[int](fail, capacity=2, name="w")
-    with pytest.raises(Boom) as first:
-        until_error(worker)
-    with pytest.raises(Boom) as second:
-        worker.put(1)
-    assert first.value is second.value
-    worker.close()
-
-
-def test_the_consumers_error_is_raised_by_close_once() -> None:
-    """An error that no put has raised is raised by close, and only by the first."""
-    worker = WorkerThread[int](fail, capacity=8, name="w")
-    worker.put(1)
-    with pytest.raises(Boom):
-        worker.close()
-    worker.close()
-
-
 def test_a_put_that_waits_is_woken_by_the_consumers_death() -> None:
     """A caller blocked on a full queue gets the error instead of waiting forever."""
     gate, in_hand = threading.Event(), threading.Event()
@@ -119,27 +122,6 @@ def test_a_put_that_waits_is_woken_by_the_consumers_death() -> None:
     before_waiting(worker, gate.set)
     with pytest.raises(Boom):
         worker.put(3)
-
-
-def test_even_system_exit_comes_home() -> None:
-    """What is not an Exception does not end the thread unseen."""
-
-    def leave(item: int) -> None:
-        sys.exit(3)
-
-    worker = WorkerThread[int](leave, capacity=1, name="w")
-    worker.put(1)
-    with pytest.raises(SystemExit):
-        worker.close()
-
-
-def test_put_after_close_is_an_error() -> None:
-    """A closed worker takes nothing; closing again is harmless."""
-    worker = WorkerThread[int](lambda item: None, capacity=1, name="video writer")
-    worker.close()
-    worker.close()
-    with pytest.raises(ClosedError, match="video writer"):
-        worker.put(1)
 
 
 class Item:
@@ -171,92 +153,55 @@ def test_abort_drops_what_waits() -> None:
     assert seen == [first]
 
 
-def test_an_interrupted_close_can_be_called_again() -> None:
-    """The second waits for the thread as the first would have."""
-    gate, in_hand = threading.Event(), threading.Event()
-    seen: list[int] = []
-
-    def consume(item: int) -> None:
-        in_hand.set()
-        assert gate.wait(30)
-        seen.append(item)
-
-    worker = WorkerThread[int](
-        consume, capacity=9, name="w", finish=lambda: seen.append(-1)
-    )
-    for number in range(5):
-        worker.put(number)
-    assert in_hand.wait(30)
-    for _ in range(2):
-        with ctrl_c_soon(), pytest.raises(KeyboardInterrupt):
-            worker.close()
-    gate.set()
-    worker.close()
-    assert seen == [0, 1, 2, 3, 4, -1]
-
-
-def test_close_on_the_thread_itself_waits_for_nothing() -> None:
+@pytest.mark.parametrize("call", ["close", "abort"])
+def test_an_end_on_the_thread_itself_waits_for_nothing(call: str) -> None:
     """As when the consumer's garbage collection ends the worker's owner."""
-    done = threading.Event()
-    seen: list[int] = []
-
-    def consume(item: int) -> None:
-        seen.append(item)
-        assert owner.wait(30)
-        worker.close()
-
-    owner = threading.Event()
-    worker = WorkerThread[int](consume, capacity=5, name="w", finish=done.set)
-    worker.put(1)
-    worker.put(2)
-    owner.set()
-    assert done.wait(30)
-    worker.close()
-    assert seen == [1, 2]
-
-
-def test_abort_on_the_thread_itself_waits_for_nothing() -> None:
-    """What waits is dropped, and the thread ends."""
-    go = threading.Event()
+    go, done = threading.Event(), threading.Event()
     seen: list[int] = []
 
     def consume(item: int) -> None:
         seen.append(item)
         assert go.wait(30)
-        worker.abort()
+        getattr(worker, call)()
 
-    worker = WorkerThread[int](consume, capacity=5, name="w")
+    worker = WorkerThread[int](consume, capacity=5, name="w", finish=done.set)
     worker.put(1)
     worker.put(2)
     go.set()
     worker.close()
-    assert seen == [1]
+    assert (seen, done.is_set()) == {
+        "close": ([1, 2], True),
+        "abort": ([1], False),
+    }[call]
 
 
-def test_the_threads_name_tells_whose_it_is() -> None:
-    """Others recognise our threads by the beginning of their names."""
-    names: list[str] = []
-    worker = WorkerThread[int](
-        lambda _: names.append(threading.current_thread().name), capacity=1, name="w"
-    )
-    worker.put(1)
+def test_an_interrupted_close_can_be_called_again() -> None:
+    """The second waits for the thread as the first would have."""
+    gate = threading.Event()
+    seen: list[int] = []
+
+    def consume(item: int) -> None:
+        assert gate.wait(30)
+        seen.append(item)
+
+    worker = WorkerThread[int](consume, capacity=9, name="w")
+    for number in range(5):
+        worker.put(number)
+    for _ in range(2):
+        with ctrl_c_soon(), pytest.raises(KeyboardInterrupt):
+            worker.close()
+    gate.set()
     worker.close()
-    assert names == ["mjrec-w"]
+    assert seen == [0, 1, 2, 3, 4]
 
 
-@pytest.fixture
-def no_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No thread can be started, as at interpreter exit from Python 3.12 on."""
+def test_without_a_thread_put_consumes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As at interpreter exit from Python 3.12 on; an error is raised at once."""
 
     def refuse(thread: threading.Thread) -> None:
         raise RuntimeError("can't create new thread at interpreter shutdown")
 
     monkeypatch.setattr(threading.Thread, "start", refuse)
-
-
-@pytest.mark.usefixtures("no_threads")
-def test_without_a_thread_put_consumes() -> None:
-    """Each item before the next, the finish at the end and once."""
     seen: list[int] = []
     worker = WorkerThread[int](
         seen.append, capacity=1, name="w", finish=lambda: seen.append(-1)
@@ -267,40 +212,11 @@ def test_without_a_thread_put_consumes() -> None:
     worker.close()
     worker.close()
     assert seen == [0, 1, 2, -1]
-    with pytest.raises(ClosedError, match="w is closed"):
-        worker.put(3)
-
-
-@pytest.mark.usefixtures("no_threads")
-def test_without_a_thread_an_error_is_raised_by_put() -> None:
-    """At once, and again; the finish is left out."""
-    seen: list[int] = []
-    worker = WorkerThread[int](
-        fail, capacity=1, name="w", finish=lambda: seen.append(-1)
-    )
+    worker = WorkerThread[int](lambda item: seen[item], capacity=1, name="w")
     for _ in range(2):
-        with pytest.raises(Boom):
-            worker.put(1)
+        with pytest.raises(IndexError):
+            worker.put(9)
     assert worker.failed
-    worker.close()
-    worker.abort()
-    assert seen == []
-
-
-@pytest.mark.usefixtures("no_threads")
-def test_without_a_thread_close_within_an_item_comes_after_it() -> None:
-    """A signal's handler may close in the midst of an item."""
-    seen: list[int] = []
-
-    def consume(item: int) -> None:
-        worker.close()
-        seen.append(item)
-
-    worker = WorkerThread[int](
-        consume, capacity=1, name="w", finish=lambda: seen.append(-1)
-    )
-    worker.put(1)
-    assert seen == [1, -1]
 
 
 def test_items_are_consumed_in_an_exit_hook() -> None:
@@ -320,18 +236,6 @@ def test_items_are_consumed_in_an_exit_hook() -> None:
         [sys.executable, "-c", code], check=True, timeout=60, stdout=subprocess.PIPE
     )
     assert done.stdout.split() == [b"0", b"1", b"2", b"3", b"4", b"end"]
-
-
-def test_leave_lets_the_thread_end_by_itself() -> None:
-    """Without anybody waiting, the rest is consumed and the finish is called."""
-    done = threading.Event()
-    seen: list[int] = []
-    worker = WorkerThread[int](seen.append, capacity=5, name="w", finish=done.set)
-    for number in range(5):
-        worker.put(number)
-    worker.leave()
-    assert done.wait(30)
-    assert seen == list(range(5))
 
 
 def test_a_blocked_consumer_does_not_hold_the_interpreter() -> None:
@@ -364,9 +268,3 @@ def test_a_forked_child_is_told_that_it_has_no_thread() -> None:
         "assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
-
-
-def test_capacity_is_checked() -> None:
-    """A queue of nothing could never take an item."""
-    with pytest.raises(ValueError, match="capacity"):
-        WorkerThread[int](print, capacity=0, name="w")

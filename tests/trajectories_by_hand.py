@@ -26,6 +26,7 @@ from mjrec.formats.span_writer import SpanLogs, SpanWriter
 from mjrec.formats.trajectory import Array, RowLayout, StateComponent, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.views import View
+from mjrec.simulation.model_trust import directory_digest, note_models
 
 INFIX = Infix(0, "7")
 
@@ -167,7 +168,8 @@ def write_log(
 
 
 def write_finished(directory: Path, episode_id: int = 0, **rest: Any) -> Path:
-    """Write the finished trajectory of an episode."""
+    """Write the finished trajectory of an episode, as this user's own."""
+    note_models([directory_digest(directory)])
     return finish_trajectory(write_log(directory, episode_id, **rest))
 
 

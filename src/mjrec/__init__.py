@@ -10,40 +10,39 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from .errors import (
-    ArchiveError,
-    ArchiveTooLarge,
-    BlankVideo,
-    ClosedError,
-    DifferentEnvironment,
-    DifferentEvaluation,
-    DirectoryInUse,
-    DirectoryNotWritable,
-    EncoderError,
-    EnvironmentNotMade,
-    Error,
-    ExistingRecordings,
-    FileNotWritten,
-    FrameCountError,
-    GLError,
-    IdentityLeft,
-    InvalidArgument,
-    InvalidFrame,
-    MissingDependency,
-    NoPictures,
-    NotPicklable,
-    PackError,
-    PicturesDiffer,
-    PolicyError,
-    RenderError,
-    ResetNeeded,
-    ResetNotAllowed,
-    UnfinishedRecordings,
-    UnknownName,
-    UnreadableArchive,
-    UnreadableFile,
-    UntrustedModel,
-)
+from . import errors
+from .errors import ArchiveError as ArchiveError
+from .errors import ArchiveTooLarge as ArchiveTooLarge
+from .errors import BlankVideo as BlankVideo
+from .errors import ClosedError as ClosedError
+from .errors import DifferentEnvironment as DifferentEnvironment
+from .errors import DifferentEvaluation as DifferentEvaluation
+from .errors import DirectoryInUse as DirectoryInUse
+from .errors import DirectoryNotWritable as DirectoryNotWritable
+from .errors import EncoderError as EncoderError
+from .errors import EnvironmentNotMade as EnvironmentNotMade
+from .errors import Error as Error
+from .errors import ExistingRecordings as ExistingRecordings
+from .errors import FileNotWritten as FileNotWritten
+from .errors import FrameCountError as FrameCountError
+from .errors import GLError as GLError
+from .errors import IdentityLeft as IdentityLeft
+from .errors import InvalidArgument as InvalidArgument
+from .errors import InvalidFrame as InvalidFrame
+from .errors import MissingDependency as MissingDependency
+from .errors import NoPictures as NoPictures
+from .errors import NotPicklable as NotPicklable
+from .errors import PackError as PackError
+from .errors import PicturesDiffer as PicturesDiffer
+from .errors import PolicyError as PolicyError
+from .errors import RenderError as RenderError
+from .errors import ResetNeeded as ResetNeeded
+from .errors import ResetNotAllowed as ResetNotAllowed
+from .errors import UnfinishedRecordings as UnfinishedRecordings
+from .errors import UnknownName as UnknownName
+from .errors import UnreadableArchive as UnreadableArchive
+from .errors import UnreadableFile as UnreadableFile
+from .errors import UntrustedModel as UntrustedModel
 
 if TYPE_CHECKING:
     from .engines.local import LocalEngine as LocalEngine
@@ -136,81 +135,7 @@ _LAZY = {
 
 # What can be had without any extra, so that `from mjrec import *` works there too;
 # `DmEnvMonitor` needs dm_env.
-__all__ = [
-    "ArchiveError",
-    "ArchiveTooLarge",
-    "BlankVideo",
-    "Check",
-    "ClosedError",
-    "Comparison",
-    "DifferentEnvironment",
-    "DifferentEvaluation",
-    "DirectoryInUse",
-    "DirectoryNotWritable",
-    "EncoderError",
-    "EnvironmentNotMade",
-    "Episode",
-    "Error",
-    "Evaluation",
-    "ExistingRecordings",
-    "FileNotWritten",
-    "FrameCountError",
-    "GLError",
-    "GymnasiumMonitor",
-    "IdentityLeft",
-    "InvalidArgument",
-    "InvalidFrame",
-    "LocalEngine",
-    "MissingDependency",
-    "Monitor",
-    "NoPictures",
-    "NotPicklable",
-    "PackError",
-    "PicturesDiffer",
-    "PolicyError",
-    "RayEngine",
-    "Recovery",
-    "RenderError",
-    "RenderedVideos",
-    "ResetNeeded",
-    "ResetNotAllowed",
-    "SlurmEngine",
-    "StatsRecorder",
-    "Terminated",
-    "Trajectory",
-    "UnfinishedRecordings",
-    "UnknownName",
-    "UnreadableArchive",
-    "UnreadableFile",
-    "UntrustedModel",
-    "VectorMonitor",
-    "Verification",
-    "VideoRecorder",
-    "VideoWriter",
-    "capped_cubic_video_schedule",
-    "clear_monitor_files",
-    "compare",
-    "detect_monitor_files",
-    "detect_training_manifests",
-    "disable_videos",
-    "evaluate",
-    "exit_on_signals",
-    "film_strip",
-    "iter_episodes",
-    "load_results",
-    "load_trajectory",
-    "merge_stats_files",
-    "pack",
-    "recover",
-    "render",
-    "render_states",
-    "render_videos",
-    "save_video",
-    "use_gl",
-    "verify",
-    "write_archive",
-    "write_report",
-]
+__all__ = sorted({*errors.KINDS, *_LAZY} - {"DmEnvMonitor"})
 
 
 def __getattr__(name: str) -> Any:

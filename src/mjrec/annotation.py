@@ -2,8 +2,7 @@
 """Episode, step, time and return, drawn on a frame.
 
 Pillow draws the letters, in its own font, so that they are the same on every machine
-with the same Pillow. Each letter is drawn once: a frame is annotated by laying a dark
-band over its top and the letters over the band.
+with the same Pillow, in white over a dark band at the frame's top.
 
 Pillow is an extra and is imported when the first frame is annotated.
 """
@@ -16,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .errors import MissingDependency
 from .frames import Frame
@@ -73,16 +71,29 @@ def annotated(frame: Frame, caption: Caption) -> Frame:
         MissingDependency: there is no Pillow that can do it.
     """
     check_annotation()
+    # Here, as in `_pillow`.
+    from PIL import Image, ImageDraw
+
     result = np.array(frame, order="C", subok=False)
-    numbers = _numbers(caption)
+    texts = _numbers(caption)
     layout = _layout(
-        *frame.shape[:2], tuple(-1 if n is None else len(n) for n in numbers)
+        *frame.shape[:2], tuple(-1 if n is None else len(n) for n in texts)
     )
     if layout is None:
         return result
+    font = _font(layout.letters)
+    written = Image.new("L", (layout.width, layout.height))
+    draw = ImageDraw.Draw(written)
+    for item, left, bottom in layout.places:
+        text = f"{layout.labels[item]}{texts[item]}"
+        draw.text((left, bottom), text, fill=255, font=font, anchor="ls")
     band = result[: layout.height]
     np.take(_UNDER_BAND, band, out=band, mode="clip")
-    _write(band, _mask(layout, numbers))
+    # 255 + 1, so that dividing by 256 leaves all of it.
+    cover = np.asarray(written)[:, :, None].astype(np.uint16) + 1
+    band[:, : layout.width] += ((255 - band[:, : layout.width]) * cover >> 8).astype(
+        np.uint8
+    )
     return result
 
 
@@ -122,20 +133,6 @@ def _pillow() -> Any:
     return PIL
 
 
-class _Slot(NamedTuple):
-    """Where one item of a caption stands.
-
-    Attributes:
-        item: which one.
-        left: its first column.
-        top: its first row.
-    """
-
-    item: int
-    left: int
-    top: int
-
-
 class _Layout(NamedTuple):
     """Where the items of captions stand in frames of one size.
 
@@ -144,14 +141,14 @@ class _Layout(NamedTuple):
         width: of what is written.
         letters: their size.
         labels: of the items.
-        slots: of the items that there is room for.
+        places: item, left and base line of each that there is room for.
     """
 
     height: int
     width: int
     letters: int
     labels: tuple[str, ...]
-    slots: tuple[_Slot, ...]
+    places: tuple[tuple[int, int, int], ...]
 
 
 # All items in as few lines as fit, then ever fewer of them.
@@ -175,9 +172,15 @@ def _layout(height: int, width: int, lengths: tuple[int, ...]) -> _Layout | None
     usual = max(_USUAL_LETTERS, min(_LARGEST_LETTERS, round(height / _LETTERS)))
     for arrangements in _ARRANGEMENTS:
         for labels, room in ((_LONG, _ROOM_LONG), (_SHORT, _ROOM_SHORT)):
+            digits = [max(pair) for pair in zip(room, lengths, strict=True)]
             for letters in range(usual, _SMALLEST_LETTERS - 1, -1):
                 for lines in arrangements:
-                    layout = _laid_out(lines, letters, labels, room, lengths)
+                    there = [
+                        [item for item in line if lengths[item] >= 0] for line in lines
+                    ]
+                    layout = _laid_out(
+                        list(filter(None, there)), letters, labels, digits
+                    )
                     fits = layout.height <= height * _MOST_OF_HEIGHT
                     if fits and layout.width <= width:
                         return layout
@@ -185,96 +188,31 @@ def _layout(height: int, width: int, lengths: tuple[int, ...]) -> _Layout | None
 
 
 def _laid_out(
-    lines: tuple[tuple[int, ...], ...],
-    letters: int,
-    labels: tuple[str, ...],
-    room: tuple[int, ...],
-    lengths: tuple[int, ...],
+    lines: list[list[int]], letters: int, labels: tuple[str, ...], digits: list[int]
 ) -> _Layout:
+    font = _font(letters)
+    ascent, descent = font.getmetrics()
     margin = max(1, letters // 3)
-    line_height = _text(" ", letters).shape[0]
-    slots, widest, top = [], 0, margin // 2
+    places, widest, top = [], 0, margin // 2
     for line in lines:
-        items = [item for item in line if lengths[item] >= 0]
         left = margin
-        for item in items:
-            slots.append(_Slot(item, left, top))
-            characters = max(room[item], lengths[item])
-            left += _text(labels[item], letters).shape[1]
-            left += characters * _digit_width(letters) + letters
+        for item in line:
+            places.append((item, left, top + ascent))
+            text = labels[item] + "0" * digits[item]
+            left += math.ceil(font.getlength(text)) + letters
         # Behind the last one there is no gap but the margin.
         widest = max(widest, left - letters + margin)
-        top += line_height * bool(items)
-    return _Layout(top + margin // 2, widest, letters, labels, tuple(slots))
+        top += (ascent + descent) * bool(line)
+    return _Layout(top + margin // 2, widest, letters, labels, tuple(places))
 
 
 def _numbers(caption: Caption) -> tuple[str | None, ...]:
-    time = caption.time
-    return (
-        str(caption.episode_id),
-        str(caption.step),
-        None if time is None else f"{time:.2f} s",
-        _reward(caption.reward),
-    )
-
-
-def _reward(reward: float) -> str:
+    time, reward = caption.time, caption.reward
+    shown = f"{reward:.3f}" if abs(reward) < 1e4 else f"{reward:.1f}"
     if not math.isfinite(reward) or abs(reward) >= 1e7:
-        return f"{reward:.3g}"
-    return f"{reward:.3f}" if abs(reward) < 1e4 else f"{reward:.1f}"
-
-
-def _mask(layout: _Layout, numbers: tuple[str | None, ...]) -> NDArray[np.uint8]:
-    """Return how much of each pixel of the band the letters cover, of 255."""
-    mask = np.zeros((layout.height, layout.width), np.uint8)
-    for item, left, top in layout.slots:
-        column = left
-        for piece in _pieces(layout.labels[item], numbers[item] or "", layout.letters):
-            height, width = piece.shape
-            mask[top : top + height, column : column + width] = piece
-            column += width
-    return mask
-
-
-def _pieces(label: str, number: str, letters: int) -> list[NDArray[np.uint8]]:
-    return [_text(label, letters), *(_character(c, letters) for c in number)]
-
-
-def _write(band: Frame, mask: NDArray[np.uint8]) -> None:
-    """Lay white letters over a dark band."""
-    part = band[: mask.shape[0], : mask.shape[1]]
-    # 255 + 1, so that dividing by 256 leaves all of it.
-    cover = mask[:, :, None].astype(np.uint16) + 1
-    part += ((255 - part) * cover >> 8).astype(np.uint8)
-
-
-@functools.lru_cache(maxsize=1024)
-def _character(character: str, letters: int) -> NDArray[np.uint8]:
-    """Return a character of a number; all digits are of one width."""
-    mask = _text(character, letters)
-    missing = _digit_width(letters) - mask.shape[1]
-    if not character.isdigit() or missing <= 0:
-        return mask
-    return np.pad(mask, ((0, 0), (missing // 2, missing - missing // 2)))
-
-
-@functools.lru_cache(maxsize=64)
-def _digit_width(letters: int) -> int:
-    return max(int(_text(digit, letters).shape[1]) for digit in "0123456789")
-
-
-@functools.lru_cache(maxsize=1024)
-def _text(text: str, letters: int) -> NDArray[np.uint8]:
-    """Return how much of each pixel a text covers, of 255; one line high."""
-    # Here, as in `_pillow`.
-    from PIL import Image, ImageDraw
-
-    font = _font(letters)
-    ascent, descent = font.getmetrics()
-    size = (math.ceil(font.getlength(text)), ascent + descent)
-    image = Image.new("L", size)
-    ImageDraw.Draw(image).text((0, ascent), text, fill=255, font=font, anchor="ls")
-    return np.asarray(image).copy()
+        shown = f"{reward:.3g}"
+    seconds = None if time is None else f"{time:.2f} s"
+    return str(caption.episode_id), str(caption.step), seconds, shown
 
 
 @functools.lru_cache(maxsize=64)

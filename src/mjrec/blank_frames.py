@@ -8,6 +8,7 @@ of them give a video that is whole, counted, and of no use.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,24 +33,22 @@ class BlankFrames:
 
     def __init__(self) -> None:
         self._count = 0
-        self._all_black = True
-        self._all_plain = True
-        # None: two of them differ, or there is none yet.
+        # What all frames so far are.
+        self._suspects = set(_LOOKS)
         self._first: Frame | None = None
-        self._all_equal = True
 
     def add(self, frame: Frame) -> None:
         """Look at the next frame, `(height, width, 3) uint8`; it is not kept."""
         self._count += 1
-        if not (self._all_black or self._all_plain or self._all_equal):
-            return
-        sample = frame[::_STEP, ::_STEP]
-        if self._all_black:
-            self._all_black = _is_black(sample) and _is_black(frame)
-        if self._all_plain:
-            self._all_plain = _is_plain(sample) and _is_plain(frame)
-        if self._all_equal:
-            self._compare(frame, sample)
+        if self._first is None and "equal" in self._suspects:
+            self._first = frame.copy()
+        for name in list(self._suspects):
+            looks, first = _LOOKS[name], frame if self._first is None else self._first
+            sample = (frame[::_STEP, ::_STEP], first[::_STEP, ::_STEP])
+            if not (looks(*sample) and looks(frame, first)):
+                self._suspects.discard(name)
+        if "equal" not in self._suspects:
+            self._first = None
 
     def facts(self) -> dict[str, bool]:
         """Return what a video's metadata says about it; nothing where all is well.
@@ -60,8 +59,9 @@ class BlankFrames:
         """
         if not self._count:
             return {}
-        constant = self._all_plain or (self._all_equal and self._count > 1)
-        facts = {"suspect_black": self._all_black, "suspect_constant": constant}
+        suspects = self._suspects
+        constant = "plain" in suspects or ("equal" in suspects and self._count > 1)
+        facts = {"suspect_black": "black" in suspects, "suspect_constant": constant}
         return {name: True for name, is_so in facts.items() if is_so}
 
     def suspicion(self) -> str | None:
@@ -69,9 +69,9 @@ class BlankFrames:
         if not self.facts():
             return None
         frames = f"all {self._count} frames are" if self._count > 1 else "its frame is"
-        if self._all_black:
+        if "black" in self._suspects:
             return f"{frames} black"
-        if self._all_plain:
+        if "plain" in self._suspects:
             return f"{frames} of a single colour"
         return f"{frames} the same picture"
 
@@ -88,23 +88,17 @@ class BlankFrames:
             raise BlankVideo(video, frame_count=self._count, suspicion=suspicion)
         logger.warning("%s may show nothing: %s.", video.name, suspicion)
 
-    def _compare(self, frame: Frame, sample: Frame) -> None:
-        if self._count == 1:
-            self._first = frame.copy()
-            return
-        first = self._first
-        assert first is not None
-        same = np.array_equal(first[::_STEP, ::_STEP], sample)
-        if not (same and np.array_equal(first, frame)):
-            self._all_equal, self._first = False, None
 
-
-def _is_black(frame: Frame) -> bool:
-    return int(frame.max()) <= _BLACK
-
-
-def _is_plain(frame: Frame) -> bool:
+def _is_plain(frame: Frame, first: Frame) -> bool:
     # The first row with its first pixel, all rows with the first: whole rows compare
     # many times faster than pixels.
     row = frame[:1]
     return bool((row == row[:, :1]).all()) and bool((frame == row).all())
+
+
+# What a frame, or a sample of it, may be; beside it the video's first.
+_LOOKS: dict[str, Callable[[Frame, Frame], bool]] = {
+    "black": lambda frame, first: int(frame.max()) <= _BLACK,
+    "plain": _is_plain,
+    "equal": np.array_equal,
+}

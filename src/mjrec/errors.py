@@ -64,6 +64,13 @@ def _rebuilt(kind: type[Error], args: tuple[Any, ...], facts: dict[str, Any]) ->
     return error
 
 
+def _first_of(names: Sequence[str], count: int, *, between: str = ", ") -> str:
+    """Return some names, and how many there are besides."""
+    more = len(names) - count
+    shown = between.join(names[:count])
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
 class InvalidArgument(Error, ValueError):
     """An argument has a value that cannot be."""
 
@@ -111,18 +118,13 @@ class ExistingRecordings(Error):
         names: the base names of the monitor files in it.
     """
 
-    _SHOWN = 5
-
     def __init__(self, directory: Path, names: Sequence[str]) -> None:
         self.directory = directory
         self.names = list(names)
-        shown = ", ".join(self.names[: self._SHOWN])
-        more = len(self.names) - self._SHOWN
-        rest = f" and {more} more" if more > 0 else ""
         super().__init__(
-            f"{directory} holds recordings already: {shown}{rest}. Use a directory of "
-            "its own for each run, resume=True (--resume) to add to these recordings, "
-            "or force=True (--force) to delete them."
+            f"{directory} holds recordings already: {_first_of(names, 5)}. Use a "
+            "directory of its own for each run, resume=True (--resume) to add to these "
+            "recordings, or force=True (--force) to delete them."
         )
 
 
@@ -329,16 +331,12 @@ class UnfinishedRecordings(PackError):
         names: the base names of what is not finished.
     """
 
-    _SHOWN = 5
-
     def __init__(self, directory: Path, names: Sequence[str], *, advice: str) -> None:
         self.directory = directory
         self.names = list(names)
-        shown = ", ".join(self.names[: self._SHOWN])
-        more = len(self.names) - self._SHOWN
-        rest = f" and {more} more" if more > 0 else ""
+        listed = _first_of(names, 5)
         super().__init__(
-            f"The recordings in {directory} are not finished: {shown}{rest}. {advice}"
+            f"The recordings in {directory} are not finished: {listed}. {advice}"
         )
 
 
@@ -373,16 +371,14 @@ class IdentityLeft(PackError):
         found: the files, each with what was found in it.
     """
 
-    _SHOWN = 10
-
     def __init__(self, found: Sequence[tuple[str, str]]) -> None:
         self.found = list(found)
-        shown = "; ".join(f"{name}: {what}" for name, what in found[: self._SHOWN])
-        more = len(self.found) - self._SHOWN
-        rest = f"; and {more} more" if more > 0 else ""
+        listed = _first_of(
+            [f"{name}: {what}" for name, what in found], 10, between="; "
+        )
         super().__init__(
-            f"The packed run would not be anonymous, so it was not written: {shown}"
-            f"{rest}. Record again without these (a uid, a camera's or a body's name, "
+            f"The packed run would not be anonymous, so it was not written: {listed}. "
+            "Record again without these (a uid, a camera's or a body's name, "
             "a title), or leave out the episodes that have them."
         )
 

@@ -13,6 +13,7 @@ stack than its length lets one expect, is refused.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import math
@@ -40,17 +41,15 @@ def dumps(value: object, *, indent: int | None = None) -> str:
     with the keys 1 and "1") are written as `{"repr": ...}`: what is recorded for people
     must never stop a run.
     """
-    try:
-        if not _has_plain_keys(value):
-            return _dumps_any(value, indent=indent)
-        # Nearly everything is plain, and this is many times as fast.
-        text = _encoder(indent).encode(value)
-        # What is written is what `loads` will accept.
-        if text.count("[") + text.count("{") > _DEEPEST:
-            _check_depth(value)
-    except (TypeError, ValueError, RecursionError):
-        return _dumps_any(value, indent=indent)
-    return text
+    # Nearly everything is plain, and this is many times as fast.
+    if _is_plain(value):
+        with contextlib.suppress(TypeError, ValueError):
+            return _encoder(indent).encode(value)
+    # json offers no hook for floats. A string that cannot occur by chance stands in
+    # for infinity and is exchanged for the number afterwards.
+    mark = uuid.uuid4().hex
+    text = json.dumps(_made_plain(value, mark, ()), indent=indent, allow_nan=False)
+    return text.replace(f'"-{mark}"', "-1e999").replace(f'"{mark}"', "1e999")
 
 
 @functools.cache
@@ -77,8 +76,8 @@ def loads(text: str | bytes) -> Any:
         value = json.loads(text, object_pairs_hook=_object)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-    if beginnings > _DEEPEST:
-        _check_depth(value)
+    if beginnings > _DEEPEST and not _is_plain(value):
+        raise ValueError("it is nested too deeply")
     return value
 
 
@@ -108,8 +107,8 @@ def has_nan(value: object) -> bool:
     return False
 
 
-def _has_plain_keys(value: object) -> bool:
-    """Tell whether all keys are texts, of which no two are written as the same."""
+def _is_plain(value: object, room: int = _DEEPEST) -> bool:
+    """Tell whether all keys are texts, and nothing is nested too deeply."""
     if isinstance(value, dict):
         if not {str}.issuperset(map(type, value)):
             return False
@@ -117,33 +116,13 @@ def _has_plain_keys(value: object) -> bool:
     elif not isinstance(value, list | tuple):
         return True
     # Statistics are long lists of numbers.
-    return _FLAT.issuperset(map(type, value)) or all(map(_has_plain_keys, value))
+    return room > 0 and (
+        _FLAT.issuperset(map(type, value))
+        or all(_is_plain(item, room - 1) for item in value)
+    )
 
 
-def _check_depth(value: Any) -> None:
-    level = [value]
-    for _ in range(_DEEPEST):
-        level = [
-            inner
-            for outer in level
-            for inner in (outer.values() if isinstance(outer, dict) else outer)
-            if isinstance(inner, dict | list | tuple)
-        ]
-        if not level:
-            return
-    raise ValueError("it is nested too deeply")
-
-
-def _dumps_any(value: object, *, indent: int | None) -> str:
-    # json offers no hook for floats. A string that cannot occur by chance stands in
-    # for infinity and is exchanged for the number afterwards.
-    mark = uuid.uuid4().hex
-    plain = _plain(value, mark, ())
-    text = json.dumps(plain, indent=indent, allow_nan=False)
-    return text.replace(f'"-{mark}"', "-1e999").replace(f'"{mark}"', "1e999")
-
-
-def _plain(value: object, mark: str, outer: tuple[int, ...]) -> Any:
+def _made_plain(value: object, mark: str, outer: tuple[int, ...]) -> Any:
     """Return `value` as what JSON knows.
 
     Args:
@@ -163,11 +142,13 @@ def _plain(value: object, mark: str, outer: tuple[int, ...]) -> Any:
         case float() | np.floating():
             return _plain_float(float(value), mark)
         case np.ndarray():
-            return _plain(value.tolist(), mark, outer)
+            return _made_plain(value.tolist(), mark, outer)
         case dict() if not is_too_deep and len(set(map(_key, value))) == len(value):
-            return {_key(k): _plain(item, mark, inside) for k, item in value.items()}
+            return {
+                _key(k): _made_plain(item, mark, inside) for k, item in value.items()
+            }
         case list() | tuple() | set() | frozenset() if not is_too_deep:
-            return [_plain(item, mark, inside) for item in value]
+            return [_made_plain(item, mark, inside) for item in value]
         case _:
             return {"repr": _shown(value)}
 

@@ -135,7 +135,12 @@ def examine_machine() -> MachineReport:
     Nothing is imported or changed in this process.
     """
     probes = {backend: probe(backend, measure=True) for backend in BACKENDS}
-    chosen, reason = _choice()
+    chosen = None
+    try:
+        choice = choose()
+        chosen, reason = choice.backend, choice.reason
+    except Error as error:
+        reason = str(error)
     return MachineReport(
         can_render=chosen is not None,
         backend=chosen,
@@ -145,49 +150,27 @@ def examine_machine() -> MachineReport:
         gpu_device_files=tuple(gpu_device_files()),
         ffmpeg=examine_ffmpeg(),
         packages=tuple(examine_package(*package) for package in _PACKAGES),
-        cpus=_examine_cpus(),
+        cpus=Cpus(
+            usable=usable_cpus(),
+            present=os.cpu_count(),
+            allowed=len(os.sched_getaffinity(0)),
+            quota=cgroup_cpu_quota(),
+        ),
         python=platform.python_version(),
         platform=platform.platform(),
     )
 
 
-def _choice() -> tuple[str | None, str]:
-    try:
-        choice = choose()
-    except Error as error:
-        return None, str(error)
-    return choice.backend, choice.reason
-
-
 def _problems(chosen: str | None, probes: dict[str, Probe]) -> Iterator[Diagnosis]:
-    if chosen is None:
-        yield from _better_choice(probes)
-        return
-    yield from _spelling(chosen)
-    if not os.environ.get("MUJOCO_GL") and not probes["glfw"].renders:
-        yield Diagnosis(
-            "MUJOCO_GL is not set. mjrec gets along without; other programs choose "
-            "GLFW then, which does not render here.",
-            f"For other programs:\n  export MUJOCO_GL={chosen}",
-        )
-    if probes[chosen].warning():
-        yield Diagnosis(probes[chosen].warning(), "")
-
-
-def _better_choice(probes: dict[str, Probe]) -> Iterator[Diagnosis]:
-    """Yield a way out where a backend renders and MUJOCO_GL forbids it."""
-    rendering = [name for name, tried in probes.items() if tried.renders]
-    if rendering:
-        yield Diagnosis(
-            f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} keeps mjrec from using "
-            f"{rendering[0]}, which renders here.",
-            f"Name that one:\n  export MUJOCO_GL={rendering[0]}",
-        )
-
-
-def _spelling(chosen: str) -> Iterator[Diagnosis]:
-    """Yield what mjrec puts right for itself and other programs do not."""
     named = os.environ.get("MUJOCO_GL", "")
+    if chosen is None:
+        for other in [name for name, tried in probes.items() if tried.renders][:1]:
+            yield Diagnosis(
+                f"MUJOCO_GL={named} keeps mjrec from {other}, which renders here.",
+                f"Name that one:\n  export MUJOCO_GL={other}",
+            )
+        return
+    # What mjrec puts right for itself and other programs do not.
     if platforms_contradict(os.environ, chosen):
         yield Diagnosis(
             f"PYOPENGL_PLATFORM={os.environ['PYOPENGL_PLATFORM']} contradicts "
@@ -201,43 +184,34 @@ def _spelling(chosen: str) -> Iterator[Diagnosis]:
             "mjrec puts it right; other programs may fail.",
             f"Spell it so:\n  export MUJOCO_GL={chosen}",
         )
-
-
-def _examine_cpus() -> Cpus:
-    return Cpus(
-        usable=usable_cpus(),
-        present=os.cpu_count(),
-        allowed=len(os.sched_getaffinity(0)),
-        quota=cgroup_cpu_quota(),
-    )
+    if not named and not probes["glfw"].renders:
+        yield Diagnosis(
+            "MUJOCO_GL is not set. mjrec gets along without; other programs choose "
+            "GLFW then, which does not render here.",
+            f"For other programs:\n  export MUJOCO_GL={chosen}",
+        )
+    if probes[chosen].warning():
+        yield Diagnosis(probes[chosen].warning(), "")
 
 
 def examine_ffmpeg() -> Ffmpeg:
     """Find ffmpeg and encode a picture as a recording does."""
+    path, version = None, ""
     try:
         path = ffmpeg_executable()
-    except Error as error:
-        return Ffmpeg(None, cause=str(error), fix=_OTHER_FFMPEG)
-    version = ""
-    try:
         version = ffmpeg_version()
         settings = encoder_settings(codec=None, crf=None, muxer=MUXERS[".mp4"])
         try_encoding(path, settings, _TRIAL_FPS)
     except Error as error:
-        return Ffmpeg(path, version, cause=_last_words(error), fix=_OTHER_FFMPEG)
+        said = error.stderr.split("\n") if isinstance(error, EncoderError) else []
+        cause = next(filter(None, map(str.strip, reversed(said))), str(error))
+        fix = (
+            "Install the one that comes with imageio-ffmpeg, or name another:\n"
+            "  python -m pip install --force-reinstall imageio-ffmpeg\n"
+            "  export IMAGEIO_FFMPEG_EXE=/path/to/ffmpeg"
+        )
+        return Ffmpeg(path, version, cause=cause, fix=fix)
     return Ffmpeg(path, version, encodes=True)
-
-
-_OTHER_FFMPEG = (
-    "Install the one that comes with imageio-ffmpeg, or name another:\n"
-    "  python -m pip install --force-reinstall imageio-ffmpeg\n"
-    "  export IMAGEIO_FFMPEG_EXE=/path/to/ffmpeg"
-)
-
-
-def _last_words(error: Error) -> str:
-    said = error.stderr.strip().splitlines() if isinstance(error, EncoderError) else []
-    return said[-1] if said else str(error)
 
 
 def examine_package(name: str, program: str, install: str) -> Package:

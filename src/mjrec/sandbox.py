@@ -54,7 +54,10 @@ LIMITS: Final[Mapping[str, int]] = {
 
 # Says that a stranger's compiled models may be loaded.
 _TRUST_VARIABLE = "MJREC_TRUST_MODELS"
+# Says to what runs in a sandbox, and to what that starts, that it does.
+_INSIDE_VARIABLE = "MJREC_SANDBOX"
 
+_NOTHING: Mapping[str, str] = {}
 _STANDARD_INPUT = 0
 _SECONDS_TO_DIE = 5.0
 _LONGEST_LINE = 1 << 24
@@ -71,6 +74,7 @@ class Sandbox:
         place: an empty folder for what it leaves behind: its working directory, and
             where its temporary files are.
         limits: by their names in `resource`.
+        more_environ: environment variables besides this process's.
 
     Raises:
         Error: it cannot be started.
@@ -83,13 +87,15 @@ class Sandbox:
         *,
         place: Path,
         limits: Mapping[str, int] = LIMITS,
+        more_environ: Mapping[str, str] = _NOTHING,
     ) -> None:
         environ = {k: v for k, v in os.environ.items() if k != _TRUST_VARIABLE}
+        environ |= {**more_environ, "TMPDIR": str(place), _INSIDE_VARIABLE: "1"}
         self._stderr = (place / "words.txt").open("w+b")
         try:
             self._process = subprocess.Popen(
                 python_command(module),
-                env=environment_of_child({**environ, "TMPDIR": str(place)}),
+                env=environment_of_child(environ),
                 # MuJoCo's own log appears where it runs.
                 cwd=place,
                 stdin=subprocess.PIPE,
@@ -164,6 +170,11 @@ class Sandbox:
         # What Python says of a crash ends with the names of dozens of modules.
         words = " ".join(said.partition("\nExtension modules:")[0].split())
         return words[-_END_OF_STDERR:] or "(nothing)"
+
+
+def is_inside() -> bool:
+    """Tell whether this process runs in a sandbox already."""
+    return _INSIDE_VARIABLE in os.environ
 
 
 def enter() -> tuple[Any, Callable[..., None]]:

@@ -10,23 +10,23 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
-from .environments.episode_seeds import EpisodeSeeds, episode_seeds
+from .environments.episode_seeds import episode_seeds
 from .environments.from_name import NamedEnvironment, environment_from_name
 from .environments.global_generators import seed_global_generators
 from .environments.names import parse_environment_name
 from .environments.options import EnvironmentOptions
-from .environments.policies import Policy, load_policy, policy_file
+from .environments.policies import load_policy, policy_file
 from .environments.working_directory import working_directory_importable
 from .errors import GLError, InvalidArgument
 from .formats.manifest import read_manifest
 from .formats.monitor_directory import Infix, infix_of, manifest_name
 from .gl import use_gl
-from .monitors import Monitor
+from .monitors.monitor import monitored
 from .recorder.options import LIVE, OFF, RecorderOptions
 from .schedules import disable_videos, schedule_from_text
 
@@ -45,56 +45,24 @@ class Session:
         directory: the monitor directory.
         seed: of the session, a whole number from 0 to 2**32 - 1.
         episodes: how many.
-        max_steps: ends an episode as truncated; None is the environment's own limit,
-            and 1000 where it has none.
         policy: `random`, `zero` or `module:name`.
         schedule: which episodes get a video: `cubic`, `all`, `none`, `every:N` or
-            `at:0,5,9`; None is `cubic`, unless there is `keep`.
-        keep: which episodes get a video, decided when they have ended: `best:N`,
-            `worst:N`, `failures`, `failures:N` or `median`, see `mjrec.Monitor`.
-        force: delete the recordings that are in the directory.
-        resume: add to the recordings that are in the directory.
-        camera: a name or number; None is the model's tracking camera where there is
-            one.
+            `at:0,5,9`; None is `cubic`, unless `monitor` has a `keep`.
         further_cameras: of more videos of the same episodes.
-        tiled: one video of all cameras side by side, instead of one for each.
-        annotate: whether episode, step, time and return are written on the frames.
-        name_prefix: of the second names of videos, see `mjrec.Monitor`.
-        height: of the videos, in pixels; None is the environment's own.
-        width: likewise.
-        fps: the rate written into the videos; None is real time.
-        max_fps: the most frames per second of simulated time; None is every step.
-        render: when pictures are drawn, `"deferred"`, `"live"` or `"off"`, see
-            `mjrec.Monitor`; None is deferred where it can be.
-        workers: how many processes draw deferred pictures; None is one for each CPU;
-            0 leaves the videos pending.
-        quality: `"full"` or `"draft"`.
-        env_kwargs: more arguments for the environment.
+        made: how the environment is made; the session sets `pictures` and `seed`.
+        monitor: how it is recorded; the session sets which episodes, and the policy's
+            file.
     """
 
     environment: str
     directory: Path
     seed: int
     episodes: int = 1
-    max_steps: int | None = None
     policy: str = "random"
     schedule: str | None = None
-    keep: str | None = None
-    force: bool = False
-    resume: bool = False
-    camera: str | int | None = None
     further_cameras: tuple[str | int, ...] = ()
-    tiled: bool = False
-    annotate: bool = False
-    name_prefix: str | None = None
-    height: int | None = None
-    width: int | None = None
-    fps: float | None = None
-    max_fps: float | None = None
-    render: str | None = None
-    workers: int | None = None
-    quality: str = "full"
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    made: EnvironmentOptions = field(default_factory=EnvironmentOptions)
+    monitor: RecorderOptions = field(default_factory=RecorderOptions)
 
 
 @dataclass(frozen=True)
@@ -133,36 +101,33 @@ def record_session(
         Error: the environment, policy, schedule, camera or directory cannot be; what
             they are is checked before anything is written.
     """
+    options = session.monitor
     _check(session)
     schedule = None
-    if session.keep is None:
+    if options.keep is None:
         schedule = schedule_from_text(session.schedule or "cubic")
     with contextlib.ExitStack() as stack:
-        drawn = schedule is not disable_videos and session.render != OFF
+        drawn = schedule is not disable_videos and options.render != OFF
         named = _environment(session, pictures=drawn)
         closing = stack.enter_context(contextlib.ExitStack())
         closing.callback(named.environment.close)
         policy = load_policy(session.policy, named.environment)
-        recorded = Monitor(
+        view = dict(named.view)
+        if session.further_cameras:
+            # An environment that was made with its camera shows it by itself.
+            view["camera"] = [view.get("camera"), *session.further_cameras]
+        recorded = monitored(
             named.environment,
             session.directory,
-            schedule,
-            force=session.force,
-            resume=session.resume,
-            keep=session.keep,
-            fps=session.fps,
-            max_fps=session.max_fps,
-            render=session.render,
-            workers=session.workers,
-            quality=session.quality,
-            # Without videos it is still the schedule that chooses what is kept.
-            trajectory_callable=schedule if session.render == OFF else None,
+            replace(
+                options,
+                video_callable=schedule,
+                # Without videos it is still the schedule that chooses what is kept.
+                trajectory_callable=schedule if options.render == OFF else None,
+                policy_file=policy_file(session.policy),
+            ),
             env_id=named.env_id,
-            tiled=session.tiled,
-            annotate=session.annotate,
-            name_prefix=session.name_prefix,
-            policy_file=policy_file(session.policy),
-            **_view(named, session),
+            **view,
         )
         # A name is that of one environment, never of a vector environment.
         monitor = cast("GymnasiumMonitor | DmEnvMonitor", recorded)
@@ -171,8 +136,22 @@ def record_session(
         stack.enter_context(monitor)
         for _ in range(session.episodes):
             seeds = episode_seeds(session.seed, monitor.episode_id)
-            _run_episode(named, monitor, policy, seeds, on_step)
-            yield _recorded(monitor)
+            with working_directory_importable():
+                seed_global_generators(seeds.policy)
+                policy.reset(seeds)
+                observation = named.begin_episode(monitor, seeds)
+                done = False
+                while not done:
+                    observation, done = named.step(monitor, policy(observation))
+                    on_step()
+            stats, video = monitor.stats_recorder, monitor.video_recorder
+            has_video = video is not None and video.functional and not video.empty
+            yield SessionEpisode(
+                episode_id=monitor.episode_id - 1,
+                length=stats.episode_lengths[-1],
+                reward=stats.episode_rewards[-1],
+                video=Path(str(video.path)) if video and has_video else None,
+            )
 
 
 def with_chosen_videos(episodes: Sequence[SessionEpisode]) -> list[SessionEpisode]:
@@ -196,115 +175,43 @@ def with_chosen_videos(episodes: Sequence[SessionEpisode]) -> list[SessionEpisod
     ]
 
 
-def _view(named: NamedEnvironment, session: Session) -> dict[str, Any]:
-    """Return the monitor's cameras and size."""
-    view = dict(named.view)
-    if session.further_cameras:
-        # An environment that was made with its camera shows it by itself.
-        view["camera"] = [view.get("camera"), *session.further_cameras]
-    return view
-
-
 def _check(session: Session) -> None:
     """Check what can be checked before anything is imported or made."""
+    keep = session.monitor.keep
     if session.episodes < 1:
         raise InvalidArgument(
             f"episodes must be a positive whole number, got {session.episodes}."
         )
-    RecorderOptions(
-        fps=session.fps,
-        max_fps=session.max_fps,
-        render=session.render,
-        workers=session.workers,
-        quality=session.quality,
-        keep=session.keep,
-        tiled=session.tiled,
-        annotate=session.annotate,
-        name_prefix=session.name_prefix,
-    )
-    if session.keep is not None and session.schedule is not None:
+    if keep is not None and session.schedule is not None:
         raise InvalidArgument(
-            f"Either keep (--keep {session.keep}) chooses the episodes that get a "
-            f"video, or a schedule does (--schedule {session.schedule}): leave one of "
-            "them out."
+            f"Either keep (--keep {keep}) chooses the episodes that get a video, or a "
+            f"schedule does (--schedule {session.schedule}): leave one of them out."
         )
     parse_environment_name(session.environment)
     episode_seeds(session.seed, 0)
 
 
 def _environment(session: Session, *, pictures: bool) -> NamedEnvironment:
-    no_gl = _choose_gl() if pictures and _may_draw_here(session) else None
+    render, workers = session.monitor.render, session.monitor.workers
+    no_gl = None
+    # Does this process draw, or one that it starts?
+    if pictures and (render == LIVE or (render is None and workers != 0)):
+        # A text environment, or one that draws by itself, needs no OpenGL, and only the
+        # environment tells which it is.
+        try:
+            use_gl()
+        except GLError as error:
+            no_gl = error
     named = environment_from_name(
-        session.environment,
-        EnvironmentOptions(
-            camera=session.camera,
-            height=session.height,
-            width=session.width,
-            max_steps=session.max_steps,
-            pictures=pictures,
-            seed=session.seed,
-            kwargs=session.env_kwargs,
-        ),
+        session.environment, replace(session.made, pictures=pictures, seed=session.seed)
     )
-    if no_gl is not None and "mujoco" in sys.modules:
-        with contextlib.closing(named.environment):
-            raise _without_gl(session, named, no_gl)
-    return named
-
-
-def _may_draw_here(session: Session) -> bool:
-    """Tell whether this process may have to draw something."""
-    if session.render is None:
-        return session.workers != 0
-    return session.render == LIVE
-
-
-def _without_gl(session: Session, named: NamedEnvironment, error: GLError) -> GLError:
-    if session.render == LIVE or not named.has_deferrable_pictures():
-        return error
-    return GLError(
-        f"{error}\nRecording itself needs no OpenGL: with --workers 0 (workers=0) the "
-        f"states are recorded, and `mjrec render {session.directory}` draws the videos "
-        "from them on a machine where OpenGL works."
-    )
-
-
-def _choose_gl() -> GLError | None:
-    """Choose a backend; return why there is none, which may not matter.
-
-    A text environment, or one that draws by itself, needs no OpenGL, and only the
-    environment tells which it is.
-    """
-    try:
-        use_gl()
-    except GLError as error:
-        return error
-    return None
-
-
-def _run_episode(
-    named: NamedEnvironment,
-    monitor: GymnasiumMonitor | DmEnvMonitor,
-    policy: Policy,
-    seeds: EpisodeSeeds,
-    on_step: Callable[[], None],
-) -> None:
-    with working_directory_importable():
-        seed_global_generators(seeds.policy)
-        policy.reset(seeds)
-        observation = named.begin_episode(monitor, seeds)
-        done = False
-        while not done:
-            observation, done = named.step(monitor, policy(observation))
-            on_step()
-
-
-def _recorded(monitor: GymnasiumMonitor | DmEnvMonitor) -> SessionEpisode:
-    video = monitor.video_recorder
-    recorded = video is not None and video.functional and not video.empty
-    return SessionEpisode(
-        episode_id=monitor.episode_id - 1,
-        length=monitor.stats_recorder.episode_lengths[-1],
-        reward=monitor.stats_recorder.episode_rewards[-1],
-        video=Path(str(video.path)) if video is not None and recorded else None,
-    )
+    if no_gl is None or "mujoco" not in sys.modules:
+        return named
+    with contextlib.closing(named.environment):
+        if render == LIVE or not named.has_deferrable_pictures():
+            raise no_gl
+        raise GLError(
+            f"{no_gl}\nRecording itself needs no OpenGL: with --workers 0 (workers=0) "
+            f"the states are recorded, and `mjrec render {session.directory}` draws "
+            "the videos from them on a machine where OpenGL works."
+        )

@@ -14,7 +14,7 @@ from types import FrameType
 from .errors import Error
 
 # What schedulers and CI send at a time limit, and terminals when they are closed.
-_SIGNALS = ("SIGTERM", "SIGHUP")
+_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
 class Terminated(SystemExit):
@@ -84,8 +84,7 @@ def exiting_on_signals() -> Iterator[None]:
 
 def _deadly() -> list[signal.Signals]:
     """Return those of the signals that would end the process at once."""
-    known = [getattr(signal, name, None) for name in _SIGNALS]
-    return [s for s in known if s is not None and signal.getsignal(s) is signal.SIG_DFL]
+    return [s for s in _SIGNALS if signal.getsignal(s) is signal.SIG_DFL]
 
 
 def received() -> Terminated | None:

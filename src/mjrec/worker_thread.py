@@ -44,8 +44,6 @@ class WorkerThread(Generic[T]):
         name: str,
         finish: Callable[[], None] | None = None,
     ) -> None:
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1, got {capacity}.")
         self._consume = consume
         self._finish = finish
         self._capacity = capacity
@@ -61,16 +59,17 @@ class WorkerThread(Generic[T]):
         self._error: BaseException | None = None
         self._error_was_raised = False
         self._process_id = os.getpid()
-        # Held until the work is done. `Thread.join` would not do: Python 3.11 and 3.12
-        # take a thread for ended when Ctrl-C interrupts the wait for it.
-        self._at_work = threading.Lock()
-        self._at_work.acquire()
-        self._thread = threading.Thread(
+        # Waited for before the thread is: Python 3.11 and 3.12 take a thread for ended
+        # when Ctrl-C interrupts `Thread.join`.
+        self._has_ended = threading.Event()
+        self._thread: threading.Thread | None = threading.Thread(
             target=self._work, name=f"mjrec-{name}", daemon=True
         )
-        self._has_thread = True
-        self._consumes_here = False
-        self._start_thread()
+        try:
+            self._thread.start()
+        except RuntimeError as error:
+            logger.info("%s works without a thread: %s.", name, error)
+            self._thread = None
 
     @property
     def failed(self) -> bool:
@@ -97,8 +96,8 @@ class WorkerThread(Generic[T]):
                 raise ClosedError(f"{self._name} is closed.")
             self._waiting.append(item)
             self._changed.notify_all()
-        if not self._has_thread:
-            self._work_here()
+        if self._thread is None:
+            self._work()
             self._raise_error()
 
     def close(self) -> None:
@@ -121,8 +120,8 @@ class WorkerThread(Generic[T]):
         with self._lock:
             self._closing = True
             self._changed.notify_all()
-        if not self._has_thread and os.getpid() == self._process_id:
-            self._work_here()
+        if self._thread is None:
+            self._work()
 
     def abort(self) -> None:
         """Drop what waits, wait for the item in hand, end the thread; raise nothing.
@@ -136,24 +135,13 @@ class WorkerThread(Generic[T]):
         self.leave()
         self._wait_for_end()
 
-    def _start_thread(self) -> None:
-        try:
-            self._thread.start()
-        except RuntimeError as error:
-            logger.info("%s works without a thread: %s.", self._name, error)
-            self._has_thread = False
-        except BaseException:
-            # Ctrl-C while it starts: it may be there, and nobody will ever close it.
-            self._aborted = True
-            self.leave()
-            raise
-
     def _wait_for_end(self) -> None:
-        # A forked child has no such thread to wait for, and nobody waits for himself.
-        is_here = threading.current_thread() is self._thread
-        if self._has_thread and not is_here and os.getpid() == self._process_id:
-            with self._at_work:
-                pass
+        # Neither waits for itself; and a forked child has no such thread.
+        if (
+            self._thread not in (None, threading.current_thread())
+            and os.getpid() == self._process_id
+        ):
+            self._has_ended.wait()
             self._thread.join()
 
     def _has_room_or_ended(self) -> bool:
@@ -165,42 +153,26 @@ class WorkerThread(Generic[T]):
             raise self._error
 
     def _work(self) -> None:
-        try:
-            self._consume_all()
-        finally:
-            self._at_work.release()
-
-    def _work_here(self) -> None:
-        # A signal's handler may call `close` in the midst of an item.
-        if self._consumes_here:
-            return
-        self._consumes_here = True
-        try:
-            self._consume_all()
-        finally:
-            self._consumes_here = False
-
-    def _consume_all(self) -> None:
+        """Consume what is put, or, where there is no thread, what waits now."""
         try:
             while self._wait_for_item():
                 self._consume(self._take())
-            if self._closing:
-                self._call_finish()
+            finish = self._finish
+            if self._closing and finish and not (self._aborted or self.failed):
+                self._finish = None
+                finish()
         # Whatever it is, it belongs to the caller; nobody looks at this thread.
         except BaseException as error:
             with self._lock:
                 self._error = error
                 self._waiting.clear()
                 self._changed.notify_all()
-
-    def _call_finish(self) -> None:
-        finish, self._finish = self._finish, None
-        if finish is not None and not (self._aborted or self.failed):
-            finish()
+        finally:
+            self._has_ended.set()
 
     def _wait_for_item(self) -> bool:
         with self._lock:
-            if self._has_thread:
+            if self._thread is not None:
                 self._changed.wait_for(lambda: self._closing or bool(self._waiting))
             return bool(self._waiting)
 

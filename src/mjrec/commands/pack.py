@@ -16,7 +16,7 @@ import tyro
 from ..errors import InvalidArgument
 from ..evidence.packing import pack as pack_directory
 from ..evidence.packing.sizes import shown_size
-from ..monitors.render_progress import RenderProgress
+from ..monitors.progress import render_progress
 from .help_text import flowing_help
 
 _NUMBERS = re.compile(r"\d{1,15}(,\d{1,15})*", re.ASCII)
@@ -54,7 +54,7 @@ def pack(
             videos are drawn again smaller, from the recorded states.
     """
     console = rich.console.Console(stderr=True)
-    with RenderProgress(console, title="drawing smaller videos ") as progress:
+    with render_progress(console, title="drawing smaller videos ") as on_progress:
         archive = pack_directory(
             directory,
             out,
@@ -64,7 +64,7 @@ def pack(
             episodes=None if episodes is None else _numbers(episodes),
             anonymous=anonymous,
             max_size=max_size,
-            on_progress=progress.show,
+            on_progress=on_progress,
         )
     _show(archive)
     return 0

@@ -13,7 +13,9 @@ import rich.console
 import tyro
 
 from .. import json_text
+from ..environments.options import EnvironmentOptions
 from ..formats.video_metadata import finished_videos
+from ..recorder.options import RecorderOptions
 from ..sessions import (
     Session,
     SessionEpisode,
@@ -105,26 +107,30 @@ def record(
         environment=env,
         directory=out,
         episodes=episodes,
-        max_steps=max_steps,
         policy=policy,
         seed=seed,
         schedule=schedule,
-        keep=keep,
-        force=force,
-        resume=resume,
-        camera=camera_of(camera[0] if camera else None),
         further_cameras=tuple(number_or_name(each) for each in camera[1:]),
-        tiled=tiled,
-        annotate=annotate,
-        name_prefix=name_prefix,
-        height=height,
-        width=width,
-        fps=fps,
-        max_fps=max_fps,
-        render=render,
-        workers=workers,
-        quality=quality,
-        env_kwargs=kwargs_of(env_kwargs),
+        made=EnvironmentOptions(
+            camera=camera_of(camera[0] if camera else None),
+            height=height,
+            width=width,
+            max_steps=max_steps,
+            kwargs=kwargs_of(env_kwargs),
+        ),
+        monitor=RecorderOptions(
+            keep=keep,
+            force=force,
+            resume=resume,
+            tiled=tiled,
+            annotate=annotate,
+            name_prefix=name_prefix,
+            fps=fps,
+            max_fps=max_fps,
+            render=render,
+            workers=workers,
+            quality=quality,
+        ),
     )
     console = rich.console.Console(quiet=as_json)
     recorded, interrupted = _run(session, console)

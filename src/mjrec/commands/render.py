@@ -14,7 +14,7 @@ import tyro
 from .. import json_text
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
-from ..monitors.render_progress import RenderProgress
+from ..monitors.progress import render_progress
 from ..rendering.jobs import Outcome, Variant
 from ..rendering.render_videos import RenderedVideos, iter_rendered_videos
 from ..rendering.views import View
@@ -102,7 +102,7 @@ def render(
         )
     engine = engine_options.chosen(workers)
     console = rich.console.Console(quiet=as_json)
-    with RenderProgress(console) as progress:
+    with render_progress(console) as on_progress:
         outcomes = iter_rendered_videos(
             target,
             variant,
@@ -112,7 +112,7 @@ def render(
             strict=strict,
             trust_models=trust_models,
             engine=engine,
-            on_progress=progress.show,
+            on_progress=on_progress,
         )
         done, is_interrupted = _collect(outcomes, console)
     report = RenderedVideos.of(done, target if target.is_dir() else target.parent)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator
 from types import FrameType
 
 from ..errors import Error
-from ..gl.given_gpu import visible_gpus
+from ..gl.devices import visible_gpus
 from .hosting import Host
 from .job_folder import HostState, JobFolder, Pace, TakenJob
 from .local_worker import SECONDS_TO_CLOSE

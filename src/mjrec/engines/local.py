@@ -17,7 +17,7 @@ from typing import Any
 from ..carried_errors import unpacked
 from ..child_python import environment_of_child
 from ..errors import Error, InvalidArgument
-from ..gl.given_gpu import CUDA_VISIBLE_DEVICES, visible_gpus
+from ..gl.devices import CUDA_VISIBLE_DEVICES, visible_gpus
 from ..machine import usable_cpus
 from .base_run import BaseRun
 from .gpu_shares import GpuShare

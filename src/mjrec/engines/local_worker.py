@@ -41,7 +41,7 @@ from typing import Any, cast
 
 from ..carried_errors import carried
 from ..child_python import say_stacks_when_asked
-from ..gl.given_gpu import render_on_given_gpu
+from ..gl.devices import render_on_given_gpu
 from ..signals import Terminated, exiting_on_signals, received
 from .work import Handler
 

@@ -18,9 +18,9 @@ from ..simulation.cameras import (
     raw_model,
     resolve_camera,
 )
-from ..simulation.episode_states import EpisodeStates
-from ..simulation.scene_view import SceneView
-from ..simulation.viewer_settings import (
+from ..simulation.capture import Capture
+from ..simulation.view import (
+    SceneView,
     option_without_rangefinder,
     place_free_camera,
 )
@@ -81,7 +81,7 @@ def dm_control_scenes(
         by_physics=by_physics,
     )
     return Scenes(
-        states=EpisodeStates(
+        states=Capture(
             lambda: (raw_model(env.physics.model), raw_data(env.physics.data)),
             view=scene,
             at_picture=scene.at_picture,

@@ -26,7 +26,7 @@ from .wrapping import around_gymnasium
 
 if TYPE_CHECKING:
     from ..simulation.authored_model import AuthoredModel
-    from ..simulation.episode_states import EpisodeStates
+    from ..simulation.capture import Capture
     from .viewer_scene import ViewerScene
 
 _MUJOCO_ENV = ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render")
@@ -146,21 +146,21 @@ def _foreign_renderer(renderer: Any) -> str | None:
     return f"the renderer {class_name(kind)} is not Gymnasium's own"
 
 
-def _states(simulated: Any, view: dict[str, Any]) -> EpisodeStates:
+def _states(simulated: Any, view: dict[str, Any]) -> Capture:
     # Loaded where there is a simulation, and so mujoco, already: importing mujoco
     # settles its OpenGL backend, which is not ours to do for a CartPole.
-    from ..simulation.episode_states import EpisodeStates
+    from ..simulation.capture import Capture
     from .viewer_scene import ViewerScene
 
     scene = ViewerScene(simulated, **view)
     own_view = any(asked is not None for asked in view.values())
-    return EpisodeStates(
+    return Capture(
         lambda: (simulated.model, simulated.data),
         view=scene,
         forget=scene.forget,
         at_picture=_at_picture(simulated, scene),
         authored=lambda: _authored(simulated),
-        obstacle=None if own_view else scene.obstacle,
+        obstacle=(lambda: None) if own_view else scene.obstacle,
         is_unmoved=None if picture_moment(simulated) else scene.is_unmoved,
     )
 

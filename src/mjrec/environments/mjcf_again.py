@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..simulation.mjcf_again import CompiledSimulation
+from ..simulation.mjcf import MjcfSimulation
 from .made_again import (
     EpisodeStart,
     RecordedEnvironment,
@@ -36,7 +36,7 @@ class MjcfAgain:
             raise wrappers_refused(recorded.wrappers)
         limit = recorded.max_episode_steps
         self._limit = limit if isinstance(limit, int) else None
-        self._simulation = CompiledSimulation(model)
+        self._simulation = MjcfSimulation(model)
         self._steps = 0
 
     def simulation(self) -> tuple[Any, Any]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import InvalidArgument, NoPictures
 from ..frames import Frame, check_size
 from ..simulation.cameras import camera_label, resolve_camera
-from ..simulation.mjcf import MjcfSimulation
+from ..simulation.mjcf import MjcfSimulation, load_mjcf
 from ..simulation.renderer import SceneRenderer
 from .default_camera import default_camera
 from .options import EnvironmentOptions
@@ -108,7 +108,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self.render_mode = render_mode
         self.height, self.width = check_size(height, width)
         self.path = Path(path)
-        self.simulation = MjcfSimulation(self.path)
+        self.simulation = MjcfSimulation(load_mjcf(self.path))
         model = self.simulation.model
         self.camera = default_camera(model) if camera is None else camera
         resolve_camera(model, self.camera)

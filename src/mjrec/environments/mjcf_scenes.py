@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..simulation.authored_model import authored_from_file
-from ..simulation.episode_states import EpisodeStates
+from ..simulation.capture import Capture
 from .mjcf_environments import MjcfEnvironment
 from .scenes import Scenes, generator_state, has_own_method, overriding_class
 from .viewer_scene import ViewerScene
@@ -39,7 +39,7 @@ def mjcf_scenes(
         width=env.width if width is None else width,
     )
     return Scenes(
-        states=EpisodeStates(
+        states=Capture(
             lambda: (simulation.model, simulation.data),
             view=scene,
             forget=scene.forget,

@@ -72,9 +72,9 @@ def picture_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
     ):
         return None
     # Loaded where there is a simulation, and so mujoco, already.
-    from ..simulation.kept_simulation import KeptSimulation
+    from ..simulation.replay import PreservedState
 
-    simulation = KeptSimulation()
+    simulation = PreservedState()
 
     def at_picture(capture: Callable[[], None]) -> None:
         with (

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from ..simulation.episode_states import EpisodeStates
+    from ..simulation.capture import Capture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class Scenes:
             JSON can hold it; None where there is none yet. It makes none.
     """
 
-    states: EpisodeStates | None = None
+    states: Capture | None = None
     obstacle: str | None = None
     environment: dict[str, Any] | None = None
     random_state: Callable[[], Any] = lambda: None

@@ -12,8 +12,8 @@ from typing import Any
 
 from ..frames import check_size
 from ..simulation.cameras import FREE_CAMERA, camera_label, resolve_camera
-from ..simulation.scene_view import SceneView
-from ..simulation.viewer_settings import (
+from ..simulation.view import (
+    SceneView,
     copy_members,
     new_scene_flags,
     place_free_camera,

@@ -26,7 +26,7 @@ from ..environments.policies import Policy, load_policy, policy_file, policy_fro
 from ..environments.working_directory import working_directory_importable
 from ..errors import Error, InvalidArgument, PolicyError
 from ..monitors import Monitor
-from ..monitors.rendering_choice import rendering_choice
+from ..monitors.base import rendering_choice
 from ..recorder.opening import JOIN
 from ..recorder.options import DEFERRED, RenderingChoice
 from ..recorder.selection import UNDECIDED
@@ -102,7 +102,7 @@ def make_acting(evaluation: Evaluation, task: str, seed: int) -> Acting:
     )
     if "mujoco" in sys.modules:
         # Not at the top, because it loads MuJoCo, which not every task has.
-        from ..simulation.mujoco_warnings import log_mujoco_warnings
+        from ..simulation.warnings import log_mujoco_warnings
 
         log_mujoco_warnings()
     with _closing_on_error(named.environment):
@@ -392,7 +392,7 @@ def _warnings(environment: Any) -> dict[str, int]:
     if simulation is None:
         return {}
     # Not at the top, because it loads MuJoCo, which not every task has.
-    from ..simulation.warning_counts import warning_counts
+    from ..simulation.warnings import warning_counts
 
     return warning_counts(simulation)
 

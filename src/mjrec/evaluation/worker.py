@@ -3,7 +3,7 @@
 
 Settings: `{"directory": DIR, "plan": <the plan as JSON>}`, and `"chooses_gl": true`
 where the worker is to choose an OpenGL backend that works on its machine, if episodes
-get videos, and `"models"` as in `rendering.video_jobs`; payload: the pickled policy,
+get videos, and `"models"` as in `rendering.engine_jobs`; payload: the pickled policy,
 where it is an object. Jobs, by their `kind`, each of which may be done again:
 
 `check`    `{"task"}`: makes the environment and the policy, and takes no step. Returns
@@ -20,7 +20,7 @@ where it is an object. Jobs, by their `kind`, each of which may be done again:
 `settle`   `{"folder", "monitor", "chosen": [[number, facts], ...]}`, see `settling`.
            Returns `{}`.
 `draw`     `{"folder", "recording", "models"}`: finishes a recording, see
-           `rendering.video_jobs`, with models that other workers may have stored.
+           `rendering.engine_jobs`, with models that other workers may have stored.
 """
 
 from __future__ import annotations

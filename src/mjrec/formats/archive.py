@@ -20,7 +20,7 @@ import shutil
 import stat
 import tarfile
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -56,79 +56,62 @@ def write_archive(
             belong into an archive, or cannot be read. Nothing was written.
     """
     pairs = [(Path(video), Path(metadata)) for video, metadata in videos]
-    try:
-        _check(pairs)
-        with tempfile.TemporaryFile() as whole:
+    for reason in _objections(pairs):
+        raise ArchiveError(f"[{env_id}] {reason}")
+    with tempfile.TemporaryFile() as whole:
+        try:
             _pack(pairs, whole)
-            whole.seek(0)
-            shutil.copyfileobj(whole, archive_file)
-    except _Refused as reason:
-        raise ArchiveError(f"[{env_id}] {reason}") from reason.__cause__
+        except OSError as error:
+            reason = f"Cannot read {error.filename}: {error.strerror}."
+            raise ArchiveError(f"[{env_id}] {reason}") from error
+        whole.seek(0)
+        shutil.copyfileobj(whole, archive_file)
 
 
-class _Refused(Exception):
-    """Why there will be no archive."""
-
-
-def _check(pairs: Sequence[_Pair]) -> None:
+def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
+    """Yield why there will be no archive, in the order in which gym looked."""
     if len(pairs) > MAX_VIDEOS:
-        raise _Refused(
+        yield (
             f"{len(pairs)} videos were given, and an archive holds at most "
             f"{MAX_VIDEOS}. Write several archives."
         )
     taken: set[str] = set()
     for video, metadata in pairs:
-        _check_files(video, metadata)
-        _check_names(video, metadata, taken)
-        taken.update((video.name, metadata.name))
-
-
-def _check_files(video: Path, metadata: Path) -> None:
-    if not os.path.lexists(video):
-        raise _Refused(
-            f"There is no video {video}. Its recording may have failed: see the "
-            "recorder's `functional`."
-        )
-    if not os.path.lexists(metadata):
-        raise _Refused(
-            f"There is no metadata {metadata} for the video {video}. A video recorder "
-            "writes it beside each video."
-        )
-    for path in (video, metadata):
-        if not stat.S_ISREG(path.lstat().st_mode):
-            raise _Refused(
-                f"{path} is a link, a directory or a device. Give the file itself."
+        if not os.path.lexists(video):
+            yield (
+                f"There is no video {video}. Its recording may have failed: see the "
+                "recorder's `functional`."
             )
-
-
-def _check_names(video: Path, metadata: Path, taken: set[str]) -> None:
-    if video.name in taken:
-        raise _Refused(_twice(video))
-    if metadata.name in taken or metadata.name == video.name:
-        raise _Refused(_twice(metadata))
-    if not _VIDEO_NAME.fullmatch(video.name):
-        raise _Refused(
-            f"{video.name!r} is no name for a video: it must be letters, digits, '_', "
-            "'-' and '.', ending in .mp4, .avi or .json."
-        )
-    if video.name.endswith(".meta.json"):
-        raise _Refused(f"{video.name!r} is the name of metadata, not of a video.")
-    if video.name.lower() == _MANIFEST:
-        raise _Refused(
-            f"A video cannot be called {video.name!r}: that is the archive's own list."
-        )
-    if not _METADATA_NAME.fullmatch(metadata.name):
-        raise _Refused(
-            f"{metadata.name!r} is no name for metadata: it must be letters, digits, "
-            "'_', '-' and '.', ending in .meta.json."
-        )
-
-
-def _twice(path: Path) -> str:
-    return (
-        f"The name {path.name!r} is there twice (the second time as {path}). An "
-        "archive has no directories: every file needs a name of its own."
-    )
+        if not os.path.lexists(metadata):
+            yield (
+                f"There is no metadata {metadata} for the video {video}. A video "
+                "recorder writes it beside each video."
+            )
+        for path in (video, metadata):
+            if not stat.S_ISREG(path.lstat().st_mode):
+                yield (
+                    f"{path} is a link, a directory or a device. Give the file itself."
+                )
+        for path in (video, metadata):
+            if path.name in taken:
+                yield (
+                    f"The name {path.name!r} is there twice (the second time as "
+                    f"{path}). An archive has no directories: every file needs a name "
+                    "of its own."
+                )
+            taken.add(path.name)
+        plain = "it must be letters, digits, '_', '-' and '.', ending in"
+        if not _VIDEO_NAME.fullmatch(video.name):
+            yield f"{video.name!r} is no name for a video: {plain} .mp4, .avi or .json."
+        if video.name.endswith(".meta.json"):
+            yield f"{video.name!r} is the name of metadata, not of a video."
+        if video.name.lower() == _MANIFEST:
+            yield (
+                f"A video cannot be called {video.name!r}: that is the archive's own "
+                "list."
+            )
+        if not _METADATA_NAME.fullmatch(metadata.name):
+            yield f"{metadata.name!r} is no name for metadata: {plain} .meta.json."
 
 
 def _pack(pairs: Sequence[_Pair], whole: IO[bytes]) -> None:
@@ -147,16 +130,16 @@ def _pack(pairs: Sequence[_Pair], whole: IO[bytes]) -> None:
 
 
 def _add_file(tar: tarfile.TarFile, path: Path) -> None:
+    # Whatever was put there since the checks is not followed or waited for.
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
-        # Whatever was put there since the checks is not followed or waited for.
-        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
         with os.fdopen(os.open(path, flags), "rb") as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise OSError("it is no regular file any more")
             _add(tar, path.name, status.st_size, file)
     except OSError as error:
-        raise _Refused(f"Cannot read {path}: {error.strerror or error}.") from error
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
 def _add(tar: tarfile.TarFile, name: str, size: int, content: IO[bytes]) -> None:

@@ -23,7 +23,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Protocol, Self
+from typing import IO, Self
 
 from ..errors import EncoderError, Error, InvalidArgument, MissingDependency
 from ..file_digests import file_sha256
@@ -33,7 +33,6 @@ from ..patience import Patience
 _ENVIRONMENT_VARIABLE = "IMAGEIO_FFMPEG_EXE"
 _END_OF_STDERR = 2000
 _PIPE_SIZE = 1 << 20
-# An encoder that closed its input ends by itself; a wrapper script may not.
 _SECONDS_TO_DIE = 10.0
 # The libavutil of ffmpeg 5.1, which renamed an option; 9 took the old name away.
 _LIBAVUTIL_OF_FPS_MODE = (57, 28)
@@ -114,14 +113,11 @@ def run_ffmpeg(
         Error: it could not be started, as `ffmpeg_executable` where that is its fault.
     """
     with FfmpegProcess(arguments, what=what, reads=True, writes=True) as process:
-        return process.communicate(standard_input)
-
-
-class HasFileno(Protocol):
-    """What is an open file."""
-
-    def fileno(self) -> int:
-        """Return its descriptor."""
+        process.write(standard_input)
+        process.end_input()
+        output = b"".join(iter(lambda: process.read(_PIPE_SIZE), b""))
+        process.wait()
+        return output
 
 
 class FfmpegProcess:
@@ -139,7 +135,7 @@ class FfmpegProcess:
         what: what fails when it fails: the first sentence of the error.
         reads: whether it is fed through `write`.
         writes: whether it is read through `read`.
-        keeps: a file that it holds open.
+        keeps: the descriptor of a file that it holds open.
 
     Attributes:
         command: the program and its arguments.
@@ -155,7 +151,7 @@ class FfmpegProcess:
         what: str,
         reads: bool = False,
         writes: bool = False,
-        keeps: HasFileno | None = None,
+        keeps: int | None = None,
     ) -> None:
         self.command = [ffmpeg_executable(), *arguments]
         self._what = what
@@ -177,13 +173,19 @@ class FfmpegProcess:
                     # tells, not the end of it: Python ignores SIGXFSZ, and so does
                     # ffmpeg then.
                     restore_signals=False,
-                    pass_fds=() if keeps is None else (keeps.fileno(),),
+                    pass_fds=() if keeps is None else (keeps,),
                 )
             except OSError as error:
                 raise _not_started(self.command[0], error) from error
             on_failure.callback(self.release)
             on_failure.callback(self.kill)
-            self._prepare_pipes()
+            for pipe in self._pipes():
+                # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More
+                # is a favour that the kernel may refuse.
+                with contextlib.suppress(OSError):
+                    fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
+            if self._process.stdin is not None:
+                os.set_blocking(self._process.stdin.fileno(), False)
             _running.add(self)
             on_failure.pop_all()
 
@@ -210,8 +212,11 @@ class FfmpegProcess:
                 else:
                     self._wait_for(pipe, select.POLLOUT)
         except (OSError, ValueError) as error:
-            # ValueError: the pipe was closed before.
-            self._end_soon()
+            # ValueError: the pipe was closed before. One that has closed its input ends
+            # by itself; a wrapper script may not.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_SECONDS_TO_DIE)
+            self.kill()
             raise self._error() from error
 
     def read(self, size: int) -> bytes:
@@ -224,29 +229,6 @@ class FfmpegProcess:
         assert pipe is not None
         self._wait_for(pipe, select.POLLIN)
         return pipe.read(size)
-
-    def communicate(self, data: bytes) -> bytes:
-        """Feed `data`, wait for the end, and return all output.
-
-        Raises:
-            EncoderError: the exit status is not 0, or it takes longer than
-                `patience_s`.
-        """
-        unsaid: bytes | None = data
-        output = b""
-
-        def has_ended(seconds: float) -> bool:
-            nonlocal unsaid, output
-            try:
-                output, _ = self._process.communicate(unsaid, timeout=seconds)
-            except subprocess.TimeoutExpired:
-                unsaid = None
-                return False
-            return True
-
-        self._wait_until(has_ended)
-        self.wait()
-        return output
 
     def end_input(self) -> None:
         """Say that nothing follows."""
@@ -308,15 +290,6 @@ class FfmpegProcess:
     def _pipes(self) -> list[IO[bytes]]:
         return [pipe for pipe in (self._process.stdin, self._process.stdout) if pipe]
 
-    def _prepare_pipes(self) -> None:
-        for pipe in self._pipes():
-            # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More is
-            # a favour that the kernel may refuse.
-            with contextlib.suppress(OSError):
-                fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
-        if self._process.stdin is not None:
-            os.set_blocking(self._process.stdin.fileno(), False)
-
     def _wait_for(self, pipe: IO[bytes], event: int) -> None:
         """Wait until a pipe is ready, or closed at the other end."""
         poll = select.poll()
@@ -371,13 +344,6 @@ class FfmpegProcess:
                 status = Path(path).stat()
                 return status.st_size, status.st_mtime_ns
         return 0, 0
-
-    def _end_soon(self) -> None:
-        """Wait for the end of a process that has closed its input."""
-        try:
-            self._process.wait(_SECONDS_TO_DIE)
-        except subprocess.TimeoutExpired:
-            self.kill()
 
     def _error(self) -> EncoderError:
         what = self._what

@@ -65,9 +65,15 @@ def save_video(
     _check_video_length(video_length)
     if episode_trigger is None and step_trigger is None:
         episode_trigger = capped_cubic_video_schedule
-    folder = _make_directory(Path(video_folder))
+    folder = Path(video_folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DirectoryNotWritable(folder, error) from error
     if step_trigger is not None:
-        frames = held = _hold(frames)
+        # Copies: a generator may fill the same array again and again.
+        is_held = isinstance(frames, Sequence | np.ndarray)
+        frames = held = list(frames if is_held else map(np.array, frames))
     if episode_trigger is not None and episode_trigger(episode_index):
         path = folder / f"{name_prefix}-episode-{episode_index}.mp4"
         _write_video(itertools.islice(frames, video_length), path, kwargs)
@@ -78,13 +84,6 @@ def save_video(
                 last = None if video_length is None else first + video_length
                 path = folder / f"{name_prefix}-step-{step}.mp4"
                 _write_video(held[first:last], path, kwargs)
-
-
-def _hold(frames: Iterable[Frame]) -> Sequence[Frame]:
-    if isinstance(frames, Sequence | np.ndarray):
-        return list(frames)
-    # Copies: a generator may fill the same array again and again.
-    return [np.array(frame) for frame in frames]
 
 
 def _write_video(frames: Iterable[Frame], path: Path, options: dict[str, Any]) -> None:
@@ -116,11 +115,3 @@ def _check_video_length(video_length: object) -> None:
             "video_length must be a positive number of frames, or None for all, got "
             f"{video_length!r}."
         )
-
-
-def _make_directory(directory: Path) -> Path:
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DirectoryNotWritable(directory, error) from error
-    return directory

@@ -1,24 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes of a model as bytes: a table of arrays in JSON, and the arrays behind it."""
+"""Changes of a model as bytes: a step, and a NumPy record with a member for each field.
+
+The record is as `numpy.save` writes it: its header says the names, types and shapes.
+"""
 
 from __future__ import annotations
 
-import json
-import math
+import io
 import struct
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument
-from ..json_text import loads
-from .json_fields import field, list_of, mapping
-from .trajectory import Array, ModelChange
-from .trajectory_layout import array_from_json, array_to_json, field_name
+from .trajectory import ModelChange, field_name
 
-# Its step, and the length of its table.
-_PREFIX = struct.Struct("<qQ")
+_STEP = struct.Struct("<q")
+_LONGEST_HEADER = 1 << 16
 
 LARGEST_CHANGE = 1 << 30
 
@@ -30,24 +28,22 @@ def pack_change(change: ModelChange) -> bytes:
         InvalidArgument: a field is no array of plain numbers, or has no name, or all
             of them are too large.
     """
-    arrays = {
-        name: np.asarray(values, order="C") for name, values in change.fields.items()
-    }
-    table = [
-        {"name": name, **array_to_json(_kind_of(name, array))}
+    arrays = {name: np.asarray(values) for name, values in change.fields.items()}
+    members = [
+        (name, array.dtype.newbyteorder("<"), array.shape)
         for name, array in arrays.items()
     ]
-    text = json.dumps(table).encode()
-    values = [
-        array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
-        for array in arrays.values()
-    ]
-    packed = b"".join((_PREFIX.pack(change.step, len(text)), text, *values))
-    if len(packed) > LARGEST_CHANGE:
+    record = np.empty((), _checked(np.dtype(members)))
+    for name, array in arrays.items():
+        record[name] = array
+    file = io.BytesIO()
+    file.write(_STEP.pack(change.step))
+    np.lib.format.write_array(file, record, (1, 0), allow_pickle=False)
+    if file.tell() > LARGEST_CHANGE:
         raise InvalidArgument(
-            f"A change of a model may have {LARGEST_CHANGE} bytes, not {len(packed)}."
+            f"A change of a model may have {LARGEST_CHANGE} bytes, not {file.tell()}."
         )
-    return packed
+    return file.getvalue()
 
 
 def unpack_change(packed: bytes) -> ModelChange:
@@ -56,41 +52,36 @@ def unpack_change(packed: bytes) -> ModelChange:
     Raises:
         ValueError: it is damaged.
     """
-    if len(packed) < _PREFIX.size:
-        raise ValueError("a change of the model is damaged")
-    step, table_size = _PREFIX.unpack_from(packed)
-    if step < 0:
-        raise ValueError("a change of the model is of no step")
-    offset = _PREFIX.size + table_size
+    file = io.BytesIO(packed)
     try:
-        table = list_of(_named_array)(loads(packed[_PREFIX.size : offset]))
-    except (RecursionError, ValueError) as error:
-        raise ValueError("the table of a change of the model is damaged") from error
-    if offset + sum(kind.size for _, kind in table) != len(packed):
-        raise ValueError("a change of the model has another size than its fields")
-    if len({name for name, _ in table}) != len(table):
-        raise ValueError("a change of the model has two fields of the same name")
-    fields: dict[str, NDArray[Any]] = {}
-    for name, kind in table:
-        count = math.prod(kind.shape)
-        values = np.frombuffer(packed, kind.dtype, count, offset)
-        # A copy can be written to, and does not keep the rest.
-        fields[name] = values.reshape(kind.shape).copy()
-        offset += kind.size
+        (step,) = _STEP.unpack(file.read(_STEP.size))
+        np.lib.format.read_magic(file)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(
+            file, max_header_size=_LONGEST_HEADER
+        )
+        _checked(dtype)
+    # NumPy parses the header as Python, and raises what that raises.
+    except Exception as error:
+        raise ValueError(f"a change of the model is damaged ({error})") from error
+    rest = file.read()
+    if step < 0 or shape or len(rest) != dtype.itemsize:
+        raise ValueError("a change of the model is damaged")
+    record: NDArray[np.void] = np.ndarray((), dtype, rest)
+    # Copies can be written to, and do not keep the rest.
+    fields = {name: np.array(record[name]) for name in dtype.names or ()}
     return ModelChange(step=step, fields=fields)
 
 
-def _kind_of(name: str, array: NDArray[Any]) -> Array:
-    kind = Array(array.dtype.newbyteorder("<").str, array.shape)
-    try:
-        field_name(name)
-        return array_from_json(array_to_json(kind))
-    except ValueError as error:
-        raise InvalidArgument(
-            f"The model field {name!r} cannot be recorded: {error}."
-        ) from None
-
-
-def _named_array(value: Any) -> tuple[str, Array]:
-    values = mapping(value)
-    return field(values, "name", field_name), array_from_json(values)
+def _checked(dtype: np.dtype[np.void]) -> np.dtype[np.void]:
+    """Return a record's dtype if its members are arrays of plain numbers."""
+    for name in dtype.names or ():
+        kind = dtype[name].base.kind
+        try:
+            field_name(name)
+            if kind not in "biuf":
+                raise ValueError(f"its dtype is {dtype[name].base}")
+        except ValueError as error:
+            raise InvalidArgument(
+                f"The model field {name!r} cannot be recorded: {error}."
+            ) from None
+    return dtype

@@ -22,9 +22,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ..atomic_files import temporary_path
-from .json_fields import read_object
 from .monitor_directory import episode_of, iter_monitor_files
-from .video_metadata import finished_videos, metadata_path
+from .video_metadata import finished_videos, metadata_of, metadata_path
 from .video_names import is_second_name, second_name_of, without_part
 
 logger = logging.getLogger(__name__)
@@ -105,10 +104,7 @@ def _said_of(video: Path) -> str | None:
     """Return the second name in a video's metadata, which may be anybody's."""
     if video.suffix != ".mp4" or episode_of(video.name) is None:
         return None
-    try:
-        name = read_object(metadata_path(video)).get("also_named")
-    except (OSError, ValueError):
-        return None
+    name = metadata_of(video).get("also_named")
     return name if isinstance(name, str) and is_second_name(name) else None
 
 

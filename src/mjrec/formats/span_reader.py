@@ -34,8 +34,7 @@ from .spans import (
     SpanList,
     row_dtype,
 )
-from .trajectory import ModelChange
-from .trajectory_reader import TrajectoryReader
+from .trajectory import ModelChange, TrajectoryReader
 
 # A row has a step, a frame, or both.
 _KINDS = STEP | FRAME
@@ -56,7 +55,7 @@ class SpanReader(TrajectoryReader):
             version.
     """
 
-    _rows: RowLogReader | None = None
+    _log_rows: RowLogReader | None = None
     _looks: BinaryIO | None = None
 
     def __init__(self, path: Path) -> None:
@@ -67,15 +66,15 @@ class SpanReader(TrajectoryReader):
         self._log = spans.log
         self._dtype = row_dtype(spans.header)
         with unreadable(spans.log), contextlib.ExitStack() as opened:
-            self._rows = RowLogReader(spans.log, self._dtype.itemsize)
+            self._log_rows = RowLogReader(spans.log, self._dtype.itemsize)
             opened.callback(self.close)
-            count = self._rows.count
+            count = self._log_rows.count
             # Again: what was begun behind it is not its own.
             known = read_list(spans.path).recordings
             recording = replace(known.get(recording.name, recording))
             if recording.stop is not None:
                 # All of its rows were counted when that was said.
-                count = self._rows.count
+                count = self._log_rows.count
             self.header = replace(spans.header, facts=dict(recording.facts))
             self._first = recording.row
             self._look_through(_stop_of(recording, count), recording.stop)
@@ -86,9 +85,9 @@ class SpanReader(TrajectoryReader):
 
     def close(self) -> None:
         """Close the log; idempotent. What is in memory stays."""
-        if self._rows is not None:
-            self._rows.close()
-            self._rows = None
+        if self._log_rows is not None:
+            self._log_rows.close()
+            self._log_rows = None
         if self._looks is not None:
             self._looks.close()
             self._looks = None
@@ -137,21 +136,16 @@ class SpanReader(TrajectoryReader):
         self.frame_steps = heads["step"][is_frame]
         return len(heads)
 
-    def _states(self, start: int, stop: int) -> NDArray[np.float64]:
-        return self._column("state", self._step_rows[start:stop])
-
-    def _actions(self, start: int, stop: int) -> NDArray[Any]:
+    def _rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        column = name.removesuffix("s")
+        if column == "snapshot":
+            rows = self._column(column, self._frame_rows[start:stop])
+            # Padding holds whatever lies between MuJoCo's arrays.
+            rows[:, self.header.snapshot.padding] = 0
+            return rows
         # The row of step k has the action that led there; that of the reset has none.
-        return self._column("action", self._step_rows[start + 1 : stop + 1])
-
-    def _observations(self, start: int, stop: int) -> NDArray[Any]:
-        return self._column("observation", self._step_rows[start:stop])
-
-    def _snapshots(self, start: int, stop: int) -> NDArray[np.uint8]:
-        snapshots = self._column("snapshot", self._frame_rows[start:stop])
-        # Padding holds whatever lies between MuJoCo's arrays.
-        snapshots[:, self.header.snapshot.padding] = 0
-        return snapshots
+        later = column == "action"
+        return self._column(column, self._step_rows[start + later : stop + later])
 
     def _column(self, name: str, wanted: NDArray[np.intp]) -> NDArray[Any]:
         member = self._dtype[name]
@@ -172,9 +166,9 @@ class SpanReader(TrajectoryReader):
         return out
 
     def _read(self, start: int, stop: int) -> NDArray[Any]:
-        if self._rows is None:
+        if self._log_rows is None:
             raise self._closed()
-        return self._rows.read(start, stop).view(self._dtype)[:, 0]
+        return self._log_rows.read(start, stop).view(self._dtype)[:, 0]
 
     def _open_looks(self, spans: SpanList) -> BinaryIO | None:
         try:

@@ -49,8 +49,13 @@ from .monitor_directory import (
     infix_of,
 )
 from .regular_files import open_regular
-from .trajectory import FORMAT_VERSION, TrajectoryHeader
-from .trajectory_layout import check_version, header_from_json, layout_to_json
+from .trajectory import (
+    FORMAT_VERSION,
+    TrajectoryHeader,
+    check_version,
+    header_from_json,
+    layout_to_json,
+)
 
 FORMAT = "mjrec spans"
 SPANS, LOG, LOOKS, FINISHED = ".spans", ".log", ".looks", ".h5"

@@ -1,22 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a trajectory holds, whichever of its two files it is in.
+"""What a trajectory holds, whichever of its two forms it has.
 
 A recorded episode is first a span of the monitor's row log (`spans`), and then an HDF5
-file (`trajectory_hdf5`). Both hold the same: facts, rows and model changes.
-`docs/format.md` is the specification of both.
+file (`trajectory_hdf5`). Both hold facts, rows and changes of the model; the JSON that
+describes their rows is the same. `docs/format.md` is the specification of both.
 """
 
 from __future__ import annotations
 
+import abc
 import functools
-from collections.abc import Iterable, Mapping
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InvalidArgument
+from .json_fields import field, integer, list_of, mapping, optional, text
 
 FORMAT_VERSION = 1
+
+# What is in a file is read as such and as nothing else: no objects, no texts.
+_DTYPES = frozenset(
+    ["|b1", "|i1", "|u1", "<f2", "<f4", "<f8"]
+    + [f"<{kind}{size}" for kind in "iu" for size in (2, 4, 8)]
+)
+
+# They become names inside the HDF5 file, where a slash would be a path.
+_NAME = re.compile(r"(?!\.{1,2}$)[^/\x00-\x1f\x7f\ud800-\udfff]{1,200}")
 
 
 def padded(size: int) -> int:
@@ -37,9 +54,14 @@ class Array:
     shape: tuple[int, ...]
 
     @functools.cached_property
+    def numpy(self) -> np.dtype[Any]:
+        """The type of one, a subarray."""
+        return np.dtype((self.dtype, self.shape))
+
+    @property
     def size(self) -> int:
         """The bytes of one."""
-        return int(np.dtype(self.dtype).itemsize * np.prod(self.shape, dtype=int))
+        return self.numpy.itemsize
 
 
 @dataclass(frozen=True)
@@ -85,8 +107,8 @@ class RowLayout:
     def padding(self) -> NDArray[np.intp]:
         """Where in a row there is nothing."""
         free = np.ones(self.size, bool)
-        for field in self.fields:
-            free[field.offset : field.offset + field.array.size] = False
+        for part in self.fields:
+            free[part.offset : part.offset + part.array.size] = False
         return np.flatnonzero(free)
 
     def unpack(self, rows: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
@@ -157,40 +179,235 @@ class ModelChange:
     fields: Mapping[str, NDArray[Any]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrajectoryContent:
-    """All of a trajectory, as arrays. T is the number of steps, F of video frames.
-
-    Attributes:
-        header: what is known besides.
-        states: `(T + 1, state_length) float64`, the first after the reset; none at all
-            in the log of an episode that was killed before that was written.
-        actions: `(T, *shape)`, or None.
-        rewards: `(T,) float64`.
-        terminated: `(T,) bool`.
-        truncated: `(T,) bool`.
-        observations: `(T + 1, *shape)`, or None.
-        frame_steps: `(F,) int64`, the step that each snapshot was taken after.
-        snapshots: `(F, snapshot.size) uint8`, packed rows.
-        model_changes: in the order of their steps.
-        dropped: how many rows and other records at the end of the log were torn or
-            damaged, as far as they can be counted, and are not here.
-    """
-
-    header: TrajectoryHeader
-    states: NDArray[np.float64]
-    actions: NDArray[Any] | None
-    rewards: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-    observations: NDArray[Any] | None
-    frame_steps: NDArray[np.int64]
-    snapshots: NDArray[np.uint8]
-    model_changes: tuple[ModelChange, ...] = ()
-    dropped: int = 0
-
-
 def _unpacked(field: Field, rows: NDArray[np.uint8]) -> NDArray[Any]:
     part = rows[..., field.offset : field.offset + field.array.size]
     values = np.ascontiguousarray(part).view(field.array.dtype)
     return values.reshape(rows.shape[:-1] + field.array.shape)
+
+
+def check_version(version: int) -> None:
+    """Raise `ValueError` for a format version that this code does not read."""
+    if version > FORMAT_VERSION:
+        raise ValueError(
+            f"it was written by a newer mjrec, in format version {version}, and this "
+            f"one reads versions up to {FORMAT_VERSION}: update mjrec"
+        )
+    if version < 1:
+        raise ValueError(f"there is no format version {version}")
+
+
+def layout_to_json(header: TrajectoryHeader) -> dict[str, Any]:
+    """Return all of a header but its facts.
+
+    Raises:
+        ValueError: no file could hold such rows.
+    """
+    layout = {
+        "state": [[c.name, c.length] for c in header.state],
+        "snapshot": [
+            {"name": f.name, **array_to_json(f.array)} for f in header.snapshot.fields
+        ],
+        "action": header.action and array_to_json(header.action),
+        "observation": header.observation and array_to_json(header.observation),
+    }
+    # What is written is what a reader will make of it.
+    if header_from_json(header.facts, layout) != header:
+        raise ValueError("the parts of its rows do not lie one behind the other")
+    return layout
+
+
+def header_from_json(
+    facts: Mapping[str, Any], layout: Mapping[str, Any]
+) -> TrajectoryHeader:
+    """Return the header that `layout_to_json` was given.
+
+    Raises:
+        ValueError: `layout` is of another shape, or there can be no such rows.
+    """
+    state = field(layout, "state", list_of(_component))
+    offsets = itertools.accumulate((length for _, length in state), initial=0)
+    snapshot = field(layout, "snapshot", list_of(named_array))
+    for parts in (state, snapshot):
+        if len(dict(parts)) != len(parts):
+            raise ValueError("two parts of a row have the same name")
+    return TrajectoryHeader(
+        facts=facts,
+        state=tuple(
+            StateComponent(name, offset, length)
+            for (name, length), offset in zip(state, offsets, strict=False)
+        ),
+        snapshot=RowLayout.packed(snapshot),
+        action=field(layout, "action", optional(array_from_json)),
+        observation=field(layout, "observation", optional(array_from_json)),
+    )
+
+
+def array_to_json(array: Array) -> dict[str, Any]:
+    """Return the kind of an array."""
+    return {"dtype": array.dtype, "shape": list(array.shape)}
+
+
+def array_from_json(value: Any) -> Array:
+    """Return the kind of an array that `array_to_json` was given.
+
+    Raises:
+        ValueError: there can be no such array.
+    """
+    values = mapping(value)
+    dtype = field(values, "dtype", text)
+    if dtype not in _DTYPES:
+        raise ValueError(f"{dtype!r:.80} is no dtype of a trajectory")
+    shape = field(values, "shape", list_of(_count))
+    # NumPy refuses what no array can be.
+    np.dtype((dtype, shape))
+    return Array(dtype, shape)
+
+
+def field_name(value: Any) -> str:
+    """Return a text that can name an array in both files."""
+    name = text(value)
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"{name[:200]!r} cannot name an array")
+    return name
+
+
+def named_array(value: Any) -> tuple[str, Array]:
+    """Return the name and the kind of an array that has both."""
+    values = mapping(value)
+    return field(values, "name", field_name), array_from_json(values)
+
+
+def _component(value: Any) -> tuple[str, int]:
+    parts = list_of(lambda item: item)(value)
+    if len(parts) != 2:
+        raise ValueError("a component is its name and its length")
+    return field_name(parts[0]), _count(parts[1])
+
+
+def _count(value: Any) -> int:
+    number = integer(value)
+    if number < 0:
+        raise ValueError(f"{number} cannot be a number of things")
+    return number
+
+
+def added_up(rewards: ArrayLike) -> float:
+    """Return the sum of rewards, one added after the other, as a monitor does.
+
+    `sum` makes up for roundings from Python 3.12 on, and NumPy's adds in pairs.
+    """
+    values = np.asarray(rewards, np.float64)
+    # Zero comes first: it makes the sum of negative zeros a positive one.
+    with np.errstate(all="ignore"):
+        return 0.0 + float(np.add.accumulate(values)[-1]) if len(values) else 0.0
+
+
+class TrajectoryReader(abc.ABC):
+    """An open trajectory. T is the number of steps, F of video frames.
+
+    Only what describes the rows is in memory; rows are read when they are asked for,
+    in ranges `start, stop` as Python counts them. A reader is used by one thread, and
+    in the process that opened it.
+
+    Attributes:
+        path: of the file.
+        header: what is known of the episode besides its rows.
+        row_count: how many states there are: T + 1, the first after the reset; 0 in
+            the log of an episode that was killed before that was written.
+        rewards: `(T,) float64`.
+        terminated: `(T,) bool`.
+        truncated: `(T,) bool`.
+        frame_steps: `(F,) int64`, the step that each snapshot was taken after.
+        change_count: how often the model changed.
+        dropped: how many rows and other records at the end of the log were torn or
+            damaged, as far as they can be counted, and are not here.
+    """
+
+    path: Path
+    header: TrajectoryHeader
+    row_count: int
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    frame_steps: NDArray[np.int64]
+    change_count: int
+    dropped: int
+
+    @property
+    def step_count(self) -> int:
+        """T."""
+        return len(self.rewards)
+
+    @property
+    def frame_count(self) -> int:
+        """F."""
+        return len(self.frame_steps)
+
+    def states(self, start: int, stop: int) -> NDArray[np.float64]:
+        """Return `(stop - start, state_length) float64`, of `row_count` rows.
+
+        Raises:
+            UnreadableFile: the file was damaged since it was opened.
+        """
+        return self._range("states", start, stop, self.row_count)
+
+    def actions(self, start: int, stop: int) -> NDArray[Any] | None:
+        """Return `(stop - start, *shape)`, of T; None where they are not recorded."""
+        if self.header.action is None:
+            return None
+        return self._range("actions", start, stop, self.step_count)
+
+    def observations(self, start: int, stop: int) -> NDArray[Any] | None:
+        """Return `(stop - start, *shape)`, of `row_count`; None as of `actions`."""
+        if self.header.observation is None:
+            return None
+        return self._range("observations", start, stop, self.row_count)
+
+    def snapshots(self, start: int, stop: int) -> NDArray[np.uint8]:
+        """Return `(stop - start, snapshot.size) uint8` packed rows, of F."""
+        return self._range("snapshots", start, stop, self.frame_count)
+
+    def iter_model_changes(self) -> Iterator[ModelChange]:
+        """Yield the changes of the model in the order of their steps."""
+        return (self._model_change(index) for index in range(self.change_count))
+
+    @functools.cached_property
+    def model_changes(self) -> tuple[ModelChange, ...]:
+        """The changes of the model in the order of their steps; read once."""
+        return tuple(self.iter_model_changes())
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Close the file; idempotent. What is in memory stays."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return (
+            f"<{type(self).__name__} {str(self.path)!r} {self.step_count} steps, "
+            f"{self.frame_count} frames>"
+        )
+
+    def _range(self, name: str, start: int, stop: int, count: int) -> NDArray[Any]:
+        if not 0 <= start <= stop <= count:
+            raise InvalidArgument(
+                f"{self.path.name} has {count} {name}; there are none from {start} to "
+                f"{stop}."
+            )
+        return self._rows(name, start, stop)
+
+    @abc.abstractmethod
+    def _rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Return some of the states, actions, observations or snapshots."""
+
+    @abc.abstractmethod
+    def _model_change(self, index: int) -> ModelChange: ...

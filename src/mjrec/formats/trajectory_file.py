@@ -15,8 +15,8 @@ from .monitor_directory import Infix, trajectory_prefix
 from .regular_files import open_regular
 from .span_reader import SpanReader
 from .spans import FINISHED
+from .trajectory import TrajectoryReader, added_up
 from .trajectory_hdf5 import SIGNATURE, TrajectoryHdf5Reader, write_hdf5
-from .trajectory_reader import TrajectoryReader, added_up
 
 
 def open_trajectory(path: Path) -> TrajectoryReader:

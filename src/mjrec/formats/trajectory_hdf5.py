@@ -6,6 +6,8 @@ members bear MuJoCo's names: `file["snapshots"]["geom_xpos"]` is an array, and t
 shuffle filter, which goes by whole rows there, puts the same byte of one row after the
 other side by side, so that what does not change costs nothing. (Of what was measured
 that was the smallest form and the fastest to write; `docs/format.md` has numbers.)
+
+Nothing here bounds the memory or time that a file asks for: `trajectory_file` does.
 """
 
 from __future__ import annotations
@@ -13,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import math
 import os
 import signal
 import threading
@@ -30,24 +31,19 @@ from ..atomic_files import replacing
 from ..errors import ClosedError, FileNotWritten, UnreadableFile
 from ..json_text import dumps
 from .json_fields import json_object, unreadable
-from .model_changes import LARGEST_CHANGE
 from .regular_files import regular_path
 from .trajectory import (
     FORMAT_VERSION,
     Array,
     ModelChange,
     RowLayout,
-)
-from .trajectory_layout import (
-    LARGEST_ROW,
-    MOST_PARTS,
+    TrajectoryReader,
     array_from_json,
     check_version,
     field_name,
     header_from_json,
     layout_to_json,
 )
-from .trajectory_reader import TrajectoryReader
 
 # How every HDF5 file begins.
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -72,16 +68,8 @@ _CHUNK_BYTES = 1 << 17
 # How much is in memory at a time while it is written.
 _BUFFER_BYTES = 1 << 22
 
-_LEVEL = 1
+_PACKING: Mapping[str, Any] = {"chunks": True, "compression": 1, "shuffle": True}
 _FILTERS = frozenset((h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE))
-# Deflate makes at most 1032 bytes out of one.
-_MOST_EXPANSION = 1040
-_MOST_CHANGES = 1 << 20
-_LONGEST_TEXT = 1 << 26
-
-# What there is once for each step or frame is read when a file is opened, and a file
-# of a few kilobytes can claim any number of them. Two weeks at 50 steps a second.
-_MOST_STEPS = 1 << 26
 
 
 def write_hdf5(reader: TrajectoryReader, path: Path) -> None:
@@ -214,115 +202,72 @@ class TrajectoryHdf5Reader(TrajectoryReader):
             raise ValueError("its facts or its layout are damaged")
         self.header = header = header_from_json(json_object(facts), json_object(layout))
         self.dropped = _whole_number(attributes, "dropped")
-        self._stored_changes = 0
-        self._stored_by_change: dict[int, int] = {}
         self.rewards = self._column("rewards", "<f8")
-        steps = len(self.rewards)
+        steps = self.step_count
         self.terminated = self._column("terminated", "|b1", steps)
         self.truncated = self._column("truncated", "|b1", steps)
-        self._state_rows = self._dataset("states", "<f8", (header.state_length,))
-        self.row_count = self._state_rows.shape[0]
-        if self.row_count != steps + 1 and (self.row_count, steps) != (0, 0):
-            raise ValueError(f"it has {self.row_count} states for {steps} steps")
         self.frame_steps = self._column("frame_steps", "<i8")
-        self._check_frames()
-        self._action_rows = self._optional("actions", header.action, steps)
-        self._observation_rows = self._optional(
-            "observations", header.observation, self.row_count
-        )
-        self._snapshot_type = _row_type(header.snapshot)
-        self._snapshot_rows = (
-            self._dataset("snapshots", self._snapshot_type, (), self.frame_count)
-            if header.snapshot.size
-            else None
-        )
-        self._changes = self._group(self._file, "model_changes")
+        state = Array("<f8", (header.state_length,)).numpy
+        self._datasets = {"states": self._dataset("states", state)}
+        self.row_count = rows = len(self._datasets["states"])
+        if rows != steps + 1 and (rows, steps) != (0, 0):
+            raise ValueError(f"it has {rows} states for {steps} steps")
+        bounds = np.concatenate(([0], self.frame_steps, [max(rows - 1, 0)]))
+        # Compared, because differences of such numbers may overflow.
+        if (bounds[1:] < bounds[:-1]).any() or (self.frame_count and not rows):
+            raise ValueError("its frames are not of its steps, in order")
+        if header.action is not None:
+            self._datasets["actions"] = self._dataset(
+                "actions", header.action.numpy, steps
+            )
+        if header.observation is not None:
+            self._datasets["observations"] = self._dataset(
+                "observations", header.observation.numpy, rows
+            )
+        if header.snapshot.size:
+            self._datasets["snapshots"] = self._dataset(
+                "snapshots", _row_type(header.snapshot), self.frame_count
+            )
+        self._changes = _group(self._file, "model_changes")
         self.change_count = len(self._changes)
-        if self.change_count > _MOST_CHANGES:
-            raise ValueError("it has too many changes of the model")
 
-    def _states(self, start: int, stop: int) -> NDArray[np.float64]:
-        return self._read(self._state_rows, start, stop)
-
-    def _actions(self, start: int, stop: int) -> NDArray[Any]:
-        return self._read(self._action_rows, start, stop)
-
-    def _observations(self, start: int, stop: int) -> NDArray[Any]:
-        return self._read(self._observation_rows, start, stop)
-
-    def _snapshots(self, start: int, stop: int) -> NDArray[np.uint8]:
+    def _rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
         size = self.header.snapshot.size
+        if name != "snapshots":
+            return self._read(self._datasets[name], start, stop)
         if not size:
             return np.empty((stop - start, 0), np.uint8)
-        rows = self._read(self._snapshot_rows, start, stop)
+        rows = self._read(self._datasets[name], start, stop)
         return rows.view(np.uint8).reshape(stop - start, size)
 
     def _model_change(self, index: int) -> ModelChange:
         self._check_open()
         with _reading(self.path):
-            group = self._group(self._changes, str(index))
+            group = _group(self._changes, str(index))
             step = _whole_number(group.attrs, "step")
             if step < 0:
                 raise ValueError("a change of the model is of no step")
-            datasets = self._changed(index, group)
-            fields = {name: _whole(dataset) for name, dataset in datasets.items()}
-            return ModelChange(step=step, fields=fields)
-
-    def _changed(self, index: int, group: h5py.Group) -> dict[str, Any]:
-        """Return the datasets of a change, which can all be read at once."""
-        if len(group) > MOST_PARTS:
-            raise ValueError(f"a change of the model has {len(group)} fields")
-        datasets = {
-            field_name(name): _checked_dataset(group, name, self.path) for name in group
-        }
-        if sum(map(_size, datasets.values())) > LARGEST_CHANGE:
-            raise ValueError("a change of the model is too large")
-        stored = sum(dataset.id.get_storage_size() for dataset in datasets.values())
-        self._stored_changes += stored - self._stored_by_change.get(index, 0)
-        self._stored_by_change[index] = stored
-        # The same data under a million names would be read a million times.
-        if self._stored_changes > self.path.stat().st_size:
-            raise ValueError("its changes of the model are stored in one another")
-        return datasets
-
-    def _check_frames(self) -> None:
-        steps = self.frame_steps
-        bounds = np.concatenate(([0], steps, [max(self.row_count - 1, 0)]))
-        # Compared, because differences of such numbers may overflow.
-        if (bounds[1:] < bounds[:-1]).any() or (len(steps) and not self.row_count):
-            raise ValueError("its frames are not of its steps, in order")
-
-    def _optional(self, name: str, kind: Array | None, count: int) -> Any:
-        return kind and self._dataset(name, kind.dtype, kind.shape, count)
+            datasets = {field_name(name): _own_dataset(group, name) for name in group}
+            return ModelChange(
+                step=step,
+                fields={name: _whole(dataset) for name, dataset in datasets.items()},
+            )
 
     def _column(self, name: str, dtype: str, count: int | None = None) -> NDArray[Any]:
-        dataset = self._dataset(name, dtype, (), count)
-        if dataset.shape[0] > _MOST_STEPS:
-            raise ValueError(f"it has more than {_MOST_STEPS} {name}")
-        return self._read(dataset, 0, dataset.shape[0])
+        dataset = self._dataset(name, np.dtype(dtype), count)
+        return self._read(dataset, 0, len(dataset))
 
-    def _dataset(
-        self,
-        name: str,
-        dtype: Any,
-        shape: tuple[int, ...],
-        count: int | None = None,
-    ) -> Any:
-        """Return a dataset with a row of `shape` for each of `count` things."""
-        dataset = _checked_dataset(self._file, name, self.path)
-        if dataset.dtype != dtype:
+    def _dataset(self, name: str, kind: np.dtype[Any], count: int | None = None) -> Any:
+        """Return a dataset with one of a kind for each of `count` things."""
+        dataset = _own_dataset(self._file, name)
+        # Memory is made for what the layout says, and HDF5 fills it as the file says.
+        if dataset.dtype != kind.base:
             raise ValueError(f"its {name} are of dtype {dataset.dtype}")
-        if dataset.shape[:1] + shape != dataset.shape:
+        if dataset.shape[:1] + kind.shape != dataset.shape:
             raise ValueError(f"its {name} have the shape {dataset.shape}")
         if count not in (None, dataset.shape[0]):
             raise ValueError(f"it has {dataset.shape[0]} {name}, not {count}")
         return dataset
-
-    def _group(self, parent: h5py.Group, name: str) -> h5py.Group:
-        group = _linked(parent, name)
-        if not isinstance(group, h5py.Group):
-            raise ValueError(f"its {name} is no group")
-        return group
 
     def _read(self, dataset: Any, start: int, stop: int) -> NDArray[Any]:
         self._check_open()
@@ -344,13 +289,7 @@ def _reading(path: Path) -> Iterator[None]:
         with unreadable(path):
             yield
     except (AttributeError, LookupError, RuntimeError, TypeError) as error:
-        raise UnreadableFile(path, _reason(error)) from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return str(error) or type(error).__name__
+        raise UnreadableFile(path, str(error) or type(error).__name__) from error
 
 
 def _linked(group: h5py.Group, name: str) -> Any:
@@ -360,8 +299,15 @@ def _linked(group: h5py.Group, name: str) -> Any:
     return group[name]
 
 
-def _checked_dataset(group: h5py.Group, name: str, path: Path) -> Any:
-    """Return a dataset that can be read without harm, whoever made the file."""
+def _group(parent: h5py.Group, name: str) -> h5py.Group:
+    group = _linked(parent, name)
+    if not isinstance(group, h5py.Group):
+        raise ValueError(f"its {name} is no group")
+    return group
+
+
+def _own_dataset(group: h5py.Group, name: str) -> Any:
+    """Return a dataset whose data is in this file, packed as mjrec packs it."""
     dataset = _linked(group, name)
     if not isinstance(dataset, h5py.Dataset):
         raise ValueError(f"its {name} is no dataset")
@@ -379,16 +325,7 @@ def _checked_dataset(group: h5py.Group, name: str, path: Path) -> Any:
         raise ValueError(f"its {name} is stored in a way that mjrec does not write")
     if dataset.shape is None:
         raise ValueError(f"its {name} is no dataset")
-    item = dataset.dtype.itemsize
-    chunk = item * math.prod(dataset.chunks or (0,))
-    stored = min(dataset.id.get_storage_size(), path.stat().st_size)
-    if chunk > LARGEST_ROW or _size(dataset) > stored * _MOST_EXPANSION:
-        raise ValueError(f"its {name} would need more memory than it can hold")
     return dataset
-
-
-def _size(dataset: Any) -> int:
-    return int(dataset.dtype.itemsize * math.prod(dataset.shape))
 
 
 def _whole(dataset: Any) -> NDArray[Any]:
@@ -406,8 +343,6 @@ def _attribute(attributes: Any, name: str, kinds: str) -> Any:
     # that has no checksum, and the HDF5 library may never come back from there.
     if identifier.shape != () or identifier.dtype.kind not in kinds:
         raise ValueError(f"its attribute {name!r} is of another type")
-    if identifier.dtype.itemsize > _LONGEST_TEXT:
-        raise ValueError(f"its attribute {name!r} is too long")
     return attributes[name]
 
 
@@ -433,12 +368,8 @@ def _row_type(layout: RowLayout) -> np.dtype[Any]:
 
 
 def _write(file: h5py.File, reader: TrajectoryReader) -> None:
-    # What is written is what a reader will accept.
-    if max(reader.step_count, reader.frame_count) > _MOST_STEPS:
-        raise UnreadableFile(reader.path, f"it has more than {_MOST_STEPS} steps")
     _write_attributes(file, reader)
-    _write_steps(file, reader)
-    _write_frames(file, reader)
+    _write_rows(file, reader)
     changes = file.create_group("model_changes")
     for index, change in enumerate(reader.iter_model_changes()):
         _write_change(changes.create_group(str(index)), change)
@@ -475,109 +406,67 @@ def _plain_facts(facts: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
                 yield name, value
 
 
-def _write_steps(file: h5py.File, reader: TrajectoryReader) -> None:
+def _write_rows(file: h5py.File, reader: TrajectoryReader) -> None:
     header, steps, rows = reader.header, reader.step_count, reader.row_count
-    states = _store(
-        file, "states", Array("<f8", (header.state_length,)), rows, reader.states
-    )
+    state = Array("<f8", (header.state_length,)).numpy
+    states = _store(file, "states", state, rows, reader.states)
     states.attrs["components"] = [c.name for c in header.state]
     states.attrs["offsets"] = np.array([c.offset for c in header.state], np.int64)
     states.attrs["lengths"] = np.array([c.length for c in header.state], np.int64)
-    _store_all(file, "rewards", reader.rewards)
-    _store_all(file, "terminated", reader.terminated)
-    _store_all(file, "truncated", reader.truncated)
-    for component in header.state:
-        if component.name == "time" and component.length == 1:
-            _store_all(file, "time", _column_of(reader, component.offset))
+    columns = {
+        name: getattr(reader, name)
+        for name in ("rewards", "terminated", "truncated", "frame_steps")
+    }
+    for c in header.state:
+        if c.name == "time" and c.length == 1:
+            columns["time"] = states[:, c.offset] if rows else np.empty(0)
+    for name, values in columns.items():
+        _store(file, name, values.dtype, len(values), _slices_of(values))
     if header.action is not None:
-        _store(file, "actions", header.action, steps, reader.actions)
+        _store(file, "actions", header.action.numpy, steps, reader.actions)
     if header.observation is not None:
-        _store(file, "observations", header.observation, rows, reader.observations)
-
-
-def _write_frames(file: h5py.File, reader: TrajectoryReader) -> None:
-    _store_all(file, "frame_steps", reader.frame_steps)
-    size = reader.header.snapshot.size
-    if not size:
-        return
-    kind = _row_type(reader.header.snapshot)
-    count = reader.frame_count
-    rows = min(_SNAPSHOT_CHUNK_ROWS, _SNAPSHOT_CHUNK_BYTES // size, count)
-    dataset = _create(file, "snapshots", kind, (count,), max(1, rows))
-    for start, stop in _parts(dataset):
-        dataset[start:stop] = reader.snapshots(start, stop).view(kind).reshape(-1)
+        kind = header.observation.numpy
+        _store(file, "observations", kind, rows, reader.observations)
+    if size := header.snapshot.size:
+        kind = _row_type(header.snapshot)
+        _store(
+            *(file, "snapshots", kind, reader.frame_count),
+            lambda start, stop: reader.snapshots(start, stop).view(kind).reshape(-1),
+            chunk_bytes=min(_SNAPSHOT_CHUNK_BYTES, _SNAPSHOT_CHUNK_ROWS * size),
+        )
 
 
 def _write_change(group: h5py.Group, change: ModelChange) -> None:
     group.attrs["step"] = np.int64(change.step)
     for name, values in change.fields.items():
-        if values.ndim and values.size:
-            group.create_dataset(
-                name, data=values, chunks=True, compression=_LEVEL, shuffle=True
-            )
-        else:
-            group.create_dataset(name, data=values)
-
-
-def _column_of(reader: TrajectoryReader, offset: int) -> NDArray[np.float64]:
-    step = _rows_at_once(8 * reader.header.state_length)
-    parts = [
-        reader.states(start, min(start + step, reader.row_count))[:, offset]
-        for start in range(0, reader.row_count, step)
-    ]
-    return np.concatenate([np.empty(0), *parts])
+        packing = _PACKING if values.ndim and values.size else {}
+        group.create_dataset(name, data=values, **packing)
 
 
 def _store(
     file: h5py.File,
     name: str,
-    kind: Array,
+    kind: np.dtype[Any],
     count: int,
     read: Callable[[int, int], NDArray[Any] | None],
+    *,
+    chunk_bytes: int = _CHUNK_BYTES,
 ) -> Any:
-    """Write `count` rows, which `read(start, stop)` gives."""
-    rows = max(1, min(count, _CHUNK_BYTES // (kind.size or 1)))
-    dataset = _create(file, name, np.dtype(kind.dtype), (count, *kind.shape), rows)
-    for start, stop in _parts(dataset):
+    """Write `count` of a kind, which `read(start, stop)` gives."""
+    shape, size = (count, *kind.shape), kind.itemsize
+    if not count * size:
+        # Nothing to be cut into chunks.
+        return file.create_dataset(name, shape, kind.base)
+    chunk = max(1, min(count, chunk_bytes // size))
+    packing = {**_PACKING, "chunks": (chunk, *kind.shape)}
+    dataset = file.create_dataset(name, shape, kind.base, **packing)
+    # Whole chunks.
+    step = max(1, _BUFFER_BYTES // size // chunk) * chunk
+    for start in range(0, count, step):
+        stop = min(start + step, count)
         dataset[start:stop] = read(start, stop)
     return dataset
 
 
-def _store_all(file: h5py.File, name: str, values: NDArray[Any]) -> None:
-    kind = Array(values.dtype.str, values.shape[1:])
-    _store(file, name, kind, len(values), lambda start, stop: values[start:stop])
-
-
-def _create(
-    file: h5py.File,
-    name: str,
-    dtype: np.dtype[Any],
-    shape: tuple[int, ...],
-    chunk_rows: int,
-) -> Any:
-    if math.prod(shape) == 0:
-        # Nothing to be cut into chunks.
-        return file.create_dataset(name, shape, dtype)
-    return file.create_dataset(
-        name,
-        shape,
-        dtype,
-        chunks=(chunk_rows, *shape[1:]),
-        compression=_LEVEL,
-        shuffle=True,
-    )
-
-
-def _parts(dataset: Any) -> Iterator[tuple[int, int]]:
-    """Yield ranges of rows to be written at once: whole chunks."""
-    if dataset.chunks is None:
-        return
-    row = dataset.dtype.itemsize * math.prod(dataset.shape[1:])
-    chunk = dataset.chunks[0]
-    step = max(1, _rows_at_once(row) // chunk) * chunk
-    for start in range(0, dataset.shape[0], step):
-        yield start, min(start + step, dataset.shape[0])
-
-
-def _rows_at_once(size: int) -> int:
-    return max(1, _BUFFER_BYTES // max(1, size))
+def _slices_of(values: NDArray[Any]) -> Callable[[int, int], NDArray[Any]]:
+    return lambda start, stop: values[start:stop]

@@ -136,10 +136,7 @@ def finished_videos(video: Path) -> list[tuple[str, str]]:
         video: the first video.
     """
     names = [(video.name, metadata_path(video).name)]
-    try:
-        said = read_object(metadata_path(video)).get("further_videos")
-    except (OSError, ValueError):
-        return names
+    said = metadata_of(video).get("further_videos")
     for name in said if isinstance(said, list) else ():
         if isinstance(name, str) and _is_further(name, video):
             further = video.with_name(name)
@@ -160,7 +157,8 @@ def further_live_videos(video: Path) -> list[str]:
     return [
         path.name
         for path in sorted(video.parent.iterdir())
-        if _is_further(path.name, video) and _is_live(metadata_path(path))
+        if _is_further(path.name, video)
+        and metadata_of(path).get("recording") == "live"
     ]
 
 
@@ -172,17 +170,19 @@ def is_done(video: Path) -> bool:
 
 def is_broken(metadata: Path) -> bool:
     """Tell whether a video's metadata says that it broke."""
-    try:
-        return bool(read_object(metadata).get("broken"))
-    except (OSError, ValueError):
-        return False
+    return bool(_read_or_nothing(metadata).get("broken"))
 
 
-def _is_live(metadata: Path) -> bool:
+def metadata_of(video: Path) -> Mapping[str, Any]:
+    """Return what a video's metadata file says; nothing where it cannot be read."""
+    return _read_or_nothing(metadata_path(video))
+
+
+def _read_or_nothing(path: Path) -> Mapping[str, Any]:
     try:
-        return read_object(metadata).get("recording") == "live"
+        return read_object(path)
     except (OSError, ValueError):
-        return False
+        return {}
 
 
 def _is_further(name: str, video: Path) -> bool:

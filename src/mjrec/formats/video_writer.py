@@ -50,9 +50,6 @@ _MAX_RATE_TERM = 10**6
 _QUEUED_BYTES = 32 << 20
 _MAX_QUEUED_FRAMES = 64
 
-# How far a video is. The two in the middle last only after an interruption.
-_OPEN, _FINISHING, _GIVEN_UP, _CLOSED = "open", "not finished", "given up", "closed"
-
 
 class VideoWriter:
     """Writes one video.
@@ -89,6 +86,7 @@ class VideoWriter:
         path: the file.
         fps: as a `Fraction`.
         frame_count: how many frames were written so far.
+        closed: whether the file is finished or given up.
         result: what was written, once closed; None without frames.
 
     Raises:
@@ -109,10 +107,11 @@ class VideoWriter:
         frame_hashes: bool = False,
         encoder_arguments: Sequence[str] = (),
     ) -> None:
-        self._state = _CLOSED
-        self._encoding: _Encoding | None = None
+        self.closed = True
         self.result: VideoFile | None = None
         self.frame_count = 0
+        # From the first frame on.
+        self._encoding: _Encoding | None = None
         self.path = _check_path(path)
         self.fps = _check_fps(fps)
         self._settings = encoder_settings(
@@ -126,12 +125,7 @@ class VideoWriter:
         self._temporary_hashes = hashes if frame_hashes else None
         try_encoding(ffmpeg_executable(), self._settings, self.fps)
         self._process_id = os.getpid()
-        self._state = _OPEN
-
-    @property
-    def closed(self) -> bool:
-        """Whether the file is finished or given up."""
-        return self._state == _CLOSED
+        self.closed = False
 
     def write(self, frame: Frame) -> None:
         """Add a frame, a `(height, width, 3) uint8` array; the first fixes the size.
@@ -144,31 +138,27 @@ class VideoWriter:
             ClosedError: after `close` or `abort`, or in a forked process.
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
         """
-        if self._state != _OPEN:
+        encoding = self._encoding
+        if self.closed or (encoding is not None and encoding.is_ending):
             raise ClosedError(
-                f"The video {self.path} is {self._state} after {self.frame_count} "
-                "frames; a file cannot be reopened: write another one."
+                f"The video {self.path} is closed after {self.frame_count} frames; a "
+                "file cannot be reopened: write another one."
             )
         if self._was_forked():
             raise ClosedError(
                 f"The video {self.path} belongs to process {self._process_id}, from "
                 "which this one was forked: write it there, or another one here."
             )
-        size = self._encoding.size if self._encoding else None
-        checked = check_frame(frame, size=size)
+        checked = check_frame(frame, size=None if encoding is None else encoding.size)
         check_size(*checked.shape[:2])
         try:
-            if self._encoding is None:
-                self._encoding = _Encoding(self.unfinished(*checked.shape[:2]))
+            if encoding is None:
+                encoding = _Encoding(self.unfinished(*checked.shape[:2]))
+                self._encoding = encoding
             # A plain copy in rows from top to bottom, whatever the view was.
-            frame = np.array(checked, order="C", copy=True, subok=False)
-            self._encoding.worker.put(frame)
-        except BaseException as error:
-            # Ctrl-C while it waits for room costs nothing. Where there is no thread it
-            # may come in the midst of a frame, which costs the video.
-            has_failed = self._encoding is not None and self._encoding.worker.failed
-            if isinstance(error, Exception) or has_failed:
-                self.abort()
+            encoding.thread.put(np.array(checked, order="C", copy=True, subok=False))
+        except Exception:
+            self.abort()
             raise
         self.frame_count += 1
 
@@ -179,12 +169,6 @@ class VideoWriter:
             height: of a frame, in pixels.
             width: of a frame, in pixels.
         """
-        arguments = self._settings.arguments(
-            height=height + height % 2,
-            width=width + width % 2,
-            fps=self.fps,
-            output=self.path.name,
-        )
         return UnfinishedVideo(
             path=self.path,
             temporary=self._temporary,
@@ -199,28 +183,29 @@ class VideoWriter:
                 "version": ffmpeg_version(),
                 # Reading the whole program takes a while, and is not for the beginning.
                 "sha256": None,
-                "arguments": arguments,
+                "arguments": self._settings.arguments(
+                    height=height + height % 2,
+                    width=width + width % 2,
+                    fps=self.fps,
+                    output=self.path.name,
+                ),
             },
         )
 
     def close(self) -> None:
         """Finish the file: encode what waits, count the frames again, give the name.
 
-        Idempotent. After Ctrl-C has interrupted it, `closed` is False, no more frames
-        are taken, and another call goes on to the same end. On the thread that encodes,
-        where a garbage collection may call it, it waits for nothing and leaves the rest
-        to another call.
+        Idempotent. After Ctrl-C has interrupted it no more frames are taken, and
+        another call goes on. On the thread that encodes, where a garbage collection may
+        call it, it leaves the rest to another call.
 
         Raises:
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
             FrameCountError: the file does not hold the frames that were written.
         """
-        if self._state == _GIVEN_UP:
-            self.abort()
-        if self._state == _CLOSED:
+        if self.closed:
             return
         if self._encoding is not None and not self._was_forked():
-            self._state = _FINISHING
             try:
                 self.result = self._encoding.finish()
             except Exception:
@@ -228,19 +213,16 @@ class VideoWriter:
                 raise
             if self.result is None:
                 return
-        self._state = _CLOSED
+        self.closed = True
 
     def abort(self) -> None:
         """Stop at once and leave nothing; an older file of that name stays.
 
-        Idempotent; may be called again after Ctrl-C interrupted it.
+        Idempotent.
         """
-        if self._state == _CLOSED:
-            return
-        self._state = _GIVEN_UP
-        if self._encoding is not None and not self._was_forked():
+        if not self.closed and self._encoding is not None and not self._was_forked():
             self._encoding.abort()
-        self._state = _CLOSED
+        self.closed = True
 
     def __enter__(self) -> Self:
         return self
@@ -277,7 +259,8 @@ class VideoWriter:
     def __repr__(self) -> str:
         return (
             f"<{type(self).__name__} {str(self.path)!r} fps={self.fps} "
-            f"codec={self._settings.codec} {self._state}, {self.frame_count} frames>"
+            f"codec={self._settings.codec} {'closed' if self.closed else 'open'}, "
+            f"{self.frame_count} frames>"
         )
 
     def _was_forked(self) -> bool:
@@ -291,14 +274,18 @@ class _Encoding:
     def __init__(self, video: UnfinishedVideo) -> None:
         self.size = (video.height, video.width)
         self.temporary = video.temporary
+        self.is_ending = False
         self._video = video
         self._encoded = 0
         self._input_ended = False
-        self._result: VideoFile | None = None
         self._hashes: FrameHashFile | None = None
         with contextlib.ExitStack() as on_failure:
-            # First of all: what is not locked may be swept up.
-            self._lock = _locked(video)
+            try:
+                # First of all: what is not locked may be swept up. With the mode that a
+                # new file gets from every program.
+                self._lock = Lock(video.temporary, "", mode=0o666)
+            except OSError as error:
+                raise DirectoryNotWritable(video.path.parent, error) from error
             on_failure.callback(self._lock.release)
             if video.hashes is not None:
                 self._hashes = FrameHashFile(
@@ -313,12 +300,13 @@ class _Encoding:
                 what=f"The video {video.path} could not be encoded.",
                 reads=True,
                 # It shares the lock, which it holds to its own end when we die.
-                keeps=self._lock,
+                keeps=self._lock.fileno(),
             )
             on_failure.callback(self._end_process)
-            self.worker = WorkerThread[Frame](
+            frame_bytes = 3 * video.height * video.width
+            self.thread = WorkerThread[Frame](
                 self._encode,
-                capacity=_capacity(3 * video.height * video.width),
+                capacity=min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes)),
                 name=f"encoder of {video.path.name}",
                 finish=self._end_input,
             )
@@ -327,34 +315,44 @@ class _Encoding:
     def finish(self) -> VideoFile | None:
         """Complete the file, check it and give it its name.
 
-        May be called again after it was interrupted, and goes on then. None on the
-        encoder's own thread, which cannot wait for itself.
+        Each part can be done again, where Ctrl-C came in between. None on the encoder's
+        own thread, which cannot wait for itself.
         """
-        self.worker.close()
+        self.is_ending = True
+        self.thread.close()
         if not self._input_ended:
             return None
         self._process.wait()
-        if self._result is None:
-            self._result = self._checked()
+        file = self._video.check()
+        if file.frame_count != self._encoded:
+            raise FrameCountError(
+                f"{file.path} was to hold {self._encoded} frames, and decoding gives "
+                f"{file.frame_count}. It was not kept.",
+                command=self._process.command,
+                returncode=0,
+                stderr="",
+            )
+        encoder = {**file.encoder, "sha256": ffmpeg_sha256()}
+        file = dataclasses.replace(file, encoder=encoder)
         if self._hashes is not None:
             self._hashes.close()
-        self._video.rename(self._result)
+        self._video.rename(file)
         self._process.release()
         self._lock.release()
-        return self._result
+        return file
 
     def abort(self) -> None:
-        """End everything and remove the temporary files. May be called again."""
+        """End everything and remove the temporary files."""
         # First the process: the thread may be waiting for it to read.
         self._process.kill()
-        self.worker.abort()
+        self.thread.abort()
         self._end_process()
         if self._hashes is not None:
             self._hashes.abort()
 
     def leave(self) -> None:
         """Let the encoder go on to the end of what it was given, by itself."""
-        self.worker.leave()
+        self.thread.leave()
         self._lock.let_go()
 
     def _encode(self, frame: Frame) -> None:
@@ -376,33 +374,6 @@ class _Encoding:
         # ffmpeg may have put another file in the place of the one that is locked.
         self.temporary.unlink(missing_ok=True)
         self._lock.release()
-
-    def _checked(self) -> VideoFile:
-        file = self._video.check()
-        if file.frame_count != self._encoded:
-            raise FrameCountError(
-                f"{file.path} was to hold {self._encoded} frames, and decoding gives "
-                f"{file.frame_count}. It was not kept.",
-                command=self._process.command,
-                returncode=0,
-                stderr="",
-            )
-        encoder = {**file.encoder, "sha256": ffmpeg_sha256()}
-        return dataclasses.replace(file, encoder=encoder)
-
-
-def _capacity(frame_bytes: int) -> int:
-    """Return how many frames may wait."""
-    return min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes))
-
-
-def _locked(video: UnfinishedVideo) -> Lock:
-    """Make the hidden file, locked: who finds it knows that it is in use."""
-    try:
-        # With the mode that a new file gets from every program.
-        return Lock(video.temporary, "", mode=0o666)
-    except OSError as error:
-        raise DirectoryNotWritable(video.path.parent, error) from error
 
 
 def _check_path(path: str | os.PathLike[str]) -> Path:

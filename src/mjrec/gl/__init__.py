@@ -6,25 +6,14 @@ Nothing here imports mujoco or OpenGL; what must is tried in child processes.
 
 from __future__ import annotations
 
-from .backends import BACKENDS
-from .choice import Choice, backend_for_children, choose, use_gl
-from .diagnosis import Diagnosis, diagnose
-from .egl_device import EglDevice
-from .given_gpu import GivenGpu, render_on_given_gpu, visible_gpus
-from .probing import Probe, probe
-
-__all__ = [
-    "BACKENDS",
-    "Choice",
-    "Diagnosis",
-    "EglDevice",
-    "GivenGpu",
-    "Probe",
-    "backend_for_children",
-    "choose",
-    "diagnose",
-    "probe",
-    "render_on_given_gpu",
-    "use_gl",
-    "visible_gpus",
-]
+from .backends import BACKENDS as BACKENDS
+from .choice import backend_for_children as backend_for_children
+from .choice import choose as choose
+from .choice import use_gl as use_gl
+from .devices import render_on_given_gpu as render_on_given_gpu
+from .devices import visible_gpus as visible_gpus
+from .diagnosis import Diagnosis as Diagnosis
+from .diagnosis import diagnose as diagnose
+from .probing import EglDevice as EglDevice
+from .probing import Probe as Probe
+from .probing import probe as probe

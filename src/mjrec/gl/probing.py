@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -17,7 +18,6 @@ from typing import Any
 from ..machine import gpu_device_files
 from .backends import backend_name, environment_for
 from .diagnosis import Diagnosis, diagnose
-from .egl_device import EglDevice
 
 # Drivers of machines with many GPUs take ten seconds and more to wake up.
 TIMEOUT = 60.0
@@ -26,6 +26,29 @@ TIMEOUT = 60.0
 _GRACE = 5.0
 _END_OF_OUTPUT = 4000
 _SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|SwiftShader|software", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class EglDevice:
+    """One of EGL's devices.
+
+    Attributes:
+        index: its place in EGL's list, which is what `MUJOCO_EGL_DEVICE_ID` means to
+            mujoco 3 (and to mujoco 4 where no device has a CUDA number).
+        device_file: for example `/dev/dri/renderD128`; empty where EGL does not tell.
+        cuda_id: CUDA's number of the same device; None where it has none, or where
+            `CUDA_VISIBLE_DEVICES` hides it.
+        software: whether it is the CPU.
+        in_use: whether the current context draws on it.
+        uuid: of the GPU, as `nvidia-smi -L` shows it; empty where EGL does not tell.
+    """
+
+    index: int
+    device_file: str
+    cuda_id: int | None
+    software: bool
+    in_use: bool
+    uuid: str = ""
 
 
 @dataclass(frozen=True)
@@ -69,21 +92,20 @@ class Probe:
         files = gpu_device_files() if self.software else []
         if not files:
             return ""
-        what = self.gl_renderer or self.backend
-        return (
-            f"{self.backend} draws on the CPU ({what}) though there is a GPU "
-            f"({', '.join(files)}). {self._way_to_the_gpu(files)}"
-        )
-
-    def _way_to_the_gpu(self, files: list[str]) -> str:
         closed = [file for file in files if not os.access(file, os.R_OK | os.W_OK)]
         if self.backend == "osmesa":
-            return "OSMesa always does; EGL can use the GPU."
-        if closed:
-            return f"This user may not open {closed[0]}: add it to the group of that."
+            way = "OSMesa always does; EGL can use the GPU."
+        elif closed:
+            way = f"This user may not open {closed[0]}: add it to the group of that."
+        else:
+            way = (
+                "EGL finds no driver for it, or MUJOCO_EGL_DEVICE_ID names another "
+                "device. A container with an NVIDIA GPU needs "
+                "NVIDIA_DRIVER_CAPABILITIES=all."
+            )
         return (
-            "EGL finds no driver for it, or MUJOCO_EGL_DEVICE_ID names another device. "
-            "A container with an NVIDIA GPU needs NVIDIA_DRIVER_CAPABILITIES=all."
+            f"{self.backend} draws on the CPU ({self.gl_renderer or self.backend}) "
+            f"though there is a GPU ({', '.join(files)}). {way}"
         )
 
 
@@ -145,7 +167,11 @@ def probe_environment(
             frames_per_second=facts.get("frames_per_second"),
             devices=devices,
         )
-    found = diagnose(output, backend=backend, environ=environ) or _unknown(output)
+    # The words of a failure that nobody has explained yet are its cause.
+    words = "\n".join(list(filter(str.strip, output.splitlines()))[-3:])
+    found = diagnose(output, backend=backend, environ=environ) or Diagnosis(
+        words or "The child process said nothing.", ""
+    )
     return Probe(
         backend,
         False,
@@ -156,25 +182,13 @@ def probe_environment(
     )
 
 
-def _unknown(output: str) -> Diagnosis:
-    """Keep the words of a failure that nobody has explained yet."""
-    words = [line for line in output.strip().splitlines() if line.strip()]
-    return Diagnosis("\n".join(words[-3:]) or "The child process said nothing.", "")
-
-
 def _ask_child(
     environ: Mapping[str, str], *, measure: bool, timeout: float
 ) -> tuple[dict[str, Any], str]:
     """Return what the child reported, and in words all that points to a failure."""
-    command = [
-        sys.executable,
-        # The working directory may hold a file called `random.py`.
-        "-P",
-        "-m",
-        "mjrec.simulation.gl_probe",
-        f"--seconds={timeout}",
-        *(["--measure"] if measure else []),
-    ]
+    # `-P`: the working directory may hold a file called `random.py`.
+    command = [sys.executable, "-P", "-m", "mjrec.simulation.gl_probe"]
+    command += [f"--seconds={timeout}", *(["--measure"] if measure else [])]
     start = time.monotonic()
     try:
         child = subprocess.Popen(
@@ -188,36 +202,25 @@ def _ask_child(
         )
     except OSError as error:
         return {}, f"{sys.executable} could not be started: {error}"
-    try:
-        answer, said = child.communicate(timeout=timeout + _GRACE)
-    except BaseException as error:
-        child.kill()
-        answer, said = child.communicate()
-        if not isinstance(error, subprocess.TimeoutExpired):
+    with child:
+        try:
+            answer, said = child.communicate(timeout=timeout + _GRACE)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            answer, said = child.communicate()
+        except BaseException:
+            child.kill()
             raise
-    facts = _merged(answer)
-    words = [said.decode(errors="replace").strip(), *facts.get("notes", [])]
-    if facts.get("error"):
-        words.append(facts["error"])
-    else:
-        words.append(_end_of(child.returncode, time.monotonic() - start, timeout))
-    return facts, "\n".join(filter(None, words))
-
-
-def _merged(answer: bytes) -> dict[str, Any]:
     facts: dict[str, Any] = {}
     for line in answer.splitlines():
         # The last line is torn if the child died in it.
-        try:
+        with contextlib.suppress(ValueError):
             facts |= json.loads(line)
-        except ValueError:
-            continue
-    return facts
-
-
-def _end_of(returncode: int, seconds: float, timeout: float) -> str:
-    if seconds >= timeout:
-        return f"no answer within {timeout:g} seconds"
-    if returncode < 0:
-        return f"The driver crashed ({signal.Signals(-returncode).name})."
-    return f"The child process ended with status {returncode}."
+    if time.monotonic() - start >= timeout:
+        end = f"no answer within {timeout:g} seconds"
+    elif child.returncode < 0:
+        end = f"The driver crashed ({signal.Signals(-child.returncode).name})."
+    else:
+        end = f"The child process ended with status {child.returncode}."
+    words = [said.decode(errors="replace").strip(), *facts.get("notes", [])]
+    return facts, "\n".join(filter(None, [*words, facts.get("error") or end]))

@@ -7,6 +7,6 @@ environments is monitored.
 
 from __future__ import annotations
 
-from .choose import Monitor
+from .monitor import Monitor
 
 __all__ = ["Monitor"]

@@ -9,10 +9,12 @@ from typing import Any
 
 from ..errors import InvalidArgument
 from ..formats.video_names import further_parts
+from ..frames import Frame, check_frame, grid_frame, grid_shape
 from ..recorder.subject import EpisodePictures
 from ..recorder.video_recorder import can_give_pictures
 from ..rendering.views import plain_camera
-from .vector_pictures import TilePictures
+
+_RGB_ARRAY = "rgb_array"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +101,38 @@ def _check(cameras: list[Any]) -> None:
         raise InvalidArgument(f"The camera {twice[0]!r} is there twice in {cameras!r}.")
 
 
-class _CameraTiles(TilePictures):
+class Tiles:
+    """The frames of several sources, side by side.
+
+    Args:
+        sources: of the frames.
+    """
+
+    def __init__(self, sources: Sequence[EpisodePictures]) -> None:
+        self.sources = sources
+
+    @property
+    def render_mode(self) -> str | None:
+        """`rgb_array` where all sources have it; None else."""
+        modes = {source.render_mode for source in self.sources}
+        return _RGB_ARRAY if modes == {_RGB_ARRAY} else None
+
+    def render(self) -> Frame:
+        """Return the frame of this moment.
+
+        Raises:
+            InvalidArgument: the frames are not of one size, or one is none.
+        """
+        return grid_frame([check_frame(source.render()) for source in self.sources])
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the metadata of a video says about its frames."""
+        rows, columns = grid_shape(len(self.sources))
+        facts = self.sources[0].facts()
+        return {**facts, "tiled": True, "rows": rows, "columns": columns}
+
+
+class _CameraTiles(Tiles):
     """The pictures of several cameras side by side."""
 
     def facts(self) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from ..environments.no_pictures import NoPictureSource
 from ..environments.scenes import Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
+from .base import MonitorBase
 from .cameras import camera_pictures
-from .controls import MonitorControls
 
 logger = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ _NO_PHYSICS = (
 )
 
 
-class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  # untyped
+class DmEnvMonitor(MonitorBase, dm_env.Environment):  # type: ignore[misc]  # untyped
     """Records a dm_env environment; `mjrec.Monitor` makes one and says how.
 
     It keeps dm_env's contract: `reset` at any time; `step` before the first reset, or
@@ -69,17 +69,13 @@ class DmEnvMonitor(MonitorControls, dm_env.Environment):  # type: ignore[misc]  
             tiled=options.tiled,
         )
 
-        def scenes() -> Scenes:
-            return _scenes(env, env_id=env_id, camera=view.camera, **size)
-
-        self._start(
+        self._open(
             env,
             directory,
+            options,
             env_id=env_id or _env_id(env),
             view=view,
-            scenes=scenes(),
-            clip_scenes=scenes() if options.has_clips else None,
-            options=options,
+            scenes=lambda: _scenes(env, env_id=env_id, camera=view.camera, **size),
             close_environment=operator.methodcaller("close"),
         )
 
@@ -178,9 +174,7 @@ def _pictures(
 
 def _scenes(env: dm_env.Environment, **known: Any) -> Scenes:
     if getattr(env, "physics", None) is None:
-        return Scenes(
-            states=None, obstacle=None, environment=None, random_state=lambda: None
-        )
+        return Scenes()
     from ..environments.dm_control_scenes import dm_control_scenes
 
     return dm_control_scenes(env, **known)

@@ -6,26 +6,27 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, SupportsFloat
 
 import gymnasium
+import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
 from ..environments.gymnasium_scenes import gymnasium_scenes
-from ..environments.scenes import Scenes
 from ..recorder.finisher import Finisher
 from ..recorder.options import RecorderOptions
+from .base import MonitorBase
 from .cameras import camera_pictures
-from .controls import MonitorControls
-from .success import success_in
 
 logger = logging.getLogger(__name__)
 
+_Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
-class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
+
+class GymnasiumMonitor(MonitorBase, gymnasium.Wrapper[Any, Any, Any, Any]):
     """Records a Gymnasium environment; `mjrec.Monitor` makes one and says how.
 
     An episode is over when it is terminated or truncated. A reset in mid-episode is
@@ -57,28 +58,21 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         # gym's own convention: the step that ends an episode begins the next.
         self._same_step_autoreset = bool(env.metadata.get("semantics.autoreset"))
-        self._next_step_autoreset = any(
-            isinstance(wrapper, gymnasium.wrappers.Autoreset) for wrapper in _chain(env)
-        )
+        self._next_step_autoreset = _has_autoreset(env)
         size = {"height": height, "width": width}
         view = camera_pictures(
             camera,
             lambda each: gymnasium_pictures(env, camera=each, **size),
             tiled=options.tiled,
         )
-
-        def scenes() -> Scenes:
-            return gymnasium_scenes(env, camera=view.camera, **size)
-
-        self._start(
+        self._open(
             env,
             directory,
+            options,
             env_id=env_id or env_id_of(env),
             env_index=env_index,
             view=view,
-            scenes=scenes(),
-            clip_scenes=scenes() if options.has_clips else None,
-            options=options,
+            scenes=lambda: gymnasium_scenes(env, camera=view.camera, **size),
             rendering=rendering,
             close_environment=close_environment,
         )
@@ -100,13 +94,10 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._recorder.closed:
             return self.env.reset(seed=seed, options=options)
         result = self._reset_by(lambda: self.env.reset(seed=seed, options=options))
-        self._began = time.perf_counter()
         self._begin(seed=seed, options=options, observation=result[0])
         return result
 
-    def step(
-        self, action: Any
-    ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> _Step:
         """Step the environment and record what happened.
 
         Raises:
@@ -118,7 +109,9 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
             if recorder.closed:
                 return self.env.step(action)
             if self._next_step_autoreset and recorder.done:
-                return self._reset_by_step(action)
+                result = self._reset_by(lambda: self.env.step(action))
+                self._begin(observation=result[0])
+                return result
             recorder.before_step(action)
         try:
             result = self.env.step(action)
@@ -133,6 +126,12 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
             self._record(*result)
         return result
 
+    def _begin(
+        self, *, seed: Any = None, options: Any = None, observation: Any = None
+    ) -> None:
+        self._began = time.perf_counter()
+        super()._begin(seed=seed, options=options, observation=observation)
+
     def _record(
         self,
         observation: Any,
@@ -140,7 +139,19 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
         terminated: bool,
         truncated: bool,
         info: dict[str, Any],
+        first_observation: Any = None,
     ) -> None:
+        """Record a step, and the reset that it was besides, if it was.
+
+        Args:
+            observation: of the step, as all up to `info`.
+            reward: likewise.
+            terminated: likewise.
+            truncated: likewise.
+            info: likewise; what it says of the episode is added to it.
+            first_observation: of the episode that the step begins; `observation`, if
+                None.
+        """
         if self._recorder.closed:
             return
         done = bool(terminated or truncated)
@@ -154,30 +165,17 @@ class GymnasiumMonitor(MonitorControls, gymnasium.Wrapper[Any, Any, Any, Any]):
             success=success_in(info) if done else None,
         )
         if done and self._options.episode_info:
-            self._add_episode_info(info)
-        if resets_itself:
-            self._recorder.before_reset()
-            self._began = time.perf_counter()
-            self._begin(observation=observation)
-
-    def _add_episode_info(self, info: dict[str, Any]) -> None:
-        stats = self.stats_recorder
-        info.setdefault(
-            "episode",
-            {
+            stats = self.stats_recorder
+            episode = {
                 "r": stats.episode_rewards[-1],
                 "l": stats.episode_lengths[-1],
                 "t": round(time.perf_counter() - self._began, 6),
-            },
-        )
-
-    def _reset_by_step(
-        self, action: Any
-    ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        result = self._reset_by(lambda: self.env.step(action))
-        self._began = time.perf_counter()
-        self._begin(observation=result[0])
-        return result
+            }
+            info.setdefault("episode", episode)
+        if resets_itself:
+            self._recorder.before_reset()
+            first = observation if first_observation is None else first_observation
+            self._begin(observation=first)
 
 
 def env_id_of(env: gymnasium.Env[Any, Any]) -> str:
@@ -193,9 +191,27 @@ def env_id_of(env: gymnasium.Env[Any, Any]) -> str:
     return unknown
 
 
-def _chain(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
-    """Yield `env` and the environments inside it, from the outside in."""
-    yield env
+def success_in(info: Mapping[str, Any]) -> bool | None:
+    """Return whether an episode was a success; None where nothing is said.
+
+    Args:
+        info: of its last step. `is_success` is looked at, else `success`: a truth
+            value or a number, or an array of one.
+    """
+    # Gymnasium-Robotics' Fetch and Hand environments say the first, its Adroit and maze
+    # environments the second, as MetaWorld and others do.
+    for key in ("is_success", "success"):
+        value = info.get(key)
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.item()
+        if isinstance(value, bool | int | float | np.bool_ | np.number):
+            return bool(value)
+    return None
+
+
+def _has_autoreset(env: gymnasium.Env[Any, Any]) -> bool:
     while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, gymnasium.wrappers.Autoreset):
+            return True
         env = env.env
-        yield env
+    return False

@@ -3,40 +3,55 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import functools
 import logging
-import operator
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
+import numpy as np
 
-from ..environments.gymnasium_pictures import gymnasium_pictures
-from ..errors import ResetNeeded, ResetNotAllowed
+from ..environments.gymnasium_pictures import close_environment, free_viewers
+from ..errors import Error, ResetNeeded, ResetNotAllowed
+from ..formats.monitor_directory import infix_of, iter_monitor_files
 from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
 from ..recorder.options import RecorderOptions
-from .controls import MonitorControls
-from .lifetime import MonitorLifetime
-from .vector_inside import InsideRecording, environments_inside
-from .vector_modes import autoreset_mode, reset_indices
-from .vector_outside import OutsideRecording
-from .vector_pictures import OutsidePictures, TilePictures, VectorFrames
-from .vector_recording import VectorRecording, for_each
-from .vector_tiles import TiledVideo, check_tiled, wants_tiles
-from .waiting import waiting_display
+from ..rendering.background import Background
+from .base import Closable, MonitorBase, call_all
+from .gymnasium_monitor import GymnasiumMonitor
+from .progress import render_progress
+from .tiles import TiledVideo, has_videos, vector_tiles
+from .vector_slots import (
+    NEXT_STEP,
+    SAME_STEP,
+    UNSEEN,
+    Env,
+    Frames,
+    SlotMonitor,
+    VectorEnv,
+    autoreset_mode,
+    check_outside,
+    common_env_id,
+    env_id_outside,
+    environments_inside,
+    info_of,
+    is_async,
+    slots_outside,
+    way_out,
+)
 
 logger = logging.getLogger(__name__)
 
-_VectorEnv = gymnasium.vector.VectorEnv[Any, Any, Any]
+# Of the tails of all sub-environments' row logs, in bytes.
+_TAILS = 4 << 20
 
 
-class VectorMonitor(
-    MonitorLifetime,
-    gymnasium.vector.VectorWrapper,
-):
+class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
     """Records a Gymnasium vector environment; `mjrec.Monitor` makes one and says how.
 
     Every sub-environment has a monitor of its own, with its own infix, statistics,
@@ -66,13 +81,16 @@ class VectorMonitor(
 
     After `close` nothing is recorded: calls go straight to the environment, which is
     closed.
+
+    Attributes:
+        monitors: the monitors of the sub-environments, in their order.
     """
 
     allows_early_reset = True
 
     def __init__(
         self,
-        env: _VectorEnv,
+        env: VectorEnv,
         directory: str | os.PathLike[str],
         options: RecorderOptions,
         *,
@@ -82,46 +100,72 @@ class VectorMonitor(
         env_id: str | None = None,
     ) -> None:
         super().__init__(env)
-        mode = autoreset_mode(env)
-        view = {"camera": camera, "height": height, "width": width}
-        envs = environments_inside(env)
-        frames = VectorFrames(env)
-        tiles = _tiles(env, envs, frames, view) if wants_tiles(options) else None
-        if tiles is not None:
-            check_tiled(tiles)
-        recording: VectorRecording
-        if envs is not None:
-            recording = InsideRecording(
-                env, envs, directory, options, view=view, env_id=env_id
-            )
-        else:
-            recording = OutsideRecording(
-                env, mode, directory, options, frames=frames, view=view, env_id=env_id
-            )
+        self._mode = autoreset_mode(env)
         self._options = options
         self._had_error = False
-        self._recording = recording
-        self._tiled = None
-        if tiles is not None:
-            self._tiled = TiledVideo(
-                recording.monitors[0],
-                tiles,
-                options,
-                clock=recording.clock,
-                declared=recording.declared,
+        self._frames = Frames(env)
+        inside = environments_inside(env)
+        self._is_inside = inside is not None
+        view = {"camera": camera, "height": height, "width": width}
+        if inside is None:
+            check_outside(env, options.render, view)
+        envs: Sequence[Env] = inside or slots_outside(env, self._frames)
+        tiles = vector_tiles(envs, options, view)
+        if self._mode == SAME_STEP and has_videos(options):
+            _warn_of_missing_frames(env, inside is None, tiles is not None)
+        env_id = env_id or (common_env_id(envs) if inside else env_id_outside(env))
+        shared = None
+        if options.workers != 0:
+            shared = Background(
+                directory, workers=options.workers, strict=options.strict
             )
+        # How a sub-environment is closed; until all have monitors, not at all.
+        closing: dict[str, Callable[[Env], None]] = {"by": lambda env: None}
+        kind = SlotMonitor if inside is None else GymnasiumMonitor
+        self.monitors: tuple[GymnasiumMonitor, ...] = _all_or_none(
+            directory,
+            [
+                functools.partial(
+                    kind,
+                    each,
+                    directory,
+                    _options_of(index, len(envs), options, view),
+                    **view,
+                    env_id=env_id,
+                    env_index=index,
+                    rendering=None if shared is None else lambda _: shared.share(),
+                    close_environment=lambda env: closing["by"](env),
+                )
+                for index, each in enumerate(envs)
+            ],
+        )
+        closing["by"] = close_environment
+        self._shared = shared
+        self._tiled = None
         # What `close` passes on to the environment's own.
         self._closing: dict[str, Any] = {}
+        options_of_close = self._closing
+        closings: list[Callable[[], object]] = []
+        if tiles is not None:
+            self._tiled = TiledVideo(self.monitors[0], tiles, options, envs[0])
+            # Its videos stand in the manifest of the first.
+            closings.append(self._tiled.close)
+        if shared is not None:
+            # Before anything is closed: what is done by then, all manifests say.
+            closings.append(shared.stop)
+        # The vector environment closes them itself.
+        closings.append(lambda: closing.update(by=free_viewers))
+        closings += [monitor._guard.close for monitor in self.monitors]
+        if inside is not None:
+            originals = list(inside)
+            closings.append(lambda: inside.__setitem__(slice(None), originals))
+            inside[:] = self.monitors
+        closings.append(lambda: env.close(**options_of_close))
         self._guard = ExitGuard(
             self,
-            functools.partial(_close, recording, self._tiled, env, self._closing),
-            at_exit=functools.partial(_note_last_error, recording),
+            functools.partial(call_all, closings),
+            at_exit=functools.partial(_note_last_error, self.monitors),
         )
-
-    @property
-    def monitors(self) -> tuple[MonitorControls, ...]:
-        """The monitors of the sub-environments, in their order."""
-        return self._recording.monitors
 
     @property
     def directory(self) -> Path:
@@ -165,17 +209,15 @@ class VectorMonitor(
                 been reset then.
         """
         if self._is_closed:
-            return self._reset_unrecorded(seed, options)
-        which = reset_indices(options, self.num_envs)
+            return self._env_reset(seed, options)
+        which = _reset_indices(options, self.num_envs)
         self._check_reset(which)
         tiled = self._tiled if 0 in which else None
         if tiled is not None:
             tiled.take_last()
-        try:
-            result = self._recording.reset(which, seed=seed, options=options)
-        except BaseException as error:
-            self._note_error(error)
-            raise
+        with self._noting_errors():
+            reset = self._reset_inside if self._is_inside else self._reset_slots
+            result = reset(which, seed, options)
         self._had_error = False
         if tiled is not None:
             tiled.after_reset()
@@ -191,11 +233,10 @@ class VectorMonitor(
         """
         if self._is_closed:
             return self.env.step(actions)
-        try:
-            result = self._recording.step(actions)
-        except BaseException as error:
-            self._note_error(error)
-            raise
+        with self._noting_errors():
+            # Monitors inside the vector environment record by themselves.
+            step = self.env.step if self._is_inside else self._step_slots
+            result: tuple[Any, Any, Any, Any, dict[str, Any]] = step(actions)
         if self._tiled is not None:
             _, _, terminations, truncations, _ = result
             self._tiled.after_step(
@@ -223,14 +264,14 @@ class VectorMonitor(
         self._closing.update(options)
         try:
             if wait and not self._is_closed:
-                if self._tiled is not None:
-                    self._tiled.take_last()
-                with waiting_display() as on_progress:
-                    self._recording.finish(on_progress)
+                self._finish()
         finally:
             self._guard.close()
         if wait:
-            self._raise_failures()
+            failures: dict[str, str] = {}
+            for monitor in self.monitors:
+                failures.update(monitor._recorder.failures())
+            self._raise_failures(failures)
 
     def __del__(self) -> None:
         # Gymnasium 1.0 would call `close`, which waits; the guard sees to the end.
@@ -240,20 +281,113 @@ class VectorMonitor(
     def _is_closed(self) -> bool:
         return all(monitor._recorder.closed for monitor in self.monitors)
 
-    def _reset_unrecorded(self, seed: Any, options: Any) -> tuple[Any, dict[str, Any]]:
+    def _finish(self) -> None:
+        """End all episodes, then wait until all videos are rendered."""
+        if self._tiled is not None:
+            self._tiled.take_last()
+        with contextlib.ExitStack() as waiting:
+            on_progress = waiting.enter_context(render_progress(title="rendering "))
+            if self._shared is not None:
+                waiting.enter_context(self._shared.waiting_at_the_end(on_progress))
+            call_all(monitor._recorder.finish for monitor in self.monitors)
+
+    def _env_reset(self, seed: Any, options: Any) -> tuple[Any, dict[str, Any]]:
         result: tuple[Any, dict[str, Any]] = self.env.reset(seed=seed, options=options)
         return result
+
+    def _reset_inside(
+        self, which: list[int], seed: Any, options: dict[str, Any] | None
+    ) -> tuple[Any, dict[str, Any]]:
+        result = self._env_reset(seed, options)
+        if any(self.monitors[index]._recorder.done is None for index in which):
+            raise Error(
+                f"{type(self.env.unwrapped).__name__} was reset, and did not reset "
+                "the environments in its list `envs`, so that nothing could be "
+                "recorded. Put Monitor around each of them, inside the functions that "
+                "make them, with resume=True."
+            )
+        return result
+
+    def _reset_slots(
+        self, which: list[int], seed: Any, options: dict[str, Any] | None
+    ) -> tuple[Any, dict[str, Any]]:
+        slots = {index: slot for index, slot in self._open_slots() if index in which}
+        # A copy: the reset takes the mask out of the original.
+        noted = options and {k: v for k, v in options.items() if k != "reset_mask"}
+        for slot in slots.values():
+            slot._recorder.before_reset()
+        result = self._env_reset(seed, options)
+        self._frames.forget()
+        observations = self._split(result[0])
+        call_all(
+            functools.partial(
+                slot._begin,
+                seed=_seed_of(self.env, index, seed),
+                options=noted,
+                observation=observations[index],
+            )
+            for index, slot in slots.items()
+        )
+        return result
+
+    def _step_slots(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        slots = list(self._open_slots())
+        resets = self._mode == NEXT_STEP
+        each = list(gymnasium.vector.utils.iterate(self.env.action_space, actions))
+        begins = [slot.before_step(each[i], resets=resets) for i, slot in slots]
+        result = self.env.step(actions)
+        self._frames.forget()
+        observations, rewards, terminations, truncations, infos = result
+        firsts = self._split(observations)
+        lasts = firsts
+        of_lasts: Any = infos
+        if self._mode == SAME_STEP:
+            lasts = infos.get("final_obs", firsts)
+            of_lasts = infos.get("final_info", infos)
+        ends = np.logical_or(terminations, truncations)
+        said: dict[int, dict[str, Any]] = {}
+
+        def record(index: int, slot: SlotMonitor, begins: bool) -> None:
+            if begins:
+                slot._begin(observation=firsts[index])
+                return
+            is_end = bool(ends[index])
+            if is_end:
+                said[index] = info_of(of_lasts, index)
+            slot._record(
+                lasts[index] if is_end else firsts[index],
+                rewards[index],
+                bool(terminations[index]),
+                bool(truncations[index]),
+                said.get(index, {}),
+                firsts[index],
+            )
+
+        call_all(
+            functools.partial(record, index, slot, begins)
+            for (index, slot), begins in zip(slots, begins, strict=True)
+        )
+        if self._options.episode_info and not {"episode", "_episode"} & infos.keys():
+            _add_episode_info(infos, said, ends)
+        return result
+
+    def _open_slots(self) -> Iterator[tuple[int, SlotMonitor]]:
+        for index, monitor in enumerate(self.monitors):
+            if not monitor._recorder.closed:
+                yield index, cast(SlotMonitor, monitor)
+
+    def _split(self, observations: Any) -> Sequence[Any]:
+        if not self._options.observations:
+            return [None] * self.num_envs
+        space = self.env.observation_space
+        return list(gymnasium.vector.utils.iterate(space, observations))
 
     def _check_reset(self, which: list[int]) -> None:
         """Check before anything is reset that all may be."""
         if self._options.allow_early_reset or self._had_error:
             return
-        running = [
-            index
-            for index in which
-            if self.monitors[index].stats_recorder.done is False
-            and self.monitors[index].stats_recorder.steps
-        ]
+        stats = [monitor.stats_recorder for monitor in self.monitors]
+        running = [i for i in which if stats[i].done is False and stats[i].steps]
         if running:
             raise ResetNotAllowed(
                 f"reset() was called, and the episodes of the sub-environments "
@@ -262,12 +396,21 @@ class VectorMonitor(
                 "the episodes are then no part of the statistics."
             )
 
+    @contextlib.contextmanager
+    def _noting_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException as error:
+            self._note_error(error)
+            raise
+
     def _note_error(self, error: BaseException) -> None:
         # Calls that were not allowed have changed nothing.
         if isinstance(error, ResetNeeded | ResetNotAllowed):
             return
         self._had_error = True
-        self._recording.note_error(error)
+        for monitor in self.monitors:
+            monitor._note_error(error)
         if self._tiled is not None:
             self._tiled.note_error(error)
 
@@ -276,43 +419,113 @@ class VectorMonitor(
             # Drawing has loaded OpenGL by now, which tears itself down at exit.
             self._guard.run_first_at_exit()
 
-    def _failures(self) -> Mapping[str, str]:
-        return self._recording.failures()
+
+def _reset_indices(options: Mapping[str, Any] | None, count: int) -> list[int]:
+    """Return which sub-environments a reset with these options resets.
+
+    To be asked before the reset, which takes the mask out of the options.
+    """
+    mask = None if options is None else options.get("reset_mask")
+    if mask is None or np.shape(mask) != (count,):
+        # The vector environment says what is wrong with it.
+        return list(range(count))
+    return [int(index) for index in np.flatnonzero(mask)]
 
 
-def _tiles(
-    env: _VectorEnv,
-    envs: list[gymnasium.Env[Any, Any]] | None,
-    frames: VectorFrames,
-    view: Mapping[str, Any],
-) -> TilePictures:
-    if envs is None:
-        count = env.num_envs
-        return TilePictures([OutsidePictures(frames, i) for i in range(count)])
-    camera = view["camera"]
-    if isinstance(camera, list | tuple) and camera:
-        view = {**view, "camera": camera[0]}
-    return TilePictures([gymnasium_pictures(each, **view) for each in envs])
+def _seed_of(env: VectorEnv, index: int, seed: Any) -> Any:
+    if isinstance(seed, list | tuple):
+        return seed[index]
+    if isinstance(seed, int) and is_async(env):
+        return seed + index
+    # One generator for all: it is the vector environment's seed.
+    return seed
 
 
-def _note_last_error(recording: VectorRecording) -> None:
+def _add_episode_info(
+    infos: dict[str, Any], said: Mapping[int, Mapping[str, Any]], ends: Any
+) -> None:
+    """Say of the episodes that are over what Gymnasium's own wrapper says."""
+    if not said:
+        return
+    zeros = {"r": 0.0, "l": 0, "t": 0.0}
+    infos["episode"] = {
+        name: np.array(
+            [said[i]["episode"][name] if i in said else zero for i in range(len(ends))]
+        )
+        for name, zero in zeros.items()
+    }
+    infos["_episode"] = np.isin(np.arange(len(ends)), list(said))
+
+
+def _options_of(
+    index: int, count: int, options: RecorderOptions, view: Mapping[str, Any]
+) -> RecorderOptions:
+    """Return the options of one sub-environment's monitor.
+
+    The first opens the directory as was asked for, and the others come to it.
+    """
+    changed: dict[str, Any] = {
+        # A tiled video of several cameras is each sub-environment's own.
+        "tiled": options.tiled and isinstance(view["camera"], list | tuple),
+        "tail_bytes": min(options.tail_bytes, _TAILS // count),
+    }
+    if index > 0:
+        changed |= {"force": False, "resume": options.resume or True}
+    if options.name_prefix is not None:
+        # One name for all would be one file for all.
+        changed["name_prefix"] = f"{options.name_prefix}-env-{index}"
+    return dataclasses.replace(options, **changed)
+
+
+def _all_or_none(
+    directory: str | os.PathLike[str], opens: Iterable[Callable[[], GymnasiumMonitor]]
+) -> tuple[GymnasiumMonitor, ...]:
+    """Return the monitors that the functions open; undo all if one fails.
+
+    Their files are removed, and the directories made for them.
+    """
+    path = Path(directory).absolute()
+    missing = [each for each in (path, *path.parents) if not each.exists()]
+    opened: list[GymnasiumMonitor] = []
+    try:
+        for open_one in opens:
+            opened.append(open_one())
+    except BaseException:
+        for monitor in opened:
+            # What was raised first is what the user needs to see.
+            with contextlib.suppress(Exception):
+                monitor._guard.close()
+        infixes = {monitor.infix for monitor in opened}
+        for file in iter_monitor_files(path, hidden=True):
+            if infix_of(file.name) in infixes:
+                file.unlink(missing_ok=True)
+        for made in missing:
+            # Other files may have come into it meanwhile.
+            with contextlib.suppress(OSError):
+                made.rmdir()
+        raise
+    return tuple(opened)
+
+
+def _warn_of_missing_frames(env: VectorEnv, is_outside: bool, is_tiled: bool) -> None:
+    if is_outside:
+        logger.warning(
+            "The last frame of each episode is missing in its video: %s resets its "
+            "sub-environments in the step that ends an episode (SAME_STEP), and %s. %s",
+            type(env.unwrapped).__name__,
+            UNSEEN,
+            way_out(env),
+        )
+    if is_tiled:
+        logger.warning(
+            "The last frame of each tiled video shows the first sub-environment, and "
+            "others that have ended likewise, after the reset: with SAME_STEP they can "
+            "be drawn together only then."
+        )
+
+
+def _note_last_error(monitors: Sequence[MonitorBase]) -> None:
     error = last_error()
     if error is not None:
-        recording.note_error(error)
-
-
-def _close(
-    recording: VectorRecording,
-    tiled: TiledVideo | None,
-    env: _VectorEnv,
-    options: Mapping[str, Any],
-) -> None:
-    parts: list[Callable[[], object]] = [
-        recording.close,
-        recording.restore,
-        functools.partial(env.close, **options),
-    ]
-    if tiled is not None:
-        # Its videos stand in the manifest of the first.
-        parts.insert(0, tiled.close)
-    for_each(operator.methodcaller("__call__"), parts)
+        for monitor in monitors:
+            monitor._note_error(error)

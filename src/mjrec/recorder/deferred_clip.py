@@ -22,14 +22,16 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import FileNotWritten, PicturesDiffer
 from ..formats.monitor_directory import clip_part_name
-from ..simulation.state_source import EpisodeStart, StateSource
 from .monitored_run import MonitoredRun
 from .options import DEFERRED
 from .trajectory_recorder import TrajectoryRecorder
+
+if TYPE_CHECKING:
+    from ..simulation.capture import Capture, EpisodeStart
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +51,7 @@ class DeferredClip:
     def __init__(
         self,
         run: MonitoredRun,
-        states: StateSource,
+        states: Capture,
         start: EpisodeStart,
         path: Path,
         *,

@@ -7,9 +7,8 @@ import functools
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..simulation.state_source import EpisodeStart
 from .deferred_video import DeferredVideo
 from .episode_trajectory import EpisodeTrajectory
 from .fast_path import FastPath, counting
@@ -20,6 +19,9 @@ from .options import DEFERRED, LIVE
 from .selection import Standing
 from .trajectory_recorder import TrajectoryRecorder
 from .video_recorder import VideoRecorder
+
+if TYPE_CHECKING:
+    from ..simulation.capture import EpisodeStart
 
 
 class EpisodeRecording:

@@ -8,7 +8,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..annotation import Caption
 from ..formats.monitor_directory import (
@@ -20,7 +20,6 @@ from ..formats.monitor_directory import (
 from ..formats.span_writer import SpanLogs
 from ..formats.video_names import second_name_of
 from ..machine import machine_fingerprint
-from ..simulation.state_source import EpisodeStart
 from .episode_videos import EpisodeVideos
 from .faults import Faults, What
 from .finisher import Finisher
@@ -32,6 +31,9 @@ from .subject import EpisodePictures, Subject, check_refusal
 from .trajectory_recorder import Pace
 from .versions import versions
 from .video_recorder import VideoRecorder
+
+if TYPE_CHECKING:
+    from ..simulation.capture import EpisodeStart
 
 logger = logging.getLogger(__name__)
 
@@ -108,7 +110,13 @@ class MonitoredRun:
         self.selection = selection
         numbers = itertools.count()
         self.logs, self.clip_logs = (
-            SpanLogs(place.path, place.infix, numbers=numbers) for _ in range(2)
+            SpanLogs(
+                place.path,
+                place.infix,
+                numbers=numbers,
+                tail_bytes=options.tail_bytes,
+            )
+            for _ in range(2)
         )
         self.pace = Pace(
             clock=subject.clock, declared=subject.declared, max_fps=options.max_fps

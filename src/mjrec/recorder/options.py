@@ -15,6 +15,7 @@ import numpy as np
 
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
+from ..formats.row_log import TAIL_BYTES
 from ..frames import check_quality
 from ..rates import to_rate
 from ..schedules import check_takes_one
@@ -62,6 +63,8 @@ class RecorderOptions:
     tiled: bool = False
     trackers: Tracker | Sequence[Tracker] = ()
     policy_file: str | os.PathLike[str] | None = None
+    # Of a row log; vector environments share a budget.
+    tail_bytes: int = TAIL_BYTES
 
     def __post_init__(self) -> None:
         type_of_mode(self.mode)

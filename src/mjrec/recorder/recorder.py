@@ -12,7 +12,7 @@ import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.journal import JournalEntry
@@ -26,7 +26,6 @@ from ..formats.pending_videos import note_failure, reason_of
 from ..formats.spans import FINISHED
 from ..results.listing import write_listing
 from ..results.recorded_environment import GYM_VERSION
-from ..simulation.state_source import StateSource
 from .clips import Clips
 from .deferred_video import DeferredVideo
 from .endings import CLOSE, INTERRUPT, RESET, ending
@@ -44,9 +43,11 @@ from .run_journal import RunJournal, facts_of
 from .selection import Standing
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import Subject, check_pictures
-from .told_trackers import ToldTrackers
-from .tracking import FinishedEpisode, Run
+from .tracking import FinishedEpisode, Run, Trackers
 from .video_recorder import VideoRecorder
+
+if TYPE_CHECKING:
+    from ..simulation.capture import Capture
 
 logger = logging.getLogger(__name__)
 
@@ -127,7 +128,7 @@ class Recorder:
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
-        self._trackers = ToldTrackers(
+        self._trackers = Trackers(
             Run(
                 directory=self.directory,
                 infix=str(self._place.infix),
@@ -424,11 +425,11 @@ class Recorder:
             if self._clips is not None:
                 self._clips.close(self._ending or {"reason": CLOSE})
 
-    def _all_states(self) -> list[StateSource]:
+    def _all_states(self) -> list[Capture]:
         both = (self._subject.states, self._subject.clip_states)
         return [each for each in both if each is not None]
 
-    def _finish_models(self, states: StateSource) -> None:
+    def _finish_models(self, states: Capture) -> None:
         try:
             states.finish()
         except Error as error:

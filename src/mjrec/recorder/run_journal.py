@@ -10,8 +10,8 @@ from typing import Any
 from ..errors import FileNotWritten
 from ..file_digests import file_sha256
 from ..formats.journal import JournalEntry, JournalWriter
+from ..provenance import look_around
 from ..results.run import Run
-from ..surroundings import look_around
 from .episode_choice import EpisodeChoice
 from .options import RecorderOptions
 from .selection import Selection

@@ -6,12 +6,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import NoPictures, PicturesDiffer
-from ..simulation.state_source import StateSource
 from .options import RenderingChoice
 from .video_recorder import PictureSource, can_give_pictures
+
+if TYPE_CHECKING:
+    from ..simulation.capture import Capture
 
 
 class EpisodePictures(PictureSource, Protocol):
@@ -52,8 +54,8 @@ class Subject:
     env_index: int | None = None
     further_pictures: Mapping[str, EpisodePictures] = field(default_factory=dict)
     cameras: tuple[Any, ...] = ()
-    states: StateSource | None = None
-    clip_states: StateSource | None = None
+    states: Capture | None = None
+    clip_states: Capture | None = None
     environment: Mapping[str, Any] | None = None
     random_state: Callable[[], Any] = lambda: None
 

@@ -7,9 +7,16 @@ be quick. It is given facts and names of files, never pictures.
 
 from __future__ import annotations
 
+import contextlib
+import logging
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from ..formats.video_names import view_of
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,3 +116,85 @@ class Tracker:
 
     def end(self, run: Run) -> None:
         """Take note of the end of a run; nothing more of it is told."""
+
+
+class Trackers:
+    """The trackers of one run.
+
+    One that raises is not called again: an experiment tracker that has lost its server
+    is no reason to lose a simulation.
+
+    Args:
+        run: what they are told of.
+        trackers: who is told.
+        on_fault: called with the class name of one that has raised, what, and the
+            number of the episode that it was told of, or None.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        trackers: Iterable[Tracker],
+        *,
+        on_fault: Callable[[str, Exception, int | None], object],
+    ) -> None:
+        self._run = run
+        self._trackers: Sequence[Tracker] = tuple(trackers)
+        self._on_fault = on_fault
+        # Of episodes whose videos are still to come.
+        self._episodes: dict[int, FinishedEpisode] = {}
+        self._tell(None, "begin")
+
+    def __bool__(self) -> bool:
+        """Whether anybody listens."""
+        return bool(self._trackers)
+
+    def episode(self, episode: FinishedEpisode, *, has_video: bool) -> None:
+        """Tell of an episode that has just ended.
+
+        Args:
+            episode: the episode.
+            has_video: whether a video of it may come.
+        """
+        if has_video and self._trackers:
+            self._episodes[episode.episode_id] = episode
+        self._tell(episode.episode_id, "episode", episode)
+
+    def videos(self, finished: Iterable[tuple[int, Path, Path]]) -> None:
+        """Tell of videos that are finished.
+
+        Args:
+            finished: the number of the episode, the video and its metadata.
+        """
+        for episode_id, path, metadata_path in finished:
+            self._tell(
+                episode_id,
+                "video",
+                FinishedVideo(
+                    path=path,
+                    metadata_path=metadata_path,
+                    episode_id=episode_id,
+                    episode=self._episodes.get(episode_id),
+                    view=view_of(path.name),
+                ),
+            )
+
+    def end(self) -> None:
+        """Tell of the end of the run; nobody is called any more after it."""
+        self._tell(None, "end")
+        self._trackers = ()
+        self._episodes.clear()
+
+    def _tell(self, episode_id: int | None, what: str, *facts: Any) -> None:
+        for tracker in self._trackers:
+            try:
+                getattr(tracker, what)(self._run, *facts)
+            except Exception as error:  # whatever somebody's tracker does
+                name = type(tracker).__name__
+                logger.exception("%s has failed and is told nothing more.", name)
+                others = (each for each in self._trackers if each is not tracker)
+                self._trackers = tuple(others)
+                self._on_fault(name, error, episode_id)
+                # So that it lets go of what it holds open, as far as it still can.
+                with contextlib.suppress(Exception):
+                    tracker.end(self._run)

@@ -8,7 +8,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,13 @@ from ..errors import PicturesDiffer
 from ..formats.span_writer import SpanLogs, SpanWriter
 from ..formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
 from ..rates import rate_from_timestep, stride_for
-from ..simulation.gathering import words_of
-from ..simulation.state_source import EpisodeStart, StateSource
+from ..simulation.memory import words_of
 from .fast_path import FastPath, gathering
 from .stats_recorder import StatsRecorder
 from .step_arrays import StepArray, action_array, step_array
+
+if TYPE_CHECKING:
+    from ..simulation.capture import Capture, EpisodeStart
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +74,7 @@ class TrajectoryRecorder:
         name: str,
         *,
         facts: Mapping[str, Any],
-        states: StateSource | None,
+        states: Capture | None,
         start: EpisodeStart | None,
         pace: Pace,
         observation: Any = None,
@@ -85,9 +87,11 @@ class TrajectoryRecorder:
         self._is_alone = is_alone
         self._facts = facts
         self._states = states
-        self._start = start or _NOTHING
+        self._start = start
+        self._components = () if start is None else start.state
+        self._layout = RowLayout() if start is None else start.snapshot
         self._pace = pace
-        self._takes_frames = bool(self._start.snapshot.fields)
+        self._takes_frames = bool(self._layout.fields)
         self._stride = 1
         self._span: SpanWriter | None = None
         self._fast: FastPath | None = None
@@ -96,8 +100,8 @@ class TrajectoryRecorder:
         self._action: StepArray | None = None
         self._observation = None if observation is None else step_array(observation)
         # What belongs to step 0 waits here until there is a recording.
-        self._first_state = np.full(sum(c.length for c in self._start.state), np.nan)
-        self._first_snapshot = np.empty(self._start.snapshot.size, np.uint8)
+        self._first_state = np.full(sum(c.length for c in self._components), np.nan)
+        self._first_snapshot = np.empty(self._layout.size, np.uint8)
         self._first_observation = None
         if self._observation is not None:
             self._observation.set(observation)
@@ -256,16 +260,16 @@ class TrajectoryRecorder:
                 self._logs.close()
 
     def _new_fast_path(self, span: SpanWriter, stats: StatsRecorder) -> FastPath | None:
-        memory, action = self._start.memory, self._action
+        start, action = self._start, self._action
         # Of another size the last word would have what stands behind it in memory.
-        if memory is None or action is None or action.size % 8:
+        if start is None or start.words is None or action is None or action.size % 8:
             return None
         return gathering(
             stats,
             span,
-            np.concatenate([memory.words, words_of([action.values])]),
+            np.concatenate([start.words, words_of([action.values])]),
             set_action=action.set,
-            is_current=memory.is_current,
+            is_current=start.is_current,
             stride=self._stride,
         )
 
@@ -277,17 +281,17 @@ class TrajectoryRecorder:
             self._first_change = self._states.capture_snapshot(self._first_snapshot)
 
     def _begin(self) -> SpanWriter:
-        start = self._start
         header = TrajectoryHeader(
             facts={**self._facts, **self._parts(), **self._measured_pace()},
-            state=start.state,
-            snapshot=start.snapshot,
+            state=self._components,
+            snapshot=self._layout,
             action=_array_of(self._action),
             observation=_array_of(self._observation),
         )
         span = self._logs.begin(self._name, header, alone=self._is_alone)
         try:
-            for fields in (start.model_fields, self._first_change):
+            own = None if self._start is None else self._start.model_fields
+            for fields in (own, self._first_change):
                 if fields:
                     span.add_change(ModelChange(step=0, fields=fields))
             columns, slot = span.log.columns, span.make_room()
@@ -377,8 +381,6 @@ class TrajectoryRecorder:
 # Of the same few steps in each episode; fractions take Python long.
 _rate_of = functools.lru_cache(maxsize=64)(rate_from_timestep)
 _stride_for = functools.lru_cache(maxsize=64)(stride_for)
-
-_NOTHING = EpisodeStart(state=(), snapshot=RowLayout(), model={}, scene=None)
 
 
 def _array_of(array: StepArray | None) -> Array | None:

@@ -78,12 +78,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         log=[record.levelno, handler.format(record)]
     )
     logging.getLogger().addHandler(handler)
-    names: queue.SimpleQueue[str] = queue.SimpleQueue()
-    threading.Thread(target=_read, args=[names], daemon=True).start()
+    told: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=[told], daemon=True).start()
     threading.Thread(target=_beat, args=[answers, say], daemon=True).start()
     try:
         with Finisher(arguments.directory, workers=workers) as finisher:
-            _Work(arguments.directory, finisher, names, say, arguments.strict).do()
+            _work(finisher, arguments.directory, told, say, strict=arguments.strict)
     except _Stopped:
         return 0
 
@@ -127,76 +127,51 @@ def _beat(answers: LineWriter, say: _Say) -> None:
         time.sleep(seconds)
 
 
-class _Work:
-    """Does what it is told, and tells what came of it."""
+def _work(
+    finisher: Finisher,
+    directory: Path,
+    told: queue.SimpleQueue[str],
+    say: _Say,
+    *,
+    strict: bool,
+) -> NoReturn:
+    """Do what is told, and tell what came of it, until the end of this process."""
+    all_said, last_report = False, 0.0
 
-    def __init__(
-        self,
-        directory: Path,
-        finisher: Finisher,
-        told: queue.SimpleQueue[str],
-        say: _Say,
-        strict: bool,
-    ) -> None:
-        self._directory = directory
-        self._finisher = finisher
-        self._told = told
-        self._say = say
-        self._strict = strict
-        self._all_said = False
-        self._last_report = 0.0
-        # By which names the jobs were given.
-        self._names: dict[str, str] = {}
-        finisher.on_progress = self._look_up
-
-    def do(self) -> NoReturn:
-        """Work until the end of this process."""
-        finisher = self._finisher
-        while True:
-            self._take_in()
-            if not finisher:
-                finisher.rest()
-                self._take_in(self._told.get())
-            elif finisher.is_ready() or self._all_said:
-                job, outcome = finisher.do_next()
-                self._report()
-                name = self._names.pop(job.name)
-                self._say(done=name, name=outcome.name, failure=outcome.failure)
-            else:
-                # The simulation is still writing the model.
-                time.sleep(_SECONDS_BETWEEN_LOOKS)
-
-    def _take_in(self, *names: str) -> None:
-        """Take what was said."""
-        told = list(names)
-        while not self._told.empty():
-            told.append(self._told.get())
-        for name in told:
-            self._all_said = name == ALL_SAID
+    def take_in(*, wait: bool = False) -> None:
+        nonlocal all_said
+        while wait or not told.empty():
+            name, wait = told.get(), False
+            all_said = name == ALL_SAID
             if name == EXPECTED:
-                self._finisher.start_workers()
-            elif not self._all_said and not self._add(name):
-                self._say(done=name, name=name, failure=None)
+                finisher.start_workers()
+            elif not all_said:
+                job = VideoJob(directory=directory, recording=name, strict=strict)
+                if key_of(name) is None or not finisher.add(job):
+                    say(done=name, name=name, failure=None)
 
-    def _add(self, name: str) -> bool:
-        key = key_of(name)
-        if key is None:
-            return False
-        job = VideoJob.finishing(self._directory, key, strict=self._strict)
-        self._names[job.name] = name
-        return self._finisher.add(job)
-
-    def _look_up(self, progress: Progress) -> None:
+    def look_up(progress: Progress) -> None:
         """Listen and report, in the midst of work."""
-        del progress
+        nonlocal last_report
         now = time.monotonic()
-        if now - self._last_report >= _SECONDS_BETWEEN_REPORTS:
-            self._last_report = now
-            self._take_in()
-            self._report()
+        if now - last_report >= _SECONDS_BETWEEN_REPORTS:
+            last_report = now
+            take_in()
+            say(progress=vars(progress))
 
-    def _report(self) -> None:
-        self._say(progress=vars(self._finisher.progress))
+    finisher.on_progress = look_up
+    while True:
+        take_in()
+        if not finisher:
+            finisher.rest()
+            take_in(wait=True)
+        elif finisher.is_ready() or all_said:
+            job, outcome = finisher.do_next()
+            say(progress=vars(finisher.progress))
+            say(done=job.recording, name=outcome.name, failure=outcome.failure)
+        else:
+            # The simulation is still writing the model.
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
 
 
 if __name__ == "__main__":

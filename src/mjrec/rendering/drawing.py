@@ -18,10 +18,9 @@ from ..errors import InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
 from ..simulation.cameras import Camera, camera_from_members, is_tracking
 from ..simulation.canvas import KeptCanvas
-from ..simulation.given_states import GivenStates
-from ..simulation.mujoco_warnings import log_mujoco_warnings
-from ..simulation.recorded_scene import RecordedScene
 from ..simulation.renderer import SceneRenderer
+from ..simulation.scene import GivenStates, RecordedScene
+from ..simulation.warnings import log_mujoco_warnings
 from .recorded_facts import open_for_rendering
 from .recorded_frames import check_has_frames
 from .views import PlainCamera, View
@@ -64,7 +63,7 @@ class Drawing:
 
     @property
     def gl_facts(self) -> dict[str, Any]:
-        """Who draws, and on which device: `gl_strings.current_gl_facts`."""
+        """Who draws, and on which device: `gl_info.current_gl_facts`."""
         return self._cameras[0].renderer.gl_facts
 
     def draw(self, index: int, *, out: Frame | None = None) -> Frame:
@@ -170,7 +169,7 @@ def trajectory_drawing(
         GLError: nothing can be drawn here.
     """
     with contextlib.ExitStack() as opened:
-        reader = opened.enter_context(open_for_rendering(path))
+        reader = opened.enter_context(open_for_rendering(path, is_vetted=True))
         check_has_frames(reader)
         facts = reader.header.facts
         scene = RecordedScene(reader)

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 from ..errors import (
     BlankVideo,
@@ -39,6 +38,7 @@ from .recordings import (
     key_of,
     look_at,
     read_recording,
+    recordings,
     remove_unfinished,
 )
 from .render_video import render_video
@@ -63,13 +63,13 @@ class _Work(NamedTuple):
 
 def finish(
     directory: Path,
-    keys: Iterable[RecordingKey],
+    keys: Iterable[RecordingKey] | None = None,
     *,
     workers: int | None,
     strict: bool = False,
     on_progress: _OnProgress = lambda _: None,
 ) -> Iterator[Outcome]:
-    """Finish what is pending of some recordings, and yield what became of each.
+    """Finish what is pending in a directory, and yield what became of each recording.
 
     Nothing is yielded of one that nothing was to be done about. What another
     process is at is left to it. Manifests of monitors that are closed are kept true,
@@ -77,7 +77,7 @@ def finish(
 
     Args:
         directory: the monitor directory.
-        keys: which episodes and clips.
+        keys: which recordings; all, if None.
         workers: how many processes draw; None is one for each free CPU.
         strict: whether a video that shows nothing is a failure.
         on_progress: called after every frame, and when a recording is over.
@@ -85,7 +85,8 @@ def finish(
     Raises:
         UnreadableFile: a manifest is damaged.
     """
-    jobs = [VideoJob.finishing(directory, key, strict=strict) for key in keys]
+    wanted = recordings(directory) if keys is None else keys
+    jobs = [VideoJob.finishing(directory, key, strict=strict) for key in wanted]
     has_failed = False
     for outcome in do_jobs(jobs, directory, workers=workers, on_progress=on_progress):
         has_failed = has_failed or outcome.failure is not None
@@ -158,7 +159,6 @@ class Finisher:
         directory: whose CPUs are shared.
         workers: how many processes draw; None is one for each free CPU.
         on_progress: see below.
-        wait: called with seconds to wait while no CPU is free.
 
     Attributes:
         progress: how far it is.
@@ -171,11 +171,10 @@ class Finisher:
         *,
         workers: int | None,
         on_progress: _OnProgress = lambda _: None,
-        wait: Callable[[float], object] = time.sleep,
     ) -> None:
         self.progress = Progress()
         self.on_progress = on_progress
-        self._pool = SharedPool(directory, workers=workers, wait=wait)
+        self._pool = SharedPool(directory, workers=workers)
         self._waiting: dict[str, tuple[VideoJob, _Work]] = {}
         self._gl_failure: GLError | None = None
 
@@ -249,7 +248,8 @@ class Finisher:
         outcome = job.nothing
         try:
             if job.variant is not None:
-                return self._rerender(job)
+                _check_is_no_original(job)
+                return self._render(outcome, job, [job.directory / job.recording])
             lock = claim(job.directory, job.key)
             if lock is None:
                 return replace(outcome, is_elsewhere=True)
@@ -281,7 +281,7 @@ class Finisher:
             for video in (pending.video, *pending.further_videos):
                 remove_unfinished(video)
             outcome = replace(outcome, name=pending.video.name)
-            outcome = self._render(outcome, pending.parts, strict=job.strict)
+            outcome = self._render(outcome, job, pending.parts)
             if outcome.is_video:
                 outcome = replace(outcome, further_videos=further)
         if not pending.is_kept:
@@ -291,25 +291,8 @@ class Finisher:
                 drop_recording(part)
         return outcome
 
-    def _rerender(self, job: VideoJob) -> Outcome:
-        variant, video = job.variant, job.video
-        assert variant is not None
-        assert video is not None
-        trajectory = job.directory / job.recording
-        _check_is_no_original(trajectory, video)
-        return self._render(
-            job.nothing,
-            [trajectory],
-            view=variant.view,
-            max_fps=variant.max_fps,
-            fps=variant.fps,
-            annotate=variant.annotate,
-            out=video,
-            strict=job.strict,
-        )
-
     def _render(
-        self, outcome: Outcome, parts: Iterable[Path], **options: Any
+        self, outcome: Outcome, job: VideoJob, parts: Sequence[Path]
     ) -> Outcome:
         """Render the videos of a recording, and return what became of them."""
         if self._gl_failure is not None:
@@ -317,10 +300,12 @@ class Finisher:
             raise self._gl_failure
         try:
             file = render_video(
-                list(parts),
+                parts,
+                job.variant,
                 workers=self._pool.at_work(),
+                out=job.video,
+                strict=job.strict,
                 on_frame=lambda: self._count(frames_done=1),
-                **options,
             )
         except GLError as error:
             self._gl_failure = error
@@ -350,15 +335,17 @@ def _work_of(job: VideoJob) -> _Work | None:
     return _Work(videos, pending.frame_count, pending.model_file)
 
 
-def _check_is_no_original(trajectory: Path, video: Path) -> None:
+def _check_is_no_original(job: VideoJob) -> None:
     """Raise InvalidArgument if a video would replace one of a further camera."""
-    if video.parent.resolve() != trajectory.parent.resolve():
+    assert job.video is not None
+    if job.video.parent.resolve() != job.directory.resolve():
         return
+    trajectory = job.directory / job.recording
     facts = read_recording([trajectory]).facts[0]
     originals = further_video_paths(trajectory, facts) if video_facts(facts) else []
-    if video.with_suffix(".mp4").name in {path.name for path in originals}:
+    if job.video.with_suffix(".mp4").name in {path.name for path in originals}:
         raise InvalidArgument(
-            f"{video.name} is a recorded video: this camera was recorded too. If it is "
-            "not there yet, render what is pending; else say what is to be other "
+            f"{job.video.name} is a recorded video: this camera was recorded too. If "
+            "it is not there yet, render what is pending; else say what is to be other "
             "besides the camera, or where to write it."
         )

@@ -19,7 +19,7 @@ from typing import Any, Self
 from ..formats.video_names import camera_part, name_part
 from ..rates import to_rate
 from .recordings import RecordingKey, key_of
-from .views import View, plain_camera
+from .views import View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +28,10 @@ class Variant:
 
     Attributes:
         view: from where, how large and how well it is drawn.
-        max_fps: the most frames per second of simulated time.
-        fps: frames per second of the file.
+        max_fps: the most frames per second of simulated time: frames 0, n, 2n ... of
+            those recorded, with the smallest n that fits, and the last.
+        fps: frames per second of the file. If None, a second of the video is as much
+            simulated time as when the episode was recorded.
         annotate: whether episode, step, time and return are written on the frames.
 
     Raises:
@@ -46,8 +48,8 @@ class Variant:
             if rate is not None:
                 to_rate(rate)
 
-    def name_for(self, trajectory: Path) -> str:
-        """Return the name of the video that shows an episode this way.
+    def name_for(self, trajectory: str) -> str:
+        """Return the name of the video that shows a trajectory this way.
 
         It is the original's with what is other before its extension, such as
         `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. A camera whose
@@ -57,7 +59,7 @@ class Variant:
         """
         view, parts = self.view, []
         if isinstance(view.camera, Mapping):
-            members = json.dumps(plain_camera(view.camera), sort_keys=True)
+            members = json.dumps(view.camera, sort_keys=True)
             digest = hashlib.sha256(members.encode()).hexdigest()
             parts.append(f"camera-{digest[:8]}")
         elif view.camera is not None:
@@ -71,9 +73,9 @@ class Variant:
                 parts.append(f"{prefix}{name_part(f'{float(rate):g}')}fps")
         if self.annotate is not None:
             parts.append("annotated" if self.annotate else "plain")
-        key = key_of(trajectory.name)
-        stem = trajectory.stem if key is None else Path(key.video_name).stem
-        return ".".join([stem, *parts, "mp4"])
+        key = key_of(trajectory)
+        usual = Path(trajectory if key is None else key.video_name)
+        return ".".join([usual.stem, *parts, "mp4"])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +121,7 @@ class VideoJob:
         """What became of it as long as nothing did."""
         if self.video is not None:
             return Outcome(name=self.video.name, directory=self.video.parent)
-        return Outcome(name=self.recording, directory=self.directory)
+        return Outcome(name=self.key.told_name, directory=self.directory)
 
     def as_json(self) -> dict[str, Any]:
         """Return what JSON can hold, for `from_json` in another process."""

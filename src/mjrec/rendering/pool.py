@@ -31,7 +31,7 @@ from ..gl.backends import (
     rendering_is_off,
 )
 from ..patience import Patience
-from ..simulation.model_trust import with_all_models_trusted
+from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
 from .views import PlainCamera, View, plain_camera
 
 logger = logging.getLogger(__name__)
@@ -81,7 +81,7 @@ class WorkerPool:
 
     Attributes:
         limit: how many of them draw the next job, up to `count`. The others stay.
-        gl_facts: who draws, as `gl_strings.current_gl_facts`; empty before the first
+        gl_facts: who draws, as `gl_info.current_gl_facts`; empty before the first
             frame.
     """
 
@@ -92,7 +92,7 @@ class WorkerPool:
             )
         self._environ = _environment(os.environ, alone=count == 1)
         if trust_models:
-            self._environ = with_all_models_trusted(self._environ)
+            self._environ = {**self._environ, TRUST_VARIABLE: ALL_MODELS}
         self._workers = [_Worker() for _ in range(count)]
         self.limit = count
         self.gl_facts: dict[str, Any] = {}

@@ -36,11 +36,12 @@ from ..formats.monitor_directory import (
     infix_of,
     video_prefix,
 )
+from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_file import open_trajectory
-from ..formats.trajectory_reader import TrajectoryReader
 from ..formats.video_names import further_parts, is_second_name, with_part
 from ..frames import QUALITIES
 from ..rates import to_rate
+from ..simulation.foreign_trajectories import open_vetted_trajectory
 from .views import PlainCamera, plain_camera
 
 # What the user has asked for is written as it was given: 29.97, or a fraction that a
@@ -48,17 +49,22 @@ from .views import PlainCamera, plain_camera
 _ASKED_RATE = re.compile(r"\d{1,40}(\.\d{1,40}|/0*[1-9]\d{0,39})?", re.ASCII)
 
 
-def open_for_rendering(path: Path) -> TrajectoryReader:
-    """Open a trajectory, as `open_trajectory` does, and check its facts.
+def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryReader:
+    """Open a trajectory, whoever made it, and check its facts.
 
     Afterwards `rate`, `timestep`, `scene`, `model`, `video` and `clip` are there as
     they should be, or None, or missing; `stride`, `kept` and `candidate` as they should
     be, or missing.
 
+    Args:
+        path: of the trajectory.
+        is_vetted: whether another process of ours has opened it before.
+
     Raises:
-        UnreadableFile: of `open_trajectory`; or a fact is of a kind that it cannot be.
+        UnreadableFile: of `open_vetted_trajectory`; or a fact is of a kind that it
+            cannot be.
     """
-    reader = open_trajectory(path)
+    reader = open_trajectory(path) if is_vetted else open_vetted_trajectory(path)
     try:
         with unreadable(path):
             _check_all(reader.header.facts, _FACTS)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..annotation import Caption
 from ..errors import InvalidArgument, NoPictures
-from ..formats.trajectory_reader import TrajectoryReader
+from ..formats.trajectory import TrajectoryReader
 from ..rates import stride_for, to_rate
 from .recorded_facts import video_facts
 

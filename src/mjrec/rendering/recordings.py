@@ -38,8 +38,9 @@ from ..formats.monitor_directory import (
     video_lock_name,
     video_prefix,
 )
+from ..formats.spans import FINISHED
+from ..formats.trajectory import added_up
 from ..formats.trajectory_file import find_trajectory
-from ..formats.trajectory_reader import added_up
 from ..formats.video_metadata import is_done, metadata_path
 from .recorded_facts import (
     further_video_paths,
@@ -243,11 +244,16 @@ def may_be_left(directory: Path, key: RecordingKey) -> bool:
 
     Where it is not, `look_at` returns None.
     """
-    if key.is_clip:
-        return True
-    parts = parts_of(directory, key)
-    is_done_already = is_done(directory / key.video_name)
-    return bool(parts) and not (parts[0].is_file() and is_done_already)
+    return not _is_done(directory, key) and bool(
+        key.is_clip or parts_of(directory, key)
+    )
+
+
+def _is_done(directory: Path, key: RecordingKey) -> bool:
+    """Tell whether an episode has all that it can have."""
+    if key.is_clip or not is_done(directory / key.video_name):
+        return False
+    return (directory / f"{key.name}{FINISHED}").is_file()
 
 
 def look_at(directory: Path, key: RecordingKey) -> PendingRecording | None:
@@ -263,7 +269,7 @@ def look_at(directory: Path, key: RecordingKey) -> PendingRecording | None:
         OSError: its monitor's lock cannot be looked at.
     """
     # Most of a directory is done, and need not be opened.
-    if not may_be_left(directory, key):
+    if _is_done(directory, key):
         return None
     # Asked first: a part that comes later is of a monitor that is open.
     is_open = is_locked(directory / lock_name(key.infix))

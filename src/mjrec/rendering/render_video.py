@@ -29,6 +29,7 @@ from ..machine import machine_fingerprint
 from ..rates import to_rate
 from ..recorder.endings import KILLED
 from ..recorder.versions import versions
+from .jobs import Variant
 from .pool import WorkerPool
 from .recorded_facts import (
     further_video_paths,
@@ -67,12 +68,9 @@ class _Shot:
 
 def render_video(
     parts: Sequence[Path],
+    variant: Variant | None = None,
     *,
     workers: WorkerPool,
-    view: View | None = None,
-    max_fps: float | Fraction | None = None,
-    fps: float | Fraction | None = None,
-    annotate: bool | None = None,
     out: Path | None = None,
     strict: bool = False,
     on_frame: Callable[[], object] = lambda: None,
@@ -86,15 +84,9 @@ def render_video(
 
     Args:
         parts: the trajectory of an episode, finished or not; or the parts of a clip.
+        variant: what is to be other than recorded. With a camera, there is one video,
+            of what that one shows.
         workers: draw the frames.
-        view: from where, how large and how well; as recorded, if None. With a camera,
-            there is one video, of what that one shows.
-        max_fps: the most frames per second of simulated time: frames 0, n, 2n ... of
-            those recorded, with the smallest n that fits, and the last.
-        fps: frames per second of the file. If None, a second of the video is as much
-            simulated time as when the episode was recorded.
-        annotate: whether episode, step, time and return are written on the frames; as
-            recorded, if None.
         out: the video, of the first camera or of all side by side; as the recording
             says, beside it, if None.
         strict: whether a video that shows nothing is an error; else it is a warning.
@@ -113,18 +105,19 @@ def render_video(
         Error: its frames cannot be drawn or encoded.
     """
     recorded = read_recording(parts)
-    facts, view = recorded.facts[0], view or View()
+    facts, variant = recorded.facts[0], variant or Variant()
     if not sum(recorded.frame_counts):
         _note_that_it_broke(recorded, out)
         return None
     warn_of_other_frames(parts[0].name, facts)
-    chosen = recorded.chosen(max_fps)
+    chosen = recorded.chosen(variant.max_fps)
     runs = list(_runs(recorded, chosen.indices))
+    annotate = variant.annotate
     if annotate is None:
         annotate = bool(video_facts(facts).get("annotate", False))
     if annotate:
         check_annotation()
-    rate = _fps(recorded, chosen) if fps is None else to_rate(fps)
+    rate = _fps(recorded, chosen) if variant.fps is None else to_rate(variant.fps)
     stride = facts.get("stride", 1) * chosen.every
     timestep = recorded.timing.get("timestep")
     said = {
@@ -136,9 +129,9 @@ def render_video(
             stride=stride,
         ),
         "pictures": "scene",
-        "quality": view.quality or video_facts(facts).get("quality", "full"),
+        "quality": variant.view.quality or video_facts(facts).get("quality", "full"),
     }
-    shots = _shots(parts[0], facts, view, out)
+    shots = _shots(parts[0], facts, variant.view, out)
     if out is None:
         # They would go on leading to what is replaced now.
         take_second_names(shots[-1].path)
@@ -268,7 +261,7 @@ def _shots(
     further = list(video.get("cameras") or ())[1:]
     first = video_path(recording, facts) if out is None else out
     if view.camera is not None:
-        return [_Shot(first, view, {"camera": plain_camera(view.camera)})]
+        return [_Shot(first, view, {"camera": view.camera})]
 
     def second_name(path: Path) -> dict[str, str]:
         second = None if out is not None else video.get("also_named")
@@ -285,7 +278,7 @@ def _shots(
     shots = [
         _Shot(
             path,
-            replace(view, camera=plain_camera(camera)),
+            replace(view, camera=camera),
             {"camera": camera, "first_video": first.name, **second_name(path)},
         )
         for path, camera in zip(paths, further, strict=False)

@@ -17,14 +17,14 @@ from ..errors import InvalidArgument, UnreadableFile
 from ..formats.in_flight import is_in_flight, list_paths, read_list
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
 from ..machine import usable_cpus
-from ..simulation.model_trust import trusting_all_models
+from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine, given_engine
 from .finish import bring_up_to_date, do_jobs
 from .jobs import Outcome, Variant, VideoJob
 from .progress import Progress
 from .recordings import RecordingKey, key_of, parts_of, recordings
 from .shared_pool import check_workers
-from .views import View, plain_camera
+from .views import View
 
 _SHOWN = 20
 
@@ -157,7 +157,7 @@ def render_videos(
     """
     variant = Variant(
         view=View(
-            camera=None if camera is None else plain_camera(camera),
+            camera=camera,
             height=height,
             width=width,
             quality=quality,
@@ -218,22 +218,10 @@ def iter_rendered_videos(
     directory, keys = _recordings_of(target, episode)
     is_pending = variant == Variant() and out is None
     if is_pending:
-        _check_can_be_pending(target)
-        jobs = [VideoJob.finishing(directory, key, strict=strict) for key in keys]
+        jobs = _pending_jobs(target, keys, strict=strict)
     else:
         workers = workers or usable_cpus()
-        jobs = [
-            VideoJob(
-                directory=path.parent,
-                recording=path.name,
-                strict=strict,
-                variant=variant,
-                video=video,
-            )
-            for path, video in _videos_of_variant(
-                _trajectories(target, keys), variant, out
-            )
-        ]
+        jobs = _variant_jobs(target, keys, variant, out, strict=strict)
     tell = on_progress or (lambda _: None)
     outcomes = (
         do_jobs(jobs, directory, workers=workers, on_progress=tell)
@@ -259,34 +247,8 @@ def _afterwards(
                 yield Outcome(name=path.name, directory=directory, failure=reason)
 
 
-def _videos_of_variant(
-    trajectories: Sequence[Path], variant: Variant, out: Path | None
-) -> Iterator[tuple[Path, Path]]:
-    """Yield trajectories, each with the video that shows it another way.
-
-    Raises:
-        InvalidArgument: nothing would be other, or `out` is the name of an original, or
-            stands for several.
-    """
-    if out is not None:
-        if len(trajectories) > 1:
-            raise InvalidArgument(
-                f"{out} is one file, and several episodes were asked for: choose one."
-            )
-        # By whatever ending: the metadata would have the original's name.
-        name = out.with_suffix(".mp4").name
-        key = key_of(name)
-        if key is not None and name == key.video_name:
-            raise InvalidArgument(
-                f"{out} is the name of a recorded video, which shows what its "
-                "recording saw. Choose another name."
-            )
-    for path in trajectories:
-        yield path, out or path.with_name(variant.name_for(path))
-
-
 def _trusting(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
-    with trusting_all_models():
+    with trusting_models():
         yield from outcomes
 
 
@@ -321,30 +283,71 @@ def _recordings_of(
     return target, chosen
 
 
-def _check_can_be_pending(target: Path) -> None:
-    if not target.is_dir() and key_of(target.name) is None:
+def _pending_jobs(
+    target: Path, keys: Sequence[RecordingKey], *, strict: bool
+) -> list[VideoJob]:
+    """Return the jobs that finish recordings.
+
+    Raises:
+        InvalidArgument: the target is a file of no recording.
+    """
+    if target.is_dir():
+        return [VideoJob.finishing(target, key, strict=strict) for key in keys]
+    if not keys:
         raise InvalidArgument(
             f"No video of {target.name} is pending: no recording has such a name. To "
             "render it again, say what is to be other (camera, size, max_fps, quality, "
             "fps, annotate) or where to write it (out, --out)."
         )
+    return [VideoJob.finishing(target.parent, key, strict=strict) for key in keys]
 
 
-def _trajectories(target: Path, keys: Iterable[RecordingKey]) -> list[Path]:
-    """Return the trajectories that were asked for.
+def _variant_jobs(
+    target: Path,
+    keys: Iterable[RecordingKey],
+    variant: Variant,
+    out: Path | None,
+    *,
+    strict: bool,
+) -> list[VideoJob]:
+    """Return the jobs that render episodes another way.
 
     Raises:
-        InvalidArgument: there are none.
+        InvalidArgument: there are no trajectories; or `out` stands for several, or is
+            the name of an original.
     """
-    if not target.is_dir() and target.suffix == ".h5":
-        # Whatever its name is otherwise.
-        return [target]
     directory = target if target.is_dir() else target.parent
-    episodes = (key for key in keys if not key.is_clip)
-    trajectories = [path for key in episodes for path in parts_of(directory, key)]
-    if not trajectories:
+    if target.suffix == ".h5" and directory != target:
+        # Whatever its name is otherwise.
+        names = [target.name]
+    else:
+        episodes = [key for key in keys if not key.is_clip]
+        names = [path.name for key in episodes for path in parts_of(directory, key)]
+    if not names:
         raise InvalidArgument(
             f"There are no recorded states of {target}, from which it could be "
             "rendered again."
         )
-    return trajectories
+    if out is not None:
+        if len(names) > 1:
+            raise InvalidArgument(
+                f"{out} is one file, and several episodes were asked for: choose one."
+            )
+        # By whatever ending: the metadata would have the original's name.
+        name = out.with_suffix(".mp4").name
+        key = key_of(name)
+        if key is not None and name == key.video_name:
+            raise InvalidArgument(
+                f"{out} is the name of a recorded video, which shows what its "
+                "recording saw. Choose another name."
+            )
+    return [
+        VideoJob(
+            directory=directory,
+            recording=name,
+            strict=strict,
+            variant=variant,
+            video=out or directory / variant.name_for(name),
+        )
+        for name in names
+    ]

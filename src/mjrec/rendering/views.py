@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
@@ -29,6 +29,7 @@ class View:
         camera: the name or number of one of the model's cameras, -1 for the free
             camera in the place that the model gives it, or the members of an
             `mujoco.MjvCamera` by their names (those left out are MuJoCo's default).
+            It may be given as `plain_camera` takes it.
         height: in pixels.
         width: in pixels.
         quality: `"full"` or `"draft"`.
@@ -51,18 +52,16 @@ class View:
         )
         if self.quality is not None:
             check_quality(self.quality)
-        if self.camera is not None:
-            plain_camera(self.camera)
+        # A NumPy integer is as good as any, and so is an `MjvCamera`.
+        plain: Mapping[str, Callable[[Any], object]]
+        plain = {"camera": plain_camera, "height": int, "width": int}
+        for name, make in plain.items():
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, make(value))
 
     def as_json(self) -> dict[str, Any]:
         """Return what JSON can hold, for `View(**...)` in another process."""
-        plain = asdict(self)
-        if self.camera is not None:
-            plain["camera"] = plain_camera(self.camera)
-        for side in ("height", "width"):
-            # A NumPy integer is as good as any.
-            plain[side] = None if plain[side] is None else int(plain[side])
-        return plain
+        return asdict(self)
 
 
 def plain_camera(camera: Any) -> PlainCamera:

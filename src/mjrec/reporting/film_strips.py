@@ -35,7 +35,7 @@ from ..rendering.recorded_frames import (
     check_has_frames,
     warn_of_other_frames,
 )
-from ..rendering.views import View, plain_camera
+from ..rendering.views import View
 from .video_stream import VideoStream, read_stream, stream_frames, video_kind
 
 _TRAJECTORY: Final = ".h5"
@@ -98,7 +98,7 @@ def film_strip(
     source: contextlib.AbstractContextManager[_Shots]
     if path.suffix == _TRAJECTORY:
         view = View(
-            camera=None if camera is None else plain_camera(camera),
+            camera=camera,
             height=height,
             width=width,
             quality=quality,

@@ -17,18 +17,15 @@ from __future__ import annotations
 import io
 import json
 import logging
-import math
 import os
 import posixpath
 import re
-import struct
 import tempfile
 import zipfile
-import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -38,8 +35,7 @@ from numpy.typing import NDArray
 from ..errors import UnreadableFile
 from ..formats.regular_files import open_regular
 from ..json_text import loads
-from .model_differences import differing_fields
-from .model_fields import apply_fields
+from .fields import apply_fields, differing_fields
 
 logger = logging.getLogger(__name__)
 
@@ -53,13 +49,13 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 _DIRECTORIES = ("assetdir", "meshdir", "texturedir")
 _XML_ELEMENTS = ("include", "model")
 
-# Of a directory and a file, each of which is looked at.
-_MOST_COMBINATIONS = 100_000
+# A path is put together from several attributes, and each may go up so far. The files
+# are compiled further below an empty directory than that: going up leads to nothing.
+_MOST_UP = 4
+_EMPTY = PurePosixPath(*["x"] * 8 * _MOST_UP)
 
-# The files are compiled so many directories below an empty one: a `..` too many
-# leads to nothing.
-_SPARE_DEPTH = 8
-_EMPTY = PurePosixPath(*["x"] * _SPARE_DEPTH)
+# What MuJoCo raises where memory does not suffice, as a RuntimeError.
+_MUJOCO_GAVE_UP = "Caught an unknown exception!"
 
 
 @dataclass(frozen=True)
@@ -131,15 +127,21 @@ def read_authored(path: Path, *, limit: int) -> mujoco.MjModel:
         UnreadableFile: it is damaged or dangerous, or this MuJoCo refuses it.
     """
     try:
-        with open_regular(path) as file:
-            members = _read_members(file, limit)
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+            total = sum(member.file_size for member in archive.infolist())
+            if total > limit:
+                raise ValueError(f"its content is {total} bytes, and no model has that")
+            members = {m.filename: _read(archive, m) for m in archive.infolist()}
         contents = loads(members.pop(_CONTENTS, b"null"))
         if not isinstance(contents, dict) or contents.get("format") != _FORMAT:
             raise ValueError("it holds no model of a format that this mjrec knows")
         sources = _below(_SOURCE, members)
         model = compile_authored(AuthoredModel(contents["main"], sources))
-        apply_fields(model, dict(_fields(members)))
-    except (*_REFUSALS, mujoco.FatalError) as error:
+        fields = _below(_FIELDS, members)
+        values = {n.removesuffix(".npy"): _array(fields[n]) for n in fields}
+        apply_fields(model, values)
+    # Whatever it is that zipfile, NumPy and MuJoCo raise for such a file.
+    except Exception as error:
         reason = " ".join(str(error).split())
         if isinstance(error, MemoryError) or reason == _MUJOCO_GAVE_UP:
             reason = "it needs more memory than there is, or than it may have"
@@ -156,7 +158,10 @@ def compile_authored(authored: AuthoredModel) -> mujoco.MjModel:
     """
     for name in authored.files:
         _check_name(name)
-    _check_references(authored)
+    if _parsed(authored.main, authored.files[authored.main]).tag != "mujoco":
+        raise ValueError(f"{authored.main} is not MJCF")
+    # References are checked as the documents are read.
+    _check_documents(authored)
     with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
         root = Path(directory) / _EMPTY
         for name, content in authored.files.items():
@@ -218,6 +223,8 @@ def _checked_reference(value: str) -> str:
     # A colon is a drive, or what a resource provider is called by.
     if value.startswith(("/", "~")) or any(c in value for c in "\\:\0"):
         raise ValueError(f"it refers to {value!r}, which is no plain relative path")
+    if value.split("/").count("..") > _MOST_UP:
+        raise ValueError(f"it refers to {value!r}, which is outside")
     return value
 
 
@@ -227,45 +234,22 @@ def _check_name(name: str) -> None:
         raise ValueError(f"it holds a file called {name!r}")
 
 
-def _check_references(authored: AuthoredModel) -> None:
-    """Raise ValueError where a file elsewhere might be read."""
-    if _parsed(authored.main, authored.files[authored.main]).tag != "mujoco":
-        raise ValueError(f"{authored.main} is not MJCF")
-    documents = _documents(authored)
-    directories = _all_directories(documents.values())
-    assets = sum(len(document.assets) for document in documents.values())
-    if len(directories) * assets > _MOST_COMBINATIONS:
-        raise ValueError("it names more files and directories than any model")
-    for name, document in documents.items():
-        for base in {PurePosixPath(name).parent, PurePosixPath(authored.main).parent}:
-            for reference in document.xml:
-                _check_inside(base / reference)
-            for directory in directories:
-                for reference in document.assets:
-                    _check_inside(base / directory / reference)
+def _check_documents(authored: AuthoredModel) -> None:
+    """Check all files that may be read as MJCF, whatever they are called.
 
-
-def _documents(authored: AuthoredModel) -> dict[str, _Document]:
-    """Return all files that may be read as MJCF, whatever they are called."""
+    Raises:
+        ValueError: a file elsewhere might be read.
+    """
     by_base_name: dict[str, list[str]] = {}
     for name in authored.files:
         by_base_name.setdefault(PurePosixPath(name).name, []).append(name)
-    documents: dict[str, _Document] = {}
     waiting = [authored.main]
     while waiting:
         name = waiting.pop()
-        documents[name] = _document(name, authored.files[name])
         # Wherever they are: MuJoCo's rules for it have changed.
-        for reference in documents[name].xml:
+        for reference in _document(name, authored.files[name]).xml:
             # Taken out, so that nothing is looked at twice, however often it is named.
-            found = by_base_name.pop(PurePosixPath(reference).name, [])
-            waiting += [other for other in found if other not in documents]
-    return documents
-
-
-def _check_inside(path: PurePosixPath) -> None:
-    if os.path.normpath(_EMPTY / path).startswith(".."):
-        raise ValueError(f"it refers to {path}, which is outside")
+            waiting += by_base_name.pop(PurePosixPath(reference).name, [])
 
 
 def _all_directories(documents: Iterable[_Document]) -> frozenset[str]:
@@ -316,21 +300,8 @@ def _npy(value: NDArray[Any]) -> bytes:
     return buffer.getvalue()
 
 
-def _fields(members: Mapping[str, bytes]) -> Iterator[tuple[str, NDArray[Any]]]:
-    for name, content in _below(_FIELDS, members).items():
-        yield name.removesuffix(".npy"), _array(content)
-
-
 def _array(content: bytes) -> NDArray[Any]:
-    file = io.BytesIO(content)
-    if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError("a field in it is not stored as a plain array")
-    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    # NumPy asks for as much memory as the header says, whatever follows it.
-    if dtype.hasobject or dtype.itemsize * math.prod(shape) > len(content):
-        raise ValueError("a field in it is not stored as a plain array")
-    file.seek(0)
-    return np.asarray(np.load(file, allow_pickle=False))
+    return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
 
 
 def _below(prefix: str, members: Mapping[str, bytes]) -> dict[str, bytes]:
@@ -349,48 +320,7 @@ def _member(name: str) -> zipfile.ZipInfo:
     return member
 
 
-# What zipfile raises for damage, encryption and what it does not know.
-_DAMAGE = (
-    EOFError,
-    IndexError,
-    RuntimeError,
-    struct.error,
-    zlib.error,
-    zipfile.BadZipFile,
-    zipfile.LargeZipFile,
-)
-
-# What MuJoCo raises where memory does not suffice, as a RuntimeError.
-_MUJOCO_GAVE_UP = "Caught an unknown exception!"
-
-_REFUSALS = (KeyError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
-
-
-def _read_members(file: BinaryIO, limit: int) -> dict[str, bytes]:
-    try:
-        with zipfile.ZipFile(file) as archive:
-            members = [member for member in archive.infolist() if not member.is_dir()]
-            _check_members(members, limit)
-            return {m.filename: _read_member(archive, m) for m in members}
-    except _DAMAGE as error:
-        raise ValueError(f"it is damaged ({error})") from error
-
-
-def _check_members(members: Sequence[zipfile.ZipInfo], limit: int) -> None:
-    total = sum(member.file_size for member in members)
-    if total > limit:
-        raise ValueError(f"its content is {total} bytes, and no model needs that")
-    if len({member.filename for member in members}) < len(members):
-        raise ValueError("two files in it have the same name")
-    for member in members:
-        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError(f"{member.filename!r:.200} in it is packed in another way")
-
-
-def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
+def _read(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     with archive.open(member) as stream:
         # With a number: without one, it unpacks more than the size that is noted.
-        content = stream.read(member.file_size)
-    if len(content) != member.file_size:
-        raise ValueError(f"{member.filename} in it is truncated")
-    return content
+        return stream.read(member.file_size)

@@ -1,20 +1,105 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An OpenGL context that draws scenes of a model, from any thread."""
+"""An OpenGL context that draws scenes of a model, from any thread.
+
+Most of a model is read anew for every frame. What stands in `_UPLOADS` and `_WHOLE` was
+copied to the graphics card, or compiled into a display list, when the context was made,
+and a later change does not show until it is uploaded or the context is made anew.
+"""
 
 from __future__ import annotations
 
 import copy
 import hashlib
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from ..errors import InvalidArgument
 from ..frames import Frame, check_quality, check_size
-from .baked_fields import BakedFields
-from .gl_strings import current_gl_strings, largest_picture
-from .gl_thread import GLStrings, GLThread, gl_error
+from .fields import holder_of
+from .gl_info import current_gl_strings, largest_picture
+from .gl_thread import GLThread, gl_error
+
+
+class _Upload(NamedTuple):
+    """Fields of a model, how many things they describe, and what uploads one of them.
+
+    Attributes:
+        arrays: names of arrays.
+        number: the field that says how many.
+        function: takes the model, the context and the number of one.
+    """
+
+    arrays: tuple[str, ...]
+    number: str
+    function: Callable[..., None]
+
+
+_UPLOADS = {
+    "hfields": _Upload(
+        ("hfield_data", "hfield_size"), "nhfield", mujoco.mjr_uploadHField
+    ),
+    "textures": _Upload(("tex_data",), "ntex", mujoco.mjr_uploadTexture),
+    "meshes": _Upload(
+        (
+            *("mesh_vert", "mesh_normal", "mesh_texcoord", "mesh_graph"),
+            *("mesh_face", "mesh_facenormal", "mesh_facetexcoord"),
+        ),
+        "nmesh",
+        mujoco.mjr_uploadMesh,
+    ),
+}
+
+# What needs a new context. Absent from some versions of mujoco: tex_colorspace.
+_WHOLE = (
+    *("mat_texid", "skin_face", "skin_texcoord"),
+    *("tex_type", "tex_width", "tex_height", "tex_nchannel", "tex_colorspace"),
+)
+_WHOLE_VISUAL = tuple(
+    f"vis.{struct}.{name}"
+    for struct, names in {
+        "map": ("fogstart", "fogend", "haze", "shadowclip", "shadowscale"),
+        "rgba": ("fog", "haze"),
+        "quality": ("shadowsize", "offsamples", "numslices", "numstacks", "numquads"),
+        "global_": ("linewidth",),
+    }.items()
+    for name in names
+)
+_OTHERWISE = "whole"
+
+
+def is_kept_by_context(name: str) -> bool:
+    """Tell whether a context may keep a field of this name.
+
+    Args:
+        name: of an array of `MjModel` (`tex_data`), or of a member of its structs
+            (`vis.map.haze`).
+    """
+    uploaded = any(name in upload.arrays for upload in _UPLOADS.values())
+    # Of planes only, which the name does not tell.
+    of_planes = ("geom_type", "geom_size")
+    return uploaded or name in (*_WHOLE, *_WHOLE_VISUAL, *of_planes)
+
+
+def _kept_fields(model: mujoco.MjModel) -> dict[str, bytes]:
+    """Return digests of what a context keeps, by what brings it up to date."""
+    digests = {name: _digest(model, upload.arrays) for name, upload in _UPLOADS.items()}
+    # Each plane has a display list; other geoms are scaled as they are drawn.
+    is_plane = model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)
+    planes = is_plane.tobytes() + model.geom_size[is_plane].tobytes()
+    digests[_OTHERWISE] = _digest(model, (*_WHOLE, *_WHOLE_VISUAL)) + planes
+    return digests
+
+
+def _digest(model: mujoco.MjModel, names: tuple[str, ...]) -> bytes:
+    digest = hashlib.blake2b(digest_size=16)
+    for name in names:
+        if "." in name or hasattr(model, name):
+            value = getattr(*holder_of(model, name))
+            digest.update(np.ascontiguousarray(value).data)
+    return digest.digest()
 
 
 class Canvas:
@@ -48,13 +133,8 @@ class Canvas:
             raise
 
     @property
-    def gl_strings(self) -> GLStrings:
-        """Who draws: OpenGL's vendor, renderer and version."""
-        return self._thread.strings
-
-    @property
     def gl_facts(self) -> dict[str, Any]:
-        """What metadata says of who draws, as `gl_strings.current_gl_facts`."""
+        """What metadata says of who draws, as `gl_info.current_gl_facts`."""
         return self._thread.facts
 
     def go_over_to(
@@ -65,9 +145,9 @@ class Canvas:
         Raises:
             InvalidArgument, ClosedError, GLError: as a new one, or `draw`.
         """
-        baked = BakedFields.of(model)
+        kept = _kept_fields(model)
         self._thread.call(self._context.prepare, model, height, width, quality)
-        self._baked = baked
+        self._kept = kept
 
     def update(self, model: mujoco.MjModel) -> None:
         """Bring the context up to date with changes of its model.
@@ -78,10 +158,11 @@ class Canvas:
         Raises:
             ClosedError, GLError: as `draw`.
         """
-        baked = BakedFields.of(model)
-        if changed := baked.changed_since(self._baked):
+        kept = _kept_fields(model)
+        changed = {name for name in kept if kept[name] != self._kept[name]}
+        if changed:
             self._thread.call(self._context.upload, model, changed)
-            self._baked = baked
+            self._kept = kept
 
     def draw(self, scene: mujoco.MjvScene, out: Frame | None = None) -> Frame:
         """Return the picture of `scene`, the top row first, in `out` if that is given.
@@ -91,10 +172,6 @@ class Canvas:
             GLError: in a forked child, or the driver hangs.
         """
         return self._thread.call(self._context.draw, scene, out)
-
-    def check_usable(self) -> None:
-        """Raise ClosedError or GLError if `draw` would, without waiting."""
-        self._thread.check_usable()
 
     def settle(self) -> None:
         """Return when nothing is drawn any more, which may be after Ctrl-C."""
@@ -138,7 +215,7 @@ class KeptCanvas:
         height, width = check_size(height, width)
         check_quality(quality)
         before, self._kind = self._kind, None
-        kind = (_digest(model), height, width, quality)
+        kind = (_model_digest(model), height, width, quality)
         if self._canvas is None:
             self._canvas = Canvas(model, height=height, width=width, quality=quality)
         elif kind == before:
@@ -155,19 +232,11 @@ class KeptCanvas:
             self._canvas = None
 
 
-def _digest(model: mujoco.MjModel) -> bytes:
+def _model_digest(model: mujoco.MjModel) -> bytes:
     # Not what a recording says of its model, which may be a stranger's.
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return hashlib.blake2b(buffer.data).digest()
-
-
-# What to upload for which attribute of `BakedFields`, and how many there are.
-_UPLOADS = {
-    "hfields": ("nhfield", mujoco.mjr_uploadHField),
-    "textures": ("ntex", mujoco.mjr_uploadTexture),
-    "meshes": ("nmesh", mujoco.mjr_uploadMesh),
-}
 
 
 class _Context:
@@ -198,15 +267,15 @@ class _Context:
         mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), context)
 
     def upload(self, model: mujoco.MjModel, changed: set[str]) -> None:
-        """Bring the context up to date with what `BakedFields` says has changed."""
-        if not changed <= _UPLOADS.keys():
+        """Bring the context up to date with what `_kept_fields` says has changed."""
+        if _OTHERWISE in changed:
             height, width = self._rectangle.height, self._rectangle.width
             self.prepare(model, height, width, self._quality)
             return
         for name in changed:
-            count, upload = _UPLOADS[name]
-            for index in range(getattr(model, count)):
-                upload(model, self._context, index)
+            upload = _UPLOADS[name]
+            for index in range(getattr(model, upload.number)):
+                upload.function(model, self._context, index)
 
     def draw(self, scene: mujoco.MjvScene, out: Frame | None) -> Frame:
         """Return the picture of `scene`, in `out` if that is given."""

@@ -32,8 +32,7 @@ from typing import Any
 import numpy as np
 
 from ..machine import gpu_device_files
-from .egl_devices import egl_devices
-from .gl_strings import current_gl_strings
+from .gl_info import current_gl_strings, egl_devices
 
 _SIZE = 480
 _MEASURED_SECONDS = 0.8

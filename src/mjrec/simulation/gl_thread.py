@@ -11,7 +11,7 @@ with a thread of its own disturbs nobody.
 from __future__ import annotations
 
 import atexit
-import contextlib
+import concurrent.futures
 import functools
 import importlib
 import logging
@@ -21,24 +21,25 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import mujoco
 
 from ..errors import ClosedError, Error, GLError
-from .gl_strings import current_gl_facts, current_gl_strings, raw_opengl
+from .gl_info import current_gl_facts, current_gl_strings, raw_opengl
 
-_logger = logging.getLogger(__name__)
+logger = logging.getLogger(__name__)
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 # No picture takes this long, not even one of 16384x16384 pixels on a busy machine
 # without a GPU; a driver that hangs does.
-_PATIENCE_S = 300.0
+_TIMEOUT_S = 300.0
+_TIMEOUT_AT_EXIT_S = 10.0
 _SLICE_S = 0.5
-_PATIENCE_AT_EXIT_S = 10.0
 
 # What mujoco allocates for the window, which is never drawn into: everything goes to
 # the offscreen buffer of the `MjrContext`.
@@ -47,23 +48,7 @@ _WINDOW_SIDE = 16
 # Making the first context of a backend initialises a display that all of them share.
 _making_context = threading.Lock()
 
-
-class GLStrings(NamedTuple):
-    """Who drew: OpenGL's vendor, renderer and version."""
-
-    vendor: str
-    renderer: str
-    version: str
-
-
-class _Outcome(NamedTuple):
-    value: Any = None
-    error: BaseException | None = None
-
-
-class _Request(NamedTuple):
-    function: Callable[[], Any]
-    reply: queue.SimpleQueue[_Outcome]
+_Requests: TypeAlias = "queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None]"
 
 
 class GLThread:
@@ -76,6 +61,9 @@ class GLThread:
         finish: called on the thread before the context is freed. It must hold no
             reference to this object, or that would never be garbage collected.
 
+    Attributes:
+        facts: what metadata says of who draws, as `current_gl_facts`.
+
     Raises:
         GLError: no context can be made here, or this process was forked from one that
             has made contexts.
@@ -83,17 +71,17 @@ class GLThread:
 
     def __init__(self, *, finish: Callable[[], None]) -> None:
         _refuse_fork_of_gl()
-        self._requests: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()
-        self._interrupted = False
+        self._requests: _Requests = queue.SimpleQueue()
         self._closed = False
         self._hangs = False
         self._process_id = os.getpid()
-        made: queue.SimpleQueue[_Outcome] = queue.SimpleQueue()
+        # Of the last request, which may still run after Ctrl-C.
+        self._last: Future[Any] = Future()
         # A daemon, because the interpreter waits for other threads before it calls
         # what atexit knows, and this one ends only when it is told to.
         self._thread = threading.Thread(
             target=_serve,
-            args=(self._requests, made, finish),
+            args=(self._requests, self._last, finish),
             name="mjrec-gl",
             daemon=True,
         )
@@ -103,22 +91,12 @@ class GLThread:
         )
         # Its own atexit hook may run after EGL was shut down, ours may not.
         self._release.atexit = False
-        self._facts: dict[str, Any] = self._answer(made)
+        self.facts: dict[str, Any] = self._result(self._last)
         # Hooks run in reverse order, and mujoco's, which shuts EGL down, was registered
         # when the first context was made.
         self._exit_hook = functools.partial(_close_at_exit, weakref.ref(self))
         atexit.register(self._exit_hook)
         weakref.finalize(self, atexit.unregister, self._exit_hook).atexit = False
-
-    @property
-    def strings(self) -> GLStrings:
-        """Who draws: OpenGL's vendor, renderer and version."""
-        return _strings_in(self._facts)
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """What metadata says of who draws, as `current_gl_facts`."""
-        return dict(self._facts)
 
     def call(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Return `function(*args, **kwargs)`, called on the thread.
@@ -131,10 +109,17 @@ class GLThread:
                 hangs.
         """
         self.settle()
-        reply: queue.SimpleQueue[_Outcome] = queue.SimpleQueue()
-        request = _Request(lambda: function(*args, **kwargs), reply)
-        value: T = self._answer(reply, request)
-        return value
+        future: Future[T] = Future()
+        self._last = future
+        try:
+            self._requests.put((future, functools.partial(function, *args, **kwargs)))
+            return self._result(future)
+        finally:
+            # After Ctrl-C, where it has not begun. The traceback of an error holds this
+            # frame, which must not hold the error.
+            if not future.cancel() and future.done():
+                self._last = _idle()
+            del future
 
     def settle(self) -> None:
         """Return when the thread is idle.
@@ -145,16 +130,10 @@ class GLThread:
         Raises:
             ClosedError, GLError: as `call`.
         """
-        self.check_usable()
-        if self._interrupted:
-            # Requests are answered in order. Not the answer that was given up is waited
-            # for, which the interruption may have swallowed.
-            reply: queue.SimpleQueue[_Outcome] = queue.SimpleQueue()
-            self._requests.put(_Request(lambda: None, reply))
-            self._wait_for(reply)
-            self._interrupted = False
+        self._check_usable()
+        _wait_for(self._last)
 
-    def close(self, patience_s: float = _PATIENCE_S) -> None:
+    def close(self, timeout_s: float = _TIMEOUT_S) -> None:
         """Call `finish`, free the context and end the thread. Idempotent.
 
         Does nothing in a forked child.
@@ -165,10 +144,10 @@ class GLThread:
         self._release()
         atexit.unregister(self._exit_hook)
         if not self._hangs:
-            self._thread.join(patience_s)
+            self._thread.join(timeout_s)
 
-    def check_usable(self) -> None:
-        """Raise ClosedError or GLError if a call would, without waiting."""
+    def _check_usable(self) -> None:
+        """Raise ClosedError or GLError if a call would."""
         if self._closed:
             raise ClosedError("The renderer is closed.")
         if os.getpid() != self._process_id:
@@ -182,38 +161,30 @@ class GLThread:
                 "The OpenGL driver hangs since an earlier call: end this process."
             )
 
-    def _answer(
-        self, reply: queue.SimpleQueue[_Outcome], request: _Request | None = None
-    ) -> Any:
-        try:
-            if request is not None:
-                # Not before: Ctrl-C may come as soon as the thread has it.
-                self._requests.put(request)
-            outcome = self._wait_for(reply)
-        except BaseException:
-            # Raised by a signal's handler, as Ctrl-C does.
-            self._interrupted = True
-            raise
-        if outcome.error is None:
-            return outcome.value
-        try:
-            raise outcome.error
-        finally:
-            # The traceback holds this frame, which must not hold the error.
-            del outcome
-
-    def _wait_for(self, reply: queue.SimpleQueue[_Outcome]) -> _Outcome:
-        deadline = time.monotonic() + _PATIENCE_S
-        while (left := deadline - time.monotonic()) > 0:
-            # In slices: a signal that comes just before the wait does not end it, and
-            # Ctrl-C would be noticed only after it.
-            with contextlib.suppress(queue.Empty):
-                return reply.get(timeout=min(left, _SLICE_S))
+    def _result(self, future: Future[T]) -> T:
+        if _wait_for(future):
+            return future.result()
         self._hangs = True
         raise GLError(
-            f"The OpenGL driver gave no answer within {_PATIENCE_S:.0f} seconds. "
+            f"The OpenGL driver gave no answer within {_TIMEOUT_S:.0f} seconds. "
             "Run `mjrec doctor` to see which backend works; end this process."
         )
+
+
+def _wait_for(future: Future[Any]) -> bool:
+    """Wait until a request is answered; tell whether it is."""
+    deadline = time.monotonic() + _TIMEOUT_S
+    while not future.done() and (left := deadline - time.monotonic()) > 0:
+        # In slices: a signal that comes just before the wait does not end it, and
+        # Ctrl-C would be noticed only after it.
+        concurrent.futures.wait([future], min(left, _SLICE_S))
+    return future.done()
+
+
+def _idle() -> Future[Any]:
+    future: Future[Any] = Future()
+    future.cancel()
+    return future
 
 
 def gl_error(what: str, reason: object, *, remedy: str = "") -> GLError:
@@ -235,32 +206,33 @@ def gl_error(what: str, reason: object, *, remedy: str = "") -> GLError:
     return GLError(" ".join(filter(None, parts)))
 
 
-def _serve(
-    requests: queue.SimpleQueue[_Request | None],
-    made: queue.SimpleQueue[_Outcome],
-    finish: Callable[[], None],
-) -> None:
+def _serve(requests: _Requests, made: Future[Any], finish: Callable[[], None]) -> None:
     try:
         context = _make_context()
-        made.put(_Outcome(current_gl_facts()))
     except BaseException as error:
-        made.put(_Outcome(error=error))
+        made.set_exception(error)
         return
+    made.set_result(current_gl_facts())
+    # Nothing of the caller's is kept alive while waiting for the next request.
+    del made
     while (request := requests.get()) is not None:
-        _serve_one(request, context)
-        # Nothing of the caller's is kept alive while waiting for the next request.
+        _answer(*request, context)
         del request
     _end(context, finish)
 
 
-def _serve_one(request: _Request, context: Any) -> None:
+def _answer(future: Future[Any], function: Callable[[], Any], context: Any) -> None:
+    if not future.set_running_or_notify_cancel():
+        return
     try:
         # Each time, because a garbage collection on this thread may have freed some
         # other context, and mujoco's EGL then lets go of whatever is current.
         context.make_current()
-        request.reply.put(_Outcome(request.function()))
+        future.set_result(function())
     except BaseException as error:
-        request.reply.put(_Outcome(error=error))
+        future.set_exception(error)
+        # Its traceback holds this frame.
+        del future
 
 
 def _end(context: Any, finish: Callable[[], None]) -> None:
@@ -270,10 +242,10 @@ def _end(context: Any, finish: Callable[[], None]) -> None:
         try:
             step()
         except Exception:
-            _logger.debug("Could not free an OpenGL context", exc_info=True)
+            logger.debug("Could not free an OpenGL context", exc_info=True)
 
 
-def _tell_to_end(requests: queue.SimpleQueue[_Request | None], process_id: int) -> None:
+def _tell_to_end(requests: _Requests, process_id: int) -> None:
     # `put` may be called from a finaliser; the thread does the rest in its own time.
     if os.getpid() == process_id:
         requests.put(None)
@@ -281,7 +253,7 @@ def _tell_to_end(requests: queue.SimpleQueue[_Request | None], process_id: int) 
 
 def _close_at_exit(reference: weakref.ref[GLThread]) -> None:
     if (thread := reference()) is not None:
-        thread.close(_PATIENCE_AT_EXIT_S)
+        thread.close(_TIMEOUT_AT_EXIT_S)
 
 
 def _make_context() -> Any:
@@ -292,7 +264,9 @@ def _make_context() -> Any:
             context: Any = _owned(_context_class())(_WINDOW_SIDE, _WINDOW_SIDE)
             _has_made_context = True
         context.make_current()
-        works = bool(_read_strings().renderer)
+        # Not every context of mujoco's imports it, and nothing is read before.
+        raw_opengl()
+        works = bool(current_gl_strings().get("gl_renderer"))
     except Error:
         raise
     except Exception as error:
@@ -302,17 +276,6 @@ def _make_context() -> Any:
         # GLFW without a display makes an object that does nothing.
         raise gl_error("No OpenGL context can be made", "nothing draws into it")
     return context
-
-
-def _read_strings() -> GLStrings:
-    # Not every context of mujoco's imports it, and nothing is read through it before.
-    raw_opengl()
-    return _strings_in(current_gl_strings())
-
-
-def _strings_in(facts: Mapping[str, Any]) -> GLStrings:
-    names = ("gl_vendor", "gl_renderer", "gl_version")
-    return GLStrings(*(facts.get(name, "") for name in names))
 
 
 def _context_class() -> Any:

@@ -53,19 +53,16 @@ class MjcfSimulation:
     of a second, each frame is one step and the rate is one over the timestep.
 
     Args:
-        path: of the MJCF file.
+        model: the compiled model, as of `load_mjcf`.
 
     Attributes:
         model: the `mujoco.MjModel`.
         data: its `mujoco.MjData`.
         frame_rate: frames in a simulated second.
-
-    Raises:
-        UnreadableFile: MuJoCo refuses the file.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.model = load_mjcf(path)
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model = model
         self.data = mujoco.MjData(self.model)
         self._timestep = _meant_timestep(self.model)
         self.frame_rate = min(FRAME_RATE, 1 / self._timestep)

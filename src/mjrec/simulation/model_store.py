@@ -19,10 +19,10 @@ import hashlib
 import logging
 import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -41,6 +41,7 @@ from .authored_model import (
 )
 from .model_trust import (
     TRUST_VARIABLE,
+    directory_digest,
     is_stored,
     is_trusted,
     note_models,
@@ -56,11 +57,6 @@ _CHUNK = 1 << 20
 
 # Nothing that was recorded comes near; a file that claims more is made to hurt.
 _LARGEST = 1 << 31
-
-# What is mostly zeros packs a thousandfold. So may a small model; a large one of which
-# so little is left is made to fill the memory.
-_ALWAYS_FINE = 1 << 28
-_MOST_EXPANSION = 100
 
 # Of models that could not be written, until there is room for them.
 _MOST_KEPT = 1 << 28
@@ -88,8 +84,8 @@ class ModelStore:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._known: set[str] = set()
-        self._failures: dict[str, FileNotWritten] = {}
-        self._failed: dict[str, _Job] = {}
+        # What could not be written, and the job, unless that is kept no longer.
+        self._failed: dict[str, tuple[FileNotWritten, _Job | None]] = {}
         self._writer: WorkerThread[_Job] | None = None
 
     def add(
@@ -108,7 +104,7 @@ class ModelStore:
             `bytes` of it, `mjb` and `xml` (base names; `xml` may be None), `mujoco`
             (the version).
         """
-        compiled = _compiled(model)
+        compiled = saved_model(model)
         digest = hashlib.sha256(compiled.data).hexdigest()
         stem = f"{FILE_PREFIX}.model.{digest[:16]}"
         facts = {
@@ -121,7 +117,7 @@ class ModelStore:
         names = {name for name in (facts["mjb"], facts["xml"]) if name is not None}
         if not names <= self._known:
             self._known |= names
-            note_models([digest])
+            note_models([digest, directory_digest(self._directory)])
             self._queue(_Job(stem, compiled, authored))
         return facts
 
@@ -134,16 +130,17 @@ class ModelStore:
         """
         self._wait()
         failed, self._failed = self._failed, {}
-        for stem, job in failed.items():
-            del self._failures[stem]
-            self._queue(job)
+        for stem, (error, job) in failed.items():
+            if job is None:
+                self._failed[stem] = error, None
+            else:
+                self._queue(job)
         self._wait()
-        if self._failures:
-            failure, *_ = self._failures.values()
-            # What is kept is told again, if it fails again.
-            kept = self._failed.keys()
-            self._failures = {k: v for k, v in self._failures.items() if k in kept}
-            raise failure
+        errors = [error for error, _ in self._failed.values()]
+        # What is kept fails again, if it does.
+        self._failed = {k: v for k, v in self._failed.items() if v[1] is not None}
+        if errors:
+            raise errors[0]
 
     def leave(self) -> None:
         """Let what waits be stored in the background. Never blocks."""
@@ -162,40 +159,31 @@ class ModelStore:
         self._writer.put(job)
 
     def _store(self, job: _Job) -> None:
-        self._store_compiled(self._directory / f"{job.stem}.mjb.gz", job)
-        if job.authored is not None:
-            self._store_authored(self._directory / f"{job.stem}.zip", job, job.authored)
+        self._write(job, ".mjb.gz", lambda path: _write_gzip(path, job.compiled))
+        authored = job.authored
+        if authored is None:
+            return
+        limit = _source_limit(len(job.compiled))
+        model = _loaded(job.compiled.tobytes())
+        self._write(
+            job, ".zip", lambda path: write_authored(path, authored, model, limit=limit)
+        )
 
-    def _store_compiled(self, path: Path, job: _Job) -> None:
+    def _write(self, job: _Job, suffix: str, write: Callable[[Path], None]) -> None:
+        path = self._directory / f"{job.stem}{suffix}"
         if path.exists():
             return
         try:
             with replacing(path) as temporary:
-                _write_gzip(temporary, job.compiled, _LEVEL)
-                if not _can_hold(temporary, len(job.compiled)):
-                    _write_gzip(temporary, job.compiled, 0)
-        except OSError as error:
-            self._note_failure(path, job, error)
-
-    def _store_authored(self, path: Path, job: _Job, authored: AuthoredModel) -> None:
-        if path.exists():
-            return
-        try:
-            with replacing(path) as temporary:
-                model = _loaded(job.compiled.tobytes())
-                limit = _source_limit(len(job.compiled))
-                write_authored(temporary, authored, model, limit=limit)
+                write(temporary)
         except ValueError as error:
             logger.debug("%s is not stored: %s", path.name, error)
         except OSError as error:
-            self._note_failure(path, job, error)
-
-    def _note_failure(self, path: Path, job: _Job, error: OSError) -> None:
-        self._known.discard(path.name)
-        kept = sum(len(other.compiled) for other in self._failed.values())
-        if kept + len(job.compiled) <= _MOST_KEPT:
-            self._failed[job.stem] = job
-        self._failures[job.stem] = FileNotWritten(path, error.strerror or error)
+            self._known.discard(path.name)
+            jobs = [kept for _, kept in self._failed.values() if kept is not None]
+            size = sum(len(kept.compiled) for kept in (*jobs, job))
+            failure = FileNotWritten(path, error.strerror or error)
+            self._failed[job.stem] = failure, job if size <= _MOST_KEPT else None
 
 
 def load_model(
@@ -291,24 +279,25 @@ def _not_loadable(
     )
 
 
-def _compiled(model: mujoco.MjModel) -> NDArray[np.uint8]:
+def saved_model(model: mujoco.MjModel) -> NDArray[np.uint8]:
+    """Return a model as `mj_saveModel` writes it, with all that it refers to."""
     whole = with_embedded_files(model)
     buffer = np.empty(mujoco.mj_sizeModel(whole), np.uint8)
     mujoco.mj_saveModel(whole, None, buffer)
     return buffer
 
 
-def _can_hold(path: Path, size: int) -> bool:
-    """Tell whether a packed file is large enough to be trusted to hold so much."""
-    return size <= max(_ALWAYS_FINE, _MOST_EXPANSION * path.stat().st_size)
+def model_digest(model: mujoco.MjModel) -> str:
+    """Return the sha256 of a saved model, as recordings say it."""
+    return hashlib.sha256(saved_model(model).data).hexdigest()
 
 
-def _write_gzip(path: Path, content: NDArray[np.uint8], level: int) -> None:
+def _write_gzip(path: Path, content: NDArray[np.uint8]) -> None:
     # No name and no time in it: the same model makes the same file.
     with (
         path.open("wb") as file,
         gzip.GzipFile(
-            filename="", mode="wb", compresslevel=level, fileobj=file, mtime=0
+            filename="", mode="wb", compresslevel=_LEVEL, fileobj=file, mtime=0
         ) as stream,
     ):
         # In pieces: the interpreter's lock is let go while each is compressed.
@@ -355,36 +344,17 @@ def _source_limit(compiled_size: int) -> int:
 def _read_gzip(path: Path, size: int) -> bytes:
     """Return the `size` bytes that the file holds, and never read more."""
     with unreadable(path), open_regular(path) as file:
-        if not _can_hold(path, size):
-            raise ValueError(f"it is too small to hold the recorded {size} bytes")
+        # Not with the module `gzip`, which goes through a header of any length, and
+        # through any number of empty streams, byte by byte in Python.
+        stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
         try:
-            content = _unpacked(file, size)
+            content = stream.decompress(file.read(size + _CHUNK), size + 1)
         except zlib.error as error:
             raise ValueError(f"it is damaged ({error})") from error
-        if len(content) != size or file.read(1):
+        if len(content) != size or not stream.eof or stream.unused_data:
             there = "more" if len(content) >= size else f"{len(content)} bytes"
             raise ValueError(f"it holds {there}, not the recorded {size} bytes")
         return content
-
-
-def _unpacked(file: BinaryIO, size: int) -> bytes:
-    """Return what one gzip stream holds, and at most a byte more than `size`.
-
-    Not with the module `gzip`, which goes through a header of any length, and through
-    any number of empty streams, byte by byte in Python.
-    """
-    stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
-    pieces: list[bytes] = []
-    left = size + 1
-    while left and not stream.eof:
-        packed = file.read(_CHUNK)
-        if not packed:
-            raise ValueError("it was cut off")
-        pieces.append(stream.decompress(packed, left))
-        left -= len(pieces[-1])
-    if stream.unused_data:
-        raise ValueError("something follows after its end")
-    return b"".join(pieces)
 
 
 def _loaded(content: bytes) -> mujoco.MjModel:

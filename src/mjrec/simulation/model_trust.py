@@ -6,7 +6,8 @@ do anything to the process that loads it. The hashes in a directory prove nothin
 its maker wrote them too. So the models that this user stores are listed where only
 this user can write::
 
-    $XDG_STATE_HOME/mjrec/models       their sha256, one a line
+    $XDG_STATE_HOME/mjrec/models       their sha256, one a line, and those of the
+                                       paths of directories that they were stored in
     ~/.local/state/mjrec/models        by default
     <temporary directory>/mjrec-<uid>/models       where that cannot be written
 
@@ -28,13 +29,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import hashlib
 import logging
 import os
 import pwd
 import re
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
@@ -45,10 +47,10 @@ from ..formats.monitor_directory import FILE_PREFIX
 logger = logging.getLogger(__name__)
 
 TRUST_VARIABLE = "MJREC_TRUST_MODELS"
+ALL_MODELS = "1"
 
 _ONE_BY_ONE = "sha256:"
 _LIST_NAME = "models"
-_LOCK_NAME = ".models.lock"
 _DIGEST = re.compile("[0-9a-f]{64}")
 _DIGITS_IN_NAME = 16
 # A task may compile a model for each episode. So many are 4.3 MB, read in milliseconds.
@@ -80,7 +82,6 @@ def note_models(digests: Iterable[str]) -> None:
             _warn_once(str(error))
             reasons.append(str(error))
         except OSError as error:
-            logger.debug("There is no list in %s.", directory, exc_info=True)
             reasons.append(f"{directory}: {error.strerror or error}")
     if wanted:
         _warn_once(
@@ -112,6 +113,23 @@ def is_stored(digest: object) -> bool:
     return any(f"\n{digest}\n" in f"\n{content}" for content in _lists())
 
 
+def directory_digest(directory: Path) -> str:
+    """Return what `note_models` notes of a directory that this user records into.
+
+    By its place: what was moved or copied is a stranger's, which costs a moment and
+    nothing else.
+    """
+    place = os.path.realpath(directory)
+    return hashlib.sha256(
+        f"directory {place}".encode(errors="surrogateescape")
+    ).hexdigest()
+
+
+def is_own_directory(directory: Path) -> bool:
+    """Tell whether this user has recorded into a directory."""
+    return is_stored(directory_digest(directory))
+
+
 def stored_models(directories: Iterable[Path]) -> list[str]:
     """Return the hashes of this user's models in some directories.
 
@@ -140,39 +158,20 @@ def is_trusted(digest: object) -> bool:
     return isinstance(digest, str) and f"{_ONE_BY_ONE}{digest}" in said.split(",")
 
 
-def with_all_models_trusted(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables of a process that loads all models."""
-    return {**environ, TRUST_VARIABLE: "1"}
-
-
 @contextlib.contextmanager
-def trusting_all_models() -> Iterator[None]:
-    """Let this process, and those that it starts in the block, load all models.
-
-    For a program's own main thread: environment variables belong to the process.
-    """
-    with _saying("1"):
-        yield
-
-
-@contextlib.contextmanager
-def trusting_models(digests: Iterable[str]) -> Iterator[None]:
+def trusting_models(digests: Iterable[str] | None = None) -> Iterator[None]:
     """Let this process, and those that it starts in the block, load some models.
 
-    For whoever has made these models too, and knows that nothing crafted has these
-    hashes. What was trusted before is not, in the block.
+    For whoever knows that nothing crafted has these hashes, in a program's own main
+    thread: environment variables belong to the process. What was trusted before is
+    not, in the block.
 
     Args:
-        digests: the sha256 of the compiled models, in hex.
+        digests: the sha256 of the compiled models, in hex; None is all models.
     """
-    with _saying(",".join(_ONE_BY_ONE + digest for digest in digests) or "0"):
-        yield
-
-
-@contextlib.contextmanager
-def _saying(value: str) -> Iterator[None]:
     before = os.environ.get(TRUST_VARIABLE)
-    os.environ[TRUST_VARIABLE] = value
+    said = (_ONE_BY_ONE + digest for digest in digests or ())
+    os.environ[TRUST_VARIABLE] = ALL_MODELS if digests is None else ",".join(said)
     try:
         yield
     finally:
@@ -183,6 +182,13 @@ def _saying(value: str) -> Iterator[None]:
 
 class _Refused(Exception):
     """What stands in a list's place is not used."""
+
+    def __init__(self, objection: str) -> None:
+        super().__init__(
+            f"The list of this user's models is not used: {objection}. If nobody else "
+            "has written there, mend that; else remove it: models that were stored "
+            "before then count as a stranger's."
+        )
 
 
 @functools.cache
@@ -237,14 +243,15 @@ def _add(directory: Path, digests: Iterable[str]) -> None:
     """
     if not directory.exists():
         _make_directory(directory)
-    objection = _objection_to(directory)
-    if objection is not None:
-        if (directory / _LIST_NAME).exists():
-            raise _refused(objection)
+    path = directory / _LIST_NAME
+    objection = _objection(directory, directory.lstat(), stat.S_ISDIR)
+    if objection is not None and not path.exists():
         # Some file systems know no owners and no modes.
         raise PermissionError(objection)
+    if objection is not None:
+        raise _Refused(objection)
     # Also where appending is atomic: another process may be forgetting the oldest.
-    lock = wait_for_lock(directory / _LOCK_NAME, "")
+    lock = wait_for_lock(directory / f".{_LIST_NAME}.lock", "")
     try:
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND
         with _opened(directory, flags) as descriptor:
@@ -252,44 +259,31 @@ def _add(directory: Path, digests: Iterable[str]) -> None:
             listed = content.split()
             new = sorted(set(digests).difference(listed))
             if len(listed) + len(new) > 2 * _KEPT:
-                _write_newest(directory / _LIST_NAME, [*listed, *new])
+                with replacing(path) as temporary:
+                    temporary.touch(0o600)
+                    temporary.write_text(_lines([*listed, *new][-_KEPT:]))
             elif new:
                 # After a full disk cut a line off.
                 start = "" if content[-1:] in ("", "\n") else "\n"
-                _write(descriptor, start + _lines(new))
+                text = start + _lines(new)
+                if os.write(descriptor, text.encode()) < len(text):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     finally:
         lock.let_go()
-
-
-def _write_newest(path: Path, digests: list[str]) -> None:
-    with replacing(path) as temporary:
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        try:
-            _write(descriptor, _lines(digests[-_KEPT:]))
-        finally:
-            os.close(descriptor)
 
 
 def _lines(digests: Iterable[str]) -> str:
     return "".join(f"{digest}\n" for digest in digests)
 
 
-def _write(descriptor: int, text: str) -> None:
-    if os.write(descriptor, text.encode()) < len(text):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
 def _make_directory(directory: Path) -> None:
-    missing = [directory]
-    while not missing[-1].parent.exists():
-        missing.append(missing[-1].parent)
-    base = missing[-1].parent
+    base = next(parent for parent in directory.parents if parent.exists())
     if os.geteuid() == 0 and base.stat().st_uid != 0:
         # With `sudo` and somebody's HOME: it would be in that user's way.
         raise PermissionError(f"{base} is not root's")
-    for path in reversed(missing):
-        with contextlib.suppress(FileExistsError):
-            path.mkdir(mode=0o700)
+    for path in reversed((directory, *directory.parents)):
+        if not path.exists():
+            path.mkdir(mode=0o700, exist_ok=True)
 
 
 @contextlib.contextmanager
@@ -307,41 +301,29 @@ def _opened(directory: Path, flags: int) -> Iterator[int]:
         descriptor = os.open(path, flags | careful, 0o600)
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise _refused(f"{path} is a link") from error
+            raise _Refused(f"{path} is a link") from error
         raise
     try:
-        objection = _objection_to(directory) or _objection_to_list(path, descriptor)
+        objection = _objection(directory, directory.lstat(), stat.S_ISDIR)
+        objection = objection or _objection(path, os.fstat(descriptor), stat.S_ISREG)
         if objection is not None:
-            raise _refused(objection)
+            raise _Refused(objection)
         yield descriptor
     finally:
         os.close(descriptor)
 
 
-def _objection_to(directory: Path) -> str | None:
-    facts = directory.lstat()
-    if not stat.S_ISDIR(facts.st_mode) or facts.st_uid != os.geteuid():
-        return f"{directory} is not a directory of this user's"
+def _objection(
+    path: Path, facts: os.stat_result, is_kind: Callable[[int], bool]
+) -> str | None:
+    """Say why what stands at a path may have been written by others."""
+    if not is_kind(facts.st_mode) or facts.st_uid != os.geteuid():
+        what = "directory" if is_kind is stat.S_ISDIR else "file"
+        return f"{path} is not a {what} of this user's"
     if facts.st_mode & _OTHERS:
-        return f"{directory} is open to others (chmod 700 {directory})"
+        mode = 700 if is_kind is stat.S_ISDIR else 600
+        return f"{path} is open to others (chmod {mode} {path})"
     return None
-
-
-def _objection_to_list(path: Path, descriptor: int) -> str | None:
-    facts = os.fstat(descriptor)
-    if not stat.S_ISREG(facts.st_mode) or facts.st_uid != os.geteuid():
-        return f"{path} is not a file of this user's"
-    if facts.st_mode & _OTHERS:
-        return f"{path} is open to others (chmod 600 {path})"
-    return None
-
-
-def _refused(objection: str) -> _Refused:
-    return _Refused(
-        f"The list of this user's models is not used: {objection}. If nobody else has "
-        "written there, mend that; else remove it: models that were stored before then "
-        "count as a stranger's."
-    )
 
 
 def _content(descriptor: int) -> str:

@@ -18,19 +18,13 @@ from numpy.typing import NDArray
 from ..errors import InvalidArgument, UnknownName, UnreadableFile
 from ..formats.in_flight import recordings_in_flight
 from ..formats.monitor_directory import infix_of, iter_monitor_files
-from ..formats.trajectory_file import open_trajectory
-from ..formats.trajectory_reader import TrajectoryReader
+from ..formats.trajectory import TrajectoryReader
+from .foreign_trajectories import open_vetted_trajectory
 
 if TYPE_CHECKING:
     import mujoco
 
 _SHOWN = 10
-
-# What is read into memory: anything that is as small as this, or no more than so many
-# times as large as its file. A robot that stands still packs so well; a file that is
-# made to fill the memory packs a thousandfold.
-_ALWAYS_FINE = 1 << 31
-_MOST_EXPANSION = 64
 
 
 def load_trajectory(
@@ -49,8 +43,8 @@ def load_trajectory(
             `MJREC_TRUST_MODELS=1` says the same for all.
 
     Raises:
-        UnreadableFile: there is no such file, or it is damaged, foreign, or of a newer
-            format.
+        UnreadableFile: there is no such file, or it is damaged, of a newer format, or
+            a stranger's that does harm to the process that reads it.
         InvalidArgument: it is a directory; the trajectories in it are named.
     """
     path = Path(path)
@@ -60,7 +54,7 @@ def load_trajectory(
         path = Path(os.path.realpath(path))
     if path.is_dir():
         raise InvalidArgument(_what_is_in(path))
-    with open_trajectory(path) as reader:
+    with open_vetted_trajectory(path) as reader:
         return Trajectory(reader, trust_models=trust_models)
 
 
@@ -110,7 +104,6 @@ class Trajectory:
 
     def __init__(self, reader: TrajectoryReader, *, trust_models: bool = False) -> None:
         count, row_count = reader.step_count, reader.row_count
-        _check_size(reader)
         self.path = reader.path
         self.trust_models = trust_models
         self.facts = reader.header.facts
@@ -176,7 +169,7 @@ class Trajectory:
         Raises:
             UnreadableFile: the file is gone or damaged.
         """
-        with open_trajectory(self.path) as reader:
+        with open_vetted_trajectory(self.path) as reader:
             rows = reader.snapshots(0, len(self.frame_steps))
         return self._header.snapshot.unpack(rows)
 
@@ -209,7 +202,7 @@ class Trajectory:
             InvalidArgument: there is no such step.
         """
         # Here, because reading needs no simulator.
-        from .model_fields import apply_fields
+        from .fields import apply_fields
         from .model_store import load_model
 
         step = self._step(step)
@@ -223,7 +216,7 @@ class Trajectory:
         model = load_model(self.path.parent, stored, trust_models=self.trust_models)
         try:
             # One at a time: there may be thousands, and each as large as a texture.
-            with open_trajectory(self.path) as reader:
+            with open_vetted_trajectory(self.path) as reader:
                 for change in reader.iter_model_changes():
                     if change.step <= step:
                         apply_fields(model, change.fields)
@@ -243,7 +236,7 @@ class Trajectory:
                 data's model.
         """
         # Here, because reading needs no simulator.
-        from .integration_state import set_state
+        from .replay import set_state
 
         row = self.states[self._step(step)]
         set_state(data.model, data, self._header.state, row)
@@ -258,22 +251,6 @@ class Trajectory:
                 f"state {step}."
             )
         return step % count
-
-
-def _check_size(reader: TrajectoryReader) -> None:
-    header = reader.header
-    arrays = [array for array in (header.action, header.observation) if array]
-    row = 8 * header.state_length + sum(array.size for array in arrays)
-    needed = row * reader.row_count + header.snapshot.size * reader.frame_count
-    if not reader.path.exists():
-        # Nothing is packed in a log.
-        return
-    if needed > max(_ALWAYS_FINE, _MOST_EXPANSION * reader.path.stat().st_size):
-        raise UnreadableFile(
-            reader.path,
-            f"it claims to hold {needed / 2**30:.0f} GiB, which is far more than its "
-            "size; if that is true, read it in parts, with h5py",
-        )
 
 
 def _what_is_in(directory: Path) -> str:

@@ -9,13 +9,12 @@ module only where tensorboard is known to be there.
 from __future__ import annotations
 
 import io
-import itertools
 import os
 import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from tensorboard.compat.proto import event_pb2, summary_pb2, tensor_pb2, types_pb2
@@ -45,7 +44,11 @@ class EventFile:
     """
 
     def __init__(self, directory: Path) -> None:
-        self.directory = _make_new(directory)
+        make_directory(directory.parent)
+        self.directory, number = directory, 1
+        while not _made(self.directory):
+            number += 1
+            self.directory = directory.with_name(f"{directory.name}-{number}")
         now = time.time()
         name = f"events.out.tfevents.{now:010.0f}.{socket.gethostname()}.{os.getpid()}"
         self._file = AppendOnlyFile([self.directory / name])
@@ -56,14 +59,9 @@ class EventFile:
         self, values: Mapping[str, float], *, step: int, wall_time: float
     ) -> None:
         """Write numbers by their tags."""
-        self._write_summary(
-            *(
-                summary_pb2.Summary.Value(tag=tag, simple_value=value)
-                for tag, value in values.items()
-            ),
-            step=step,
-            wall_time=wall_time,
-        )
+        pairs = values.items()
+        summaries = [summary_pb2.Summary.Value(tag=k, simple_value=v) for k, v in pairs]
+        self._write_summary(*summaries, step=step, wall_time=wall_time)
 
     def write_gif(self, tag: str, gif: bytes, *, step: int, wall_time: float) -> None:
         """Write an animated picture."""
@@ -101,20 +99,11 @@ class EventFile:
             self._file.append(record.getvalue())
 
 
-def _make_new(directory: Path) -> Path:
-    make_directory(directory.parent)
-    for path in _names(directory):
-        try:
-            path.mkdir()
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise DirectoryNotWritable(path, error.strerror) from error
-        break
-    return path
-
-
-def _names(directory: Path) -> Iterator[Path]:
-    yield directory
-    for number in itertools.count(2):
-        yield directory.with_name(f"{directory.name}-{number}")
+def _made(directory: Path) -> bool:
+    try:
+        directory.mkdir()
+    except FileExistsError:
+        return False
+    except OSError as error:
+        raise DirectoryNotWritable(directory, error.strerror) from error
+    return True

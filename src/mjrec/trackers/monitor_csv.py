@@ -48,7 +48,7 @@ class MonitorCsvTracker(Tracker):
     def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
         # Absolute, because the working directory may be another one by then.
         self._path = None if path is None else Path(path).absolute()
-        self._files: dict[Run, _CsvFile] = {}
+        self._files: dict[Run, tuple[AppendOnlyFile, float]] = {}
 
     def begin(self, run: Run) -> None:
         """Make the run's file.
@@ -57,7 +57,10 @@ class MonitorCsvTracker(Tracker):
             DirectoryNotWritable: the directory cannot be made or written to.
             FileNotWritten: the disk is full.
         """
-        self._files[run] = _CsvFile(self._names(run), env_id=run.env_id)
+        file, t_start = AppendOnlyFile(self._names(run)), time.time()
+        self._files[run] = file, t_start
+        header = json_text.dumps({"t_start": t_start, "env_id": run.env_id})
+        file.append(f"#{header}\nr,l,t\n".encode())
 
     def episode(self, run: Run, episode: FinishedEpisode) -> None:
         """Write the episode's row.
@@ -65,11 +68,16 @@ class MonitorCsvTracker(Tracker):
         Raises:
             FileNotWritten: the disk is full; the file is as it was before.
         """
-        self._files[run].write_episode(episode)
+        file, t_start = self._files[run]
+        seconds = round(episode.end_time - t_start, 6)
+        # NumPy's numbers would be written with their types.
+        row = float(episode.reward), int(episode.length), float(seconds)
+        file.append((",".join(map(repr, row)) + "\n").encode())
 
     def end(self, run: Run) -> None:
         """Close the run's file."""
-        self._files.pop(run).close()
+        file, _ = self._files.pop(run)
+        file.close()
 
     def _names(self, run: Run) -> Iterator[Path]:
         """Yield the names that the run's file may have, best first."""
@@ -81,22 +89,3 @@ class MonitorCsvTracker(Tracker):
         for number in itertools.count(1):
             # A name without a base is given by the number.
             yield path.with_name(f"{base}.{number}.{_ENDING}".removeprefix("."))
-
-
-class _CsvFile:
-    """A file with its header, and a row for each episode."""
-
-    def __init__(self, names: Iterator[Path], *, env_id: str) -> None:
-        self._t_start = time.time()
-        self._file = AppendOnlyFile(names)
-        header = json_text.dumps({"t_start": self._t_start, "env_id": env_id})
-        self._file.append(f"#{header}\nr,l,t\n".encode())
-
-    def write_episode(self, episode: FinishedEpisode) -> None:
-        seconds = round(episode.end_time - self._t_start, 6)
-        # NumPy's numbers would be written with their types.
-        row = float(episode.reward), int(episode.length), float(seconds)
-        self._file.append((",".join(map(repr, row)) + "\n").encode())
-
-    def close(self) -> None:
-        self._file.close()

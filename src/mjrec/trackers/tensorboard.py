@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,13 +14,12 @@ from ..formats.json_fields import field, integer, read_object, text, unreadable
 from ..recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
 from ..worker_thread import WorkerThread
 from .preview import animated_gif
-from .required_packages import require
-from .scalars import group_of, name_of, scalars_of
+from .services import group_of, name_of, require, scalars_of
 
 if TYPE_CHECKING:
     from .event_file import EventFile
 
-# Videos that wait for their previews; what is kept of each is a name.
+# Videos that wait for their previews.
 _MOST_WAITING = 100
 
 
@@ -48,7 +47,7 @@ class TensorBoardTracker(Tracker):
     """
 
     def __init__(self, log_dir: str | os.PathLike[str] | None = None) -> None:
-        require("tensorboard", purpose="TensorBoardTracker", extra="tensorboard")
+        require("tensorboard", purpose="TensorBoardTracker")
         # Absolute, because the working directory may be another one by then.
         self._log_dir = None if log_dir is None else Path(log_dir).absolute()
         self._runs: dict[Run, _TensorBoardRun] = {}
@@ -96,36 +95,6 @@ class TensorBoardTracker(Tracker):
         return self._log_dir / f"{run.directory.name}.{name}"
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Preview:
-    """A preview that is to be made, and where it belongs."""
-
-    path: Path
-    frame_count: int
-    fps: Fraction
-    tag: str
-    step: int
-
-
-def _preview(video: FinishedVideo, episode: FinishedEpisode | None) -> _Preview:
-    frame_count, fps = _rate(video.metadata_path)
-    return _Preview(
-        path=video.path,
-        frame_count=frame_count,
-        fps=fps,
-        tag=f"{group_of(episode)}/{name_of(video)}",
-        step=episode.total_steps if episode else 0,
-    )
-
-
-def _rate(metadata_path: Path) -> tuple[int, Fraction]:
-    """Return a video's number of frames, and how many are shown in a second."""
-    with unreadable(metadata_path):
-        metadata = read_object(metadata_path)
-        fps = Fraction(field(metadata, "fps", text))
-        return field(metadata, "frame_count", integer), fps
-
-
 class _TensorBoardRun:
     """The event file of a run, and the thread that makes previews for it."""
 
@@ -136,7 +105,7 @@ class _TensorBoardRun:
         self._file: EventFile = EventFile(directory)
         self._last_episode: FinishedEpisode | None = None
         # Started by the first video; most runs of a vector environment have none.
-        self._previews: WorkerThread[_Preview] | None = None
+        self._previews: WorkerThread[Callable[[], None]] | None = None
 
     def write_episode(self, episode: FinishedEpisode) -> None:
         self._last_episode = episode
@@ -147,20 +116,30 @@ class _TensorBoardRun:
         )
 
     def write_video(self, video: FinishedVideo) -> None:
-        preview = _preview(video, video.episode or self._last_episode)
+        episode = video.episode or self._last_episode
+        tag = f"{group_of(episode)}/{name_of(video)}"
+        step = episode.total_steps if episode else 0
+        with unreadable(video.metadata_path):
+            metadata = read_object(video.metadata_path)
+            fps = Fraction(field(metadata, "fps", text))
+            frame_count = field(metadata, "frame_count", integer)
         self._file.write_text(
-            f"{preview.tag}_file",
-            f"episode {video.episode_id}: `{video.path.name}`, "
-            f"{preview.frame_count} frames at {float(preview.fps):g} fps, "
-            f"in `{video.path.parent}`",
-            step=preview.step,
+            f"{tag}_file",
+            f"episode {video.episode_id}: `{video.path.name}`, {frame_count} frames "
+            f"at {float(fps):g} fps, in `{video.path.parent}`",
+            step=step,
             wall_time=time.time(),
         )
+
+        def write_preview() -> None:
+            gif = animated_gif(video.path, frame_count=frame_count, fps=fps)
+            self._file.write_gif(tag, gif, step=step, wall_time=time.time())
+
         if self._previews is None:
             self._previews = WorkerThread(
-                self._write_preview, capacity=_MOST_WAITING, name="previews"
+                lambda write: write(), capacity=_MOST_WAITING, name="previews"
             )
-        self._previews.put(preview)
+        self._previews.put(write_preview)
 
     def close(self) -> None:
         try:
@@ -168,9 +147,3 @@ class _TensorBoardRun:
                 self._previews.close()
         finally:
             self._file.close()
-
-    def _write_preview(self, preview: _Preview) -> None:
-        gif = animated_gif(
-            preview.path, frame_count=preview.frame_count, fps=preview.fps
-        )
-        self._file.write_gif(preview.tag, gif, step=preview.step, wall_time=time.time())

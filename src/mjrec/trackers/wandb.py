@@ -8,8 +8,7 @@ from typing import Any
 
 from ..errors import InvalidArgument
 from ..recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
-from .required_packages import require
-from .scalars import group_of, name_of, scalars_of
+from .services import group_of, name_of, require, scalars_of
 
 _STEPS = "total_steps"
 _VIDEO_STEPS = "video_total_steps"
@@ -50,7 +49,7 @@ class WandbTracker(Tracker):
         mode: str | None = None,
         **init: Any,
     ) -> None:
-        require("wandb", purpose="WandbTracker", extra="wandb")
+        require("wandb", purpose="WandbTracker")
         named = {"project": project, "mode": mode}
         self._init = {k: v for k, v in named.items() if v is not None} | init
         if run is not None and self._init:
@@ -64,20 +63,24 @@ class WandbTracker(Tracker):
                 f"other arguments to make one, got {run!r}."
             )
         self._given = run
-        self._service: _WandbRun | None = None
+        # The run of W&B while there are monitors, and the process that is to finish it.
+        self._service: Any = None
+        self._owner: int | None = None
+        self._axes: set[str] = set()
         self._last_episodes: dict[Run, FinishedEpisode | None] = {}
 
     def begin(self, run: Run) -> None:
         """Make the run of W&B, if need be."""
         if self._service is None:
-            self._service = self._open()
+            self._open()
         self._last_episodes[run] = None
 
     def episode(self, run: Run, episode: FinishedEpisode) -> None:
         """Log the episode's scalars."""
         self._last_episodes[run] = episode
-        values = {_STEPS: episode.total_steps, **scalars_of(episode)}
-        self._log(run, episode, values)
+        group = self._group(run, episode)
+        self._define(f"{group}/*", over=f"{group}/{_STEPS}")
+        self._log(group, {_STEPS: episode.total_steps, **scalars_of(episode)})
 
     def video(self, run: Run, video: FinishedVideo) -> None:
         """Log the file; W&B copies it."""
@@ -85,74 +88,46 @@ class WandbTracker(Tracker):
         import wandb
 
         episode = video.episode or self._last_episodes[run]
+        group, name = self._group(run, episode), name_of(video)
         picture = wandb.Video(
             str(video.path), caption=f"episode {video.episode_id}", format="mp4"
         )
+        self._define(f"{group}/{name}", over=f"{group}/{_VIDEO_STEPS}")
         steps = episode.total_steps if episode else 0
-        name = name_of(video)
-        self._log(run, episode, {_VIDEO_STEPS: steps, name: picture}, video=name)
+        self._log(group, {_VIDEO_STEPS: steps, name: picture})
 
     def end(self, run: Run) -> None:
         """Finish the run of W&B, if it was made here and this was its last monitor."""
         del self._last_episodes[run]
-        if not self._last_episodes and self._service is not None:
-            service, self._service = self._service, None
-            service.leave()
+        if self._last_episodes:
+            return
+        service, self._service = self._service, None
+        # A forked child would end its parent's.
+        if service is not None and self._owner == os.getpid():
+            service.finish()
 
-    def _open(self) -> _WandbRun:
+    def _open(self) -> None:
         import wandb
 
-        if self._given is not None:
-            return _WandbRun(self._given, is_ours=False)
-        if wandb.run is not None and not self._init:
-            return _WandbRun(wandb.run, is_ours=False)
-        # Without it, `init` returns the active run, and `leave` would finish that.
-        made = wandb.init(**{"reinit": "create_new", **self._init})
-        return _WandbRun(made, is_ours=True)
+        self._axes.clear()
+        self._owner = None
+        self._service = self._given
+        if self._service is None and not self._init:
+            self._service = wandb.run
+        if self._service is None:
+            # Without it, `init` returns the active run, and `end` would finish that.
+            self._service = wandb.init(**{"reinit": "create_new", **self._init})
+            self._owner = os.getpid()
 
-    def _log(
-        self,
-        run: Run,
-        episode: FinishedEpisode | None,
-        values: dict[str, Any],
-        *,
-        video: str | None = None,
-    ) -> None:
-        assert self._service is not None
+    def _group(self, run: Run, episode: FinishedEpisode | None) -> str:
         group = group_of(episode)
-        if run.env_index is not None:
-            group = f"{group}/env{run.env_index}"
-        self._service.log(group, values, video=video)
+        return group if run.env_index is None else f"{group}/env{run.env_index}"
 
+    def _define(self, metric: str, *, over: str) -> None:
+        if metric not in self._axes:
+            self._axes.add(metric)
+            self._service.define_metric(over)
+            self._service.define_metric(metric, step_metric=over)
 
-class _WandbRun:
-    """A run of W&B, and which axes it knows."""
-
-    def __init__(self, run: Any, *, is_ours: bool) -> None:
-        self._run = run
-        self._is_ours = is_ours
-        self._process_id = os.getpid()
-        self._groups: set[str] = set()
-
-    def log(
-        self, group: str, values: dict[str, Any], *, video: str | None = None
-    ) -> None:
-        if group not in self._groups:
-            self._groups.add(group)
-            self._define(group)
-        if video is not None and f"{group}/{video}" not in self._groups:
-            self._groups.add(f"{group}/{video}")
-            self._run.define_metric(
-                f"{group}/{video}", step_metric=f"{group}/{_VIDEO_STEPS}"
-            )
-        self._run.log({f"{group}/{name}": value for name, value in values.items()})
-
-    def leave(self) -> None:
-        # A forked child would end its parent's.
-        if self._is_ours and self._process_id == os.getpid():
-            self._run.finish()
-
-    def _define(self, group: str) -> None:
-        for steps in (_STEPS, _VIDEO_STEPS):
-            self._run.define_metric(f"{group}/{steps}")
-        self._run.define_metric(f"{group}/*", step_metric=f"{group}/{_STEPS}")
+    def _log(self, group: str, values: dict[str, Any]) -> None:
+        self._service.log({f"{group}/{name}": value for name, value in values.items()})

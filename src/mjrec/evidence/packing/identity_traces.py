@@ -14,11 +14,12 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 
 from ...errors import UnreadableFile
-from ...formats.hdf5_contents import contents_of_hdf5
 from ...formats.trajectory_hdf5 import SIGNATURE
 from .identity import Identity
 from .identity_matching import IdentityMatcher
@@ -29,6 +30,7 @@ _FILM = re.compile(rb"....ftyp|RIFF....AVI ", re.DOTALL)
 # An archive in an archive in an archive ...
 _DEEPEST = 8
 _PIECE = 1 << 24
+_ROWS_AT_ONCE = 1 << 14
 _LONGEST_NAME = 1 << 12
 
 # Where something is, and what is there: a name, or bytes; and whether these may hold
@@ -129,9 +131,35 @@ def _places_in_zip(where: str, content: bytes, depth: int) -> Iterator[_Place]:
 
 
 def _places_in_hdf5(where: str, content: bytes) -> Iterator[_Place]:
-    for place, something in contents_of_hdf5(content):
-        inside = f"{where}: {place}"
-        if isinstance(something, str | bytes):
-            yield inside, something, False
-        else:
-            yield inside, np.ascontiguousarray(something).tobytes(), True
+    """Yield what is in an HDF5 file; a place in it is `/group/dataset@attribute`."""
+    found: list[tuple[str, Any]] = []
+    with h5py.File(io.BytesIO(content), "r") as file:
+        file.visititems(lambda name, item: found.append((name, item)))
+        for name, item in [("", file), *found]:
+            inside = f"{where}: /{name}"
+            yield inside, name, False
+            for key in item.attrs:
+                yield inside, key, False
+                yield from _values_in(f"{inside}@{key}", item.attrs[key])
+            if isinstance(item, h5py.Dataset):
+                for field in item.dtype.names or ():
+                    yield inside, field, False
+                yield from _rows_in(inside, item)
+
+
+def _rows_in(where: str, dataset: Any) -> Iterator[_Place]:
+    if not dataset.shape:
+        yield from _values_in(where, dataset[()])
+        return
+    for start in range(0, dataset.shape[0], _ROWS_AT_ONCE):
+        yield from _values_in(where, dataset[start : start + _ROWS_AT_ONCE])
+
+
+def _values_in(where: str, value: Any) -> Iterator[_Place]:
+    array = np.asarray(value)
+    if array.dtype.kind not in "OUS":
+        yield where, np.ascontiguousarray(array).tobytes(), True
+        return
+    for item in array.reshape(-1).tolist():
+        text = item if isinstance(item, bytes) else str(item).encode(errors="replace")
+        yield where, text, False

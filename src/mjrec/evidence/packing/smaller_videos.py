@@ -19,6 +19,7 @@ from ...atomic_files import write_text
 from ...errors import PackError
 from ...formats.json_fields import read_object, unreadable
 from ...formats.video_metadata import metadata_path
+from ...rendering.jobs import Variant
 from ...rendering.pool import WorkerPool
 from ...rendering.progress import Progress
 from ...rendering.render_video import render_video
@@ -129,8 +130,8 @@ def _draw(
     out = folder / video.video.name
     render_video(
         [video.trajectory],
+        Variant(view=_view(video, scale)),
         workers=workers,
-        view=_view(video, scale),
         out=out,
         on_frame=on_frame,
     )

@@ -24,7 +24,7 @@ from ...formats.monitor_directory import (
     trajectory_prefix,
 )
 from ...formats.spans import FINISHED
-from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.trajectory import TrajectoryReader
 from ...formats.video_metadata import StepRuns
 from ...formats.video_names import view_of
 from ...frames import grid_shape

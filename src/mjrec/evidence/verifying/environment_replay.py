@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from ...environments.made_again import EnvironmentAgain
 from ...errors import InvalidArgument
-from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.trajectory import TrajectoryReader
 from ...recorder.step_arrays import StepArray, step_array
-from ...simulation.compiled_models import differing_from
-from ...simulation.state_steps import LiveStates
+from ...simulation.fields import differing_from
+from ...simulation.replay import LiveStates
 from .differences import Differences, compared_columns
 from .recorded_models import is_of_pictures
 from .step_checks import BLOCK_ROWS

@@ -18,14 +18,10 @@ from ...environments.made_again import (
     recorded_environment,
 )
 from ...errors import InvalidArgument, UnreadableFile
-from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.trajectory import TrajectoryReader
 from ...recorder.versions import versions
-from ...simulation.compiled_models import (
-    changed_model,
-    differing_from,
-    keeps_paths,
-    model_digest,
-)
+from ...simulation.fields import changed_model, differing_from, keeps_paths
+from ...simulation.model_store import model_digest
 from ..verification import Check, Level, Verdict
 from .differences import Differences, judged
 from .environment_replay import Replay, action_kinds, replay_episode

@@ -34,7 +34,7 @@ from ...errors import Error, UnreadableFile
 from ...formats.in_flight import is_in_flight, recordings_in_flight
 from ...formats.monitor_directory import episode_of, infix_of, iter_monitor_files
 from ...formats.trajectory_file import open_trajectory
-from ...simulation.mujoco_warnings import log_mujoco_warnings
+from ...simulation.warnings import log_mujoco_warnings
 from ..verification import Check, Level, Verdict
 from .episode_physics import EpisodePhysics
 from .name_checks import EnvironmentNames

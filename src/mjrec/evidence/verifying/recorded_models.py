@@ -18,13 +18,9 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ...errors import Error, UnreadableFile
-from ...formats.trajectory_reader import TrajectoryReader
-from ...simulation.compiled_models import (
-    are_same_models,
-    changed_model,
-    changed_names,
-    model_from_sources,
-)
+from ...formats.trajectory import TrajectoryReader
+from ...simulation.fields import changed_model, differing_fields
+from ...simulation.model_store import load_model, saved_model
 
 _ZIP = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 
@@ -132,8 +128,9 @@ class RecordedModels:
         if key not in self._compiled:
             _make_room(self._compiled)
             try:
-                model = model_from_sources(self._directory, name, size)
-                self._compiled[key] = model
+                # Without the compiled model's name: that is never loaded.
+                facts = {"xml": name, "bytes": size}
+                self._compiled[key] = load_model(self._directory, facts)
             except UnreadableFile as error:
                 self._compiled[key] = error
         return self._compiled[key]
@@ -146,10 +143,10 @@ def compare_models(
 
     The size of pictures does not count.
     """
-    if not changes and are_same_models(stored, present):
+    if not changes and saved_model(stored).tobytes() == saved_model(present).tobytes():
         return ModelComparison()
     try:
-        names = changed_names(changed_model(stored, changes), present)
+        names = differing_fields(changed_model(stored, changes), present)
     except (Error, ValueError) as error:
         return ModelComparison(trouble=str(error).rstrip("."))
     return ModelComparison(differing=tuple(n for n in names if n not in _SIZES))

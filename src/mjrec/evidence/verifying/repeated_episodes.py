@@ -8,7 +8,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from ...formats.trajectory_reader import TrajectoryReader
+from ...formats.trajectory import TrajectoryReader
 from ...json_text import dumps
 from .findings import Findings
 

@@ -16,8 +16,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.trajectory_reader import TrajectoryReader
-from ...simulation.snapshot_steps import (
+from ...formats.trajectory import TrajectoryReader
+from ...simulation.replay import (
     SnapshotSteps,
     column_names,
     live_snapshot,

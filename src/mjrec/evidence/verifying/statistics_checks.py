@@ -16,8 +16,8 @@ import numpy as np
 
 from ...errors import UnreadableFile
 from ...formats.journal import JournalEntry
+from ...formats.trajectory import TrajectoryReader
 from ...formats.trajectory_file import open_trajectory
-from ...formats.trajectory_reader import TrajectoryReader
 from ..layout import ENVIRONMENT, STATISTICS
 from ..verification import Check, Level
 from .choice_checks import check_choice

@@ -21,9 +21,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.trajectory import ModelChange
-from ...formats.trajectory_reader import TrajectoryReader
-from ...simulation.state_steps import StateSteps
+from ...formats.trajectory import ModelChange, TrajectoryReader
+from ...simulation.replay import StateSteps
 from .differences import Differences, compared_columns
 from .recorded_models import is_of_pictures
 

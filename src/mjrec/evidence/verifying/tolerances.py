@@ -26,7 +26,7 @@ import numpy as np
 
 from ...machine import machine_fingerprint
 from ...recorder.versions import versions
-from ...simulation.compiled_models import has_jumping_contacts, turns_by_rk4
+from ...simulation.replay import has_jumping_contacts, turns_by_rk4
 
 _TOLERANCE: Final = 1e-9
 _LIMIT: Final = 1e-2

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rendering on the GPU that a worker was given.
+
+Schedulers hand out GPUs in `CUDA_VISIBLE_DEVICES`, and EGL does not heed it: unless
+told otherwise, every worker of a machine draws on the same GPU, the first. Which of
+EGL's devices is the given one is not computed but asked, because the numbers are those
+of three programs: the scheduler's entry is CUDA's, or a GPU's UUID; EGL has an order of
+its own; and `MUJOCO_EGL_DEVICE_ID` counts EGL's devices in mujoco 3, and CUDA's where
+it can in mujoco 4. A child process sees the given GPU alone, and its driver says which
+of EGL's devices has a CUDA number then; another one draws, and its driver says on which
+device.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import GLError, InvalidArgument
+from .backends import backend_in_environment, rendering_is_off
+from .choice import conflict_with, set_backend
+from .probing import EglDevice, Probe, probe
+
+_LOG = logging.getLogger(__name__)
+
+CUDA_VISIBLE_DEVICES = "CUDA_VISIBLE_DEVICES"
+_CHOSEN = "MUJOCO_EGL_DEVICE_ID"
+_UUIDS = ("GPU-", "MIG-")
+_DOCTOR = "`mjrec doctor` shows EGL's devices; `nvidia-smi -L` shows the GPUs."
+
+
+@dataclass(frozen=True, kw_only=True)
+class GivenGpu:
+    """What came of rendering on a given GPU.
+
+    Attributes:
+        gpu: the one that was given, as an entry of `CUDA_VISIBLE_DEVICES`; empty where
+            that variable names none.
+        device: EGL's device that draws; None where it is not the given GPU, or nobody
+            can tell.
+        gl_renderer: what draws, in OpenGL's words; empty where nothing does.
+        warning: why it does not draw on that GPU, and what to do; empty if it does.
+    """
+
+    gpu: str
+    device: EglDevice | None = None
+    gl_renderer: str = ""
+    warning: str = ""
+
+
+def render_on_given_gpu(gpu: str | None = None, *, required: bool = False) -> GivenGpu:
+    """Let this process, and its children, render on the GPU that it was given.
+
+    Afterwards `MUJOCO_EGL_DEVICE_ID` names EGL's device of that GPU, and `MUJOCO_GL`
+    is `egl`, unless it turns rendering off: then that holds for this process, and
+    whoever draws later takes the device. Where the GPU cannot be drawn on, no variable
+    changes, and what is wrong is logged as one warning. Takes a second or two, in child
+    processes. Call it before anything imports mujoco, dm_control or OpenGL.
+
+    Args:
+        gpu: one entry as in `CUDA_VISIBLE_DEVICES`: a number ("3"), or the UUID of a
+            GPU ("GPU-1a2b...") or of a part of one ("MIG-..."). None is the first
+            entry of that variable, where it is set, else CUDA's first GPU.
+        required: whether it is an error if that GPU cannot be drawn on.
+
+    Raises:
+        InvalidArgument: `gpu` is no entry, or several.
+        UnknownName: `MUJOCO_GL` names no backend that there is.
+        GLError: mujoco, dm_control or PyOpenGL was imported with another backend, or
+            one of them has begun to draw; or, if it is required, the GPU cannot be
+            drawn on.
+    """
+    entry = _entry(gpu)
+    _refuse_latecomers()
+    found, number = _found(entry, os.environ)
+    if found.warning and required:
+        raise GLError(found.warning)
+    if found.warning:
+        _LOG.warning("%s", found.warning)
+    if found.device is not None:
+        os.environ[_CHOSEN] = str(number)
+        if not rendering_is_off(os.environ):
+            set_backend("egl")
+        _LOG.info(
+            "Rendering on GPU %s: EGL device %d%s, %s.",
+            *(entry, found.device.index),
+            f" ({found.device.uuid})" if found.device.uuid else "",
+            found.gl_renderer,
+        )
+    return found
+
+
+def visible_gpus(
+    environ: Mapping[str, str] | None = None, *, devices: Path = Path("/dev")
+) -> list[str]:
+    """Return the NVIDIA GPUs of this machine that may be handed out to workers.
+
+    Each is an entry for a worker's `CUDA_VISIBLE_DEVICES`. They are this process's own
+    entries; where the variable is not set, CUDA's numbers of the GPUs whose device
+    files this process may open. A container or a job sees only its own of these, and
+    CUDA counts them from 0.
+
+    Args:
+        environ: the environment variables; this process's, if None.
+        devices: the directory of device files.
+    """
+    entries = _entries(os.environ if environ is None else environ)
+    if entries is not None:
+        return entries
+    files = [file for file in devices.glob("nvidia[0-9]*") if _can_be_opened(file)]
+    return [str(number) for number in range(len(files))]
+
+
+def device_of_gpu(devices: Sequence[EglDevice], gpu: str) -> EglDevice | None:
+    """Return EGL's device of a GPU; None where that cannot be told.
+
+    Args:
+        devices: EGL's, as a process sees them to which CUDA shows only that GPU. So
+            the one that has a CUDA number is meant, whichever number that is.
+        gpu: an entry of `CUDA_VISIBLE_DEVICES`. CUDA takes the beginning of a UUID.
+    """
+    named = [
+        device
+        for device in devices
+        if gpu.startswith("GPU-") and device.uuid.lower().startswith(gpu.lower())
+    ]
+    numbered = [device for device in devices if device.cuda_id is not None]
+    for candidates in (named, numbered):
+        if len(candidates) == 1:
+            return candidates[0]
+    return None
+
+
+def _entry(gpu: str | None) -> str:
+    if gpu is None:
+        entries = _entries(os.environ)
+        if entries is None:
+            return "0"
+        return entries[0] if entries else ""
+    entry = str(gpu).strip()
+    if entry.isdecimal() or (entry.startswith(_UUIDS) and "," not in entry):
+        return entry
+    raise InvalidArgument(
+        f"gpu must be one entry as in {CUDA_VISIBLE_DEVICES}, a number or a UUID that "
+        f"begins with GPU- or MIG-, got {gpu!r}."
+    )
+
+
+def _entries(environ: Mapping[str, str]) -> list[str] | None:
+    """Return the entries of `CUDA_VISIBLE_DEVICES`; None where it is not set."""
+    text = environ.get(CUDA_VISIBLE_DEVICES)
+    if text is None:
+        return None
+    entries = []
+    for entry in (part.strip() for part in text.split(",")):
+        # CUDA ignores whatever follows an entry that it does not understand.
+        if not (entry.isdecimal() or entry.startswith(_UUIDS)):
+            break
+        entries.append(entry)
+    return entries
+
+
+def _can_be_opened(file: Path) -> bool:
+    # What a control group forbids is seen only by trying.
+    try:
+        os.close(os.open(file, os.O_RDWR | os.O_CLOEXEC))
+    except OSError:
+        return False
+    return True
+
+
+def _refuse_latecomers() -> None:
+    """Raise GLError where the choice would come too late in this process."""
+    conflict = conflict_with("egl")
+    if conflict and not rendering_is_off(os.environ):
+        raise GLError(f"{conflict.cause} {conflict.fix}")
+    # Mujoco reads the number when it makes its first context, dm_control at import.
+    mujoco_draws = getattr(sys.modules.get("mujoco.egl"), "EGL_DISPLAY", None)
+    dm_control = "dm_control._render.pyopengl.egl_renderer" in sys.modules
+    if mujoco_draws is not None or dm_control:
+        raise GLError(
+            "This process has begun to draw by EGL, and cannot change to another GPU "
+            "any more. Call render_on_given_gpu before anything imports dm_control or "
+            "draws with mujoco."
+        )
+
+
+def _found(gpu: str, environ: Mapping[str, str]) -> tuple[GivenGpu, int | None]:
+    """Return what came of it, and the number for `MUJOCO_EGL_DEVICE_ID`."""
+    if not gpu:
+        warning = (
+            "This process was given no GPU for rendering: CUDA_VISIBLE_DEVICES names "
+            "none. Ask whoever starts it for one."
+        )
+        return GivenGpu(gpu=gpu, warning=warning), None
+    asked = f"GPU {gpu} was given for rendering"
+    backend = None if rendering_is_off(environ) else backend_in_environment(environ)
+    if backend not in (None, "egl"):
+        warning = (
+            f"{asked}, and MUJOCO_GL={backend} cannot be told on which GPU to render: "
+            "unset MUJOCO_GL, or set it to egl."
+        )
+        return GivenGpu(gpu=gpu, warning=warning), None
+    device, alone = _device(gpu, environ)
+    if device is None:
+        warning = f"{asked}, and {_lack_of_device(alone)}"
+        return GivenGpu(gpu=gpu, gl_renderer=alone.gl_renderer, warning=warning), None
+    tried = alone
+    for number, tried in _tries(device, gpu, alone, environ):
+        used = [each for each in tried.devices if each.in_use]
+        if not tried.renders or tried.software or not used:
+            continue
+        if used[0].index == device.index:
+            found = GivenGpu(gpu=gpu, device=used[0], gl_renderer=tried.gl_renderer)
+            return found, number
+    why = f"it does not render. {tried.cause} {tried.fix}".strip()
+    if tried.renders:
+        why = "mujoco draws on another device whatever MUJOCO_EGL_DEVICE_ID is."
+    warning = f"{asked}, which is EGL's {_shown(device)}, and {why} {_DOCTOR}"
+    return GivenGpu(gpu=gpu, warning=warning), None
+
+
+def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Probe]:
+    """Return EGL's device of a GPU, and what a process found that sees it alone."""
+    alone = probe("egl", environ={**environ, CUDA_VISIBLE_DEVICES: gpu, _CHOSEN: "0"})
+    device = device_of_gpu(alone.devices, gpu)
+    hardware = [device for device in alone.devices if not device.software]
+    if device is not None or len(hardware) != 1:
+        return device, alone
+    if gpu.startswith("GPU-") and hardware[0].uuid:
+        return None, alone
+    # The only one there is may be the GPU in spite of that: of another maker, or of a
+    # driver without its CUDA part, so that nobody has a number.
+    everything = {k: v for k, v in environ.items() if k != CUDA_VISIBLE_DEVICES}
+    seen = probe("egl", environ={**everything, _CHOSEN: "0"})
+    is_known_to_cuda = any(device.cuda_id is not None for device in seen.devices)
+    return None if is_known_to_cuda else hardware[0], alone
+
+
+def _tries(
+    device: EglDevice, gpu: str, alone: Probe, environ: Mapping[str, str]
+) -> Iterator[tuple[int, Probe]]:
+    """Yield numbers that may mean a device to mujoco, the likely first, and try them.
+
+    It is the place in EGL's list for mujoco 3. For mujoco 4 it is a place in
+    `CUDA_VISIBLE_DEVICES`, or CUDA's number, or the place in a list of its own.
+    """
+    if environ.get(CUDA_VISIBLE_DEVICES) == gpu:
+        yield 0, alone
+    for number in dict.fromkeys([device.index, *range(len(alone.devices))]):
+        yield number, probe("egl", environ={**environ, _CHOSEN: str(number)})
+
+
+def _lack_of_device(alone: Probe) -> str:
+    """Return why none of EGL's devices is the given GPU."""
+    hardware = [device for device in alone.devices if not device.software]
+    if not alone.devices:
+        return f"EGL has no device. {alone.cause} {alone.fix}".strip()
+    if not hardware:
+        on = f" ({alone.gl_renderer})" if alone.gl_renderer else ""
+        way = alone.warning() or (
+            "There is no GPU here that EGL finds: no device file in /dev."
+        )
+        return f"EGL has only the CPU{on}. {way}"
+    return (
+        f"none of EGL's {len(hardware)} GPUs is that: "
+        f"{'; '.join(map(_shown, hardware))}. Parts of a GPU (MIG) mostly have no "
+        f"graphics; what CUDA does not show cannot be found. {_DOCTOR}"
+    )
+
+
+def _shown(device: EglDevice) -> str:
+    cuda = "" if device.cuda_id is None else f"CUDA device {device.cuda_id}"
+    known = ", ".join(filter(None, [device.uuid, device.device_file, cuda]))
+    return f"device {device.index}" + (f" ({known})" if known else "")

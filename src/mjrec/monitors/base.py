@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every monitor has beside the environment's own interface: gym's names."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVar
+
+from ..environments.scenes import Scenes
+from ..errors import NotPicklable, PicturesDiffer, RenderError
+from ..recorder.declared_rate import declared_rate
+from ..recorder.deferred_video import DeferredVideo
+from ..recorder.endings import last_error
+from ..recorder.exit_guard import ExitGuard
+from ..recorder.finisher import Finisher
+from ..recorder.options import (
+    DEFERRED,
+    LIVE,
+    OFF,
+    WARN,
+    RecorderOptions,
+    RenderingChoice,
+)
+from ..recorder.recorder import Recorder
+from ..recorder.stats_recorder import StatsRecorder
+from ..recorder.subject import Subject
+from ..recorder.video_recorder import VideoRecorder
+from ..rendering.background import Background
+from ..simulation.inside import simulation_time
+from .cameras import CameraPictures
+from .progress import render_progress
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+_NO_SIMULATION = "it has no MuJoCo model and data that can be seen"
+
+
+class Closable:
+    """A context manager that waits for its videos unless it is left by an exception."""
+
+    _options: RecorderOptions
+    _reported_failures = False
+
+    @property
+    def directory(self) -> Path:
+        """The monitor directory, absolute."""
+        raise NotImplementedError
+
+    def close(self, *, wait: bool = True) -> None:
+        """Finish the recordings, then close the environment; `wait` for all videos."""
+        raise NotImplementedError
+
+    def _note_error(self, error: BaseException) -> None:
+        """Note that the environment, or its user, has raised."""
+        raise NotImplementedError
+
+    def _raise_failures(self, failures: Mapping[str, str]) -> None:
+        """Say once why videos could not be rendered.
+
+        Args:
+            failures: the reasons, by the names of the videos.
+
+        Raises:
+            RenderError: there are some, and `on_error` is "raise".
+        """
+        if not failures or self._reported_failures:
+            return
+        self._reported_failures = True
+        error = RenderError(self.directory, failures)
+        if self._options.on_error != WARN:
+            raise error
+        logger.warning("%s", error)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc_info: Any) -> Literal[False]:
+        _, first, _ = exc_info
+        if first is not None:
+            self._note_error(first)
+        try:
+            # Whoever leaves by an exception does not wait for videos.
+            self.close(wait=first is None)
+        except Exception as second:
+            if first is None:
+                raise
+            # What went wrong first is what the user needs to see.
+            first.add_note(f"Closing the monitor failed too: {second}")
+        return False
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> NoReturn:
+        raise NotPicklable(
+            f"A {type(self).__name__} cannot be pickled or copied: it writes files, "
+            "and two would write the same ones. Make it in the process that uses it, "
+            "inside the function that makes the environment: "
+            "lambda: mjrec.Monitor(gymnasium.make(...), directory, resume=True)."
+        )
+
+
+class MonitorBase(Closable):
+    """The part of a monitor that does not depend on the framework.
+
+    Attributes:
+        allows_early_reset: whether the framework's contract allows a reset in
+            mid-episode.
+    """
+
+    allows_early_reset: ClassVar[bool]
+    # Why there are no states, where there are none.
+    _no_simulation: ClassVar[str] = _NO_SIMULATION
+
+    _recorder: Recorder
+    _guard: ExitGuard
+
+    @property
+    def directory(self) -> Path:
+        """The monitor directory, absolute."""
+        return self._recorder.directory
+
+    @property
+    def infix(self) -> str:
+        """What the names of this monitor's files have in the middle."""
+        return self._recorder.infix
+
+    @property
+    def episode_id(self) -> int:
+        """The number of the next episode; it rises at each reset, as in gym."""
+        return self._recorder.episode_id
+
+    @property
+    def stats_recorder(self) -> StatsRecorder:
+        """Counts steps and rewards."""
+        return self._recorder.stats_recorder
+
+    @property
+    def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
+        """Records the running episode (or not); None before the first reset."""
+        return self._recorder.video_recorder
+
+    def set_monitor_mode(self, mode: str | None) -> None:
+        """Set the type of the episodes from the next reset on.
+
+        Args:
+            mode: "training", "evaluation", or None for training.
+
+        Raises:
+            InvalidArgument: it is something else.
+        """
+        self._recorder.set_mode(mode)
+
+    def get_total_steps(self) -> int:
+        """Return the number of all steps, those of unfinished episodes too."""
+        return self._recorder.stats_recorder.total_steps
+
+    def get_episode_rewards(self) -> list[float]:
+        """Return the sum of rewards of each complete episode."""
+        return list(self._recorder.stats_recorder.episode_rewards)
+
+    def get_episode_lengths(self) -> list[int]:
+        """Return the steps of each complete episode."""
+        return list(self._recorder.stats_recorder.episode_lengths)
+
+    def model_changed(self) -> None:
+        """Say that a texture, a height field or a mesh was changed in mid-episode.
+
+        All else that a picture depends on is noticed by itself, and at every reset
+        everything is. The next recorded frame shows the change; what only the physics
+        depend on (masses, damping) is then in the trajectory too, for replays.
+        """
+        self._recorder.model_changed()
+
+    def forget_pictures(self) -> None:
+        """Let the next episode look as if it were the environment's first.
+
+        Gymnasium places its free camera at the first picture, and infinite planes and
+        tracking cameras go by the picture before: an episode looks other as the tenth
+        than as the first. After this call, between two episodes, the next is shown as
+        by an environment that has just been made. Where pictures are drawn live it
+        changes nothing.
+        """
+        self._recorder.forget_pictures()
+
+    def close(self, *, wait: bool = True) -> None:
+        """Finish the recordings, then close the environment. Idempotent.
+
+        Args:
+            wait: whether to wait, with a progress bar on a terminal, until all videos
+                are rendered; else what is not rendered yet is left pending, and
+                `mjrec render DIR` makes it. Ctrl-C while it waits is the same.
+
+        Raises:
+            EncoderError: the running video could not be finished; all else is.
+            RenderError: videos could not be rendered; all else is done, and their
+                trajectories are kept.
+            FileNotWritten: the disk is full; the next call tries again.
+        """
+        try:
+            if wait:
+                with render_progress(title="rendering ") as on_progress:
+                    self._recorder.finish(on_progress)
+        finally:
+            self._guard.close()
+        if wait:
+            self._raise_failures(self._recorder.failures())
+
+    def _note_error(self, error: BaseException) -> None:
+        self._recorder.note_error(error)
+
+    def _reset_by(self, reset: Callable[[], T]) -> T:
+        """Return what the environment's reset returns; note it where it raises."""
+        recorder = self._recorder
+        recorder.before_reset()
+        try:
+            with recorder.resetting():
+                return reset()
+        except BaseException as error:
+            recorder.note_error(error)
+            raise
+
+    def _open(
+        self,
+        env: Any,
+        directory: str | os.PathLike[str],
+        options: RecorderOptions,
+        *,
+        env_id: str,
+        view: CameraPictures,
+        scenes: Callable[[], Scenes],
+        close_environment: Callable[[Any], None],
+        env_index: int | None = None,
+        rendering: Callable[[Path], Finisher] | None = None,
+    ) -> None:
+        """Open the directory; from here on the environment is this monitor's.
+
+        What renders is made by `rendering`, or is a service of this monitor's own.
+        """
+        known = scenes()
+        # Clips run beside episodes, and a source of states has one reader only.
+        clip_states = scenes().states if options.has_clips else None
+        choice = rendering_choice(
+            options.render, known, env_id, no_simulation=self._no_simulation
+        )
+        if choice.mode != DEFERRED or options.workers == 0:
+            rendering = None
+        elif rendering is None:
+            rendering = functools.partial(
+                Background, workers=options.workers, strict=options.strict
+            )
+        self._options = options
+        self._recorder = Recorder(
+            directory,
+            subject=Subject(
+                env_id=env_id,
+                env_index=env_index,
+                pictures=view.pictures,
+                further_pictures=view.further,
+                cameras=view.cameras,
+                clock=functools.partial(simulation_time, env),
+                declared=functools.partial(declared_rate, env),
+                rendering=choice,
+                states=known.states,
+                clip_states=clip_states,
+                environment=known.environment,
+                random_state=known.random_state,
+            ),
+            options=options,
+            finisher=rendering,
+        )
+        closings = [self._recorder.close]
+        closings += [each.close for each in (known.states, clip_states) if each]
+        closings.append(functools.partial(close_environment, env))
+        self._guard = ExitGuard(
+            self,
+            functools.partial(call_all, closings),
+            at_exit=functools.partial(_note_last_error, self._recorder),
+        )
+
+    def _begin(
+        self, *, seed: Any = None, options: Any = None, observation: Any = None
+    ) -> None:
+        """Record that the environment has been reset."""
+        self._recorder.reset(seed=seed, options=options, observation=observation)
+        video = self._recorder.video_recorder
+        if isinstance(video, VideoRecorder) and video.enabled:
+            # Drawing has loaded OpenGL by now, which tears itself down at exit.
+            self._guard.run_first_at_exit()
+
+
+def rendering_choice(
+    asked: str | None,
+    scenes: Scenes,
+    env_id: str,
+    *,
+    no_simulation: str = _NO_SIMULATION,
+) -> RenderingChoice:
+    """Return when the pictures of an environment are drawn.
+
+    Args:
+        asked: `"deferred"`, `"live"`, `"off"`, or None for deferred where it is known
+            that the pictures follow from the states, else live.
+        scenes: what is known of the environment.
+        env_id: its name, for messages.
+        no_simulation: why there are no states, where there are none.
+
+    Raises:
+        PicturesDiffer: deferred was asked for, and the pictures do not follow.
+    """
+    if asked in (LIVE, OFF):
+        return RenderingChoice(mode=str(asked), is_forced=True)
+    obstacle = no_simulation if scenes.states is None else scenes.obstacle
+    if obstacle is None:
+        logger.info("The videos of %s are rendered from recorded states.", env_id)
+        return RenderingChoice(mode=DEFERRED, is_forced=asked == DEFERRED)
+    if asked == DEFERRED:
+        raise PicturesDiffer(
+            f'render="deferred" was asked for, and what {env_id} shows cannot be made '
+            f'from its recorded state: {obstacle}. Use render="live" (or None, which '
+            "chooses)."
+        )
+    logger.info("The videos of %s are drawn live: %s.", env_id, obstacle)
+    return RenderingChoice(mode=LIVE, reason=obstacle)
+
+
+def call_all(calls: Iterable[Callable[[], object]]) -> None:
+    """Call all, also where one raises; then raise what the first has raised."""
+    first: BaseException | None = None
+    for call in calls:
+        try:
+            call()
+        except BaseException as error:
+            first = first or error
+    if first is not None:
+        raise first
+
+
+def _note_last_error(recorder: Recorder) -> None:
+    error = last_error()
+    if error is not None:
+        recorder.note_error(error)

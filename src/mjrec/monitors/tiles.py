@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One video of all sub-environments of a vector environment, side by side."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..environments.gymnasium_pictures import gymnasium_pictures
+from ..errors import InvalidArgument, NoPictures
+from ..formats.monitor_directory import Infix, video_prefix
+from ..recorder.declared_rate import declared_rate
+from ..recorder.endings import CLOSE, RESET, ending
+from ..recorder.live_videos import LiveVideos
+from ..recorder.options import OFF, WARN, RecorderOptions
+from ..recorder.video_recorder import VideoRecorder
+from ..schedules import disable_videos, to_schedule
+from ..simulation.inside import simulation_time
+from .base import MonitorBase
+from .cameras import Tiles
+
+logger = logging.getLogger(__name__)
+
+
+def has_videos(options: RecorderOptions) -> bool:
+    """Tell whether there are videos at all."""
+    schedule = to_schedule(options.video_callable)
+    return options.render != OFF and schedule is not disable_videos
+
+
+def vector_tiles(
+    envs: Sequence[Any], options: RecorderOptions, view: Mapping[str, Any]
+) -> Tiles | None:
+    """Return what tiled videos of sub-environments show; None where there are none.
+
+    Args:
+        envs: the sub-environments.
+        options: what was asked for.
+        view: `camera`, `height` and `width`; of several cameras the first is taken.
+
+    Raises:
+        InvalidArgument: nothing says which episodes the videos are to follow.
+        NoPictures: not all sub-environments can be drawn.
+    """
+    if not options.tiled:
+        return None
+    if options.keep is not None or options.step_trigger is not None:
+        raise InvalidArgument(
+            "tiled=True records all sub-environments during the episodes that "
+            "video_callable chooses of the first, and with keep or step_trigger no "
+            "episode is chosen when it begins. Use video_callable."
+        )
+    if not has_videos(options):
+        return None
+    camera = view["camera"]
+    if isinstance(camera, list | tuple) and camera:
+        view = {**view, "camera": camera[0]}
+    tiles = Tiles([gymnasium_pictures(each, **view) for each in envs])
+    if tiles.render_mode is None:
+        raise NoPictures(
+            "tiled=True was asked for, and a tiled video is drawn while the "
+            "environments step, which needs pictures of each of them: make them with "
+            'render_mode="rgb_array", and with the camera and the size that are wanted.'
+        )
+    return tiles
+
+
+class TiledVideo:
+    """Records all sub-environments while the schedule has an episode of the first.
+
+    Args:
+        first: the monitor of the first sub-environment, whose manifest lists the
+            videos.
+        tiles: of all.
+        options: what was asked for.
+        env: the first sub-environment, which tells the rate.
+    """
+
+    def __init__(
+        self, first: MonitorBase, tiles: Tiles, options: RecorderOptions, env: Any
+    ) -> None:
+        self._first = first
+        self._tiles = tiles
+        self._options = options
+        self._env = env
+        self._video: VideoRecorder | None = None
+        # The episode that the frames are of, and how far it has come.
+        self._episode_id = -1
+        self._progress: dict[str, Any] = {}
+        self._ending: dict[str, Any] | None = None
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether a video is running."""
+        return self._video is not None
+
+    def take_last(self) -> None:
+        """Take the frame of the last step, if it was left out."""
+        if self._video is not None and self._ending is None:
+            self._videos(self._video).take_last()
+
+    def after_reset(self) -> None:
+        """Follow the first sub-environment, which has just been reset."""
+        episode_id = self._first.episode_id - 1
+        if self._video is not None and episode_id == self._episode_id:
+            # Reset before any step: the number stays, the frame is another.
+            self._video.discard()
+            self._video = None
+        self._end_early(RESET)
+        self._begin(episode_id)
+
+    def after_step(self, *, terminated: bool, truncated: bool) -> None:
+        """Record a step of all sub-environments.
+
+        Args:
+            terminated: the task has ended the episode of the first.
+            truncated: a limit from outside has.
+        """
+        episode_id = self._first.episode_id - 1
+        is_over = terminated or truncated
+        self._ending = None
+        if self._video is not None:
+            stats = self._first.stats_recorder
+            self._progress = {"length": stats.steps, "reward": stats.rewards}
+            if is_over:
+                self._progress["length"] = stats.episode_lengths[-1]
+                self._progress["reward"] = stats.episode_rewards[-1]
+            if episode_id != self._episode_id:
+                # SAME_STEP: the first tile shows the next episode already.
+                self._video.metadata["final_frame"] = "missing"
+            self._videos(self._video).take(is_there=True, last=is_over)
+        if is_over:
+            flags = {"terminated": terminated, "truncated": truncated}
+            self._end({"complete": True, **flags})
+        if episode_id != self._episode_id:
+            self._begin(episode_id)
+
+    def note_error(self, error: BaseException) -> None:
+        """Note that something was raised; the video is marked with it if it ends so."""
+        if self._ending is None:
+            self._ending = ending(error)
+
+    def close(self) -> None:
+        """Finish the running video. Idempotent."""
+        self._end_early(CLOSE)
+
+    def _begin(self, episode_id: int) -> None:
+        self._episode_id = episode_id
+        self._progress = {"length": 0, "reward": 0.0}
+        self._ending = None
+        video = self._first.video_recorder
+        if video is None or not video.enabled:
+            return
+        infix = Infix.parse(self._first.infix)
+        assert infix is not None
+        options = self._options
+        self._video = VideoRecorder(
+            self._tiles,
+            base_path=self._first.directory
+            / f"{video_prefix(infix, episode_id)}.tiled",
+            metadata={
+                **self._first._recorder.live_video_facts(),
+                "tiled": True,
+                "sub_environments": len(self._tiles.sources),
+            },
+            fps=options.fps,
+            max_fps=options.max_fps,
+            frame_hashes=True,
+            clock=functools.partial(simulation_time, self._env),
+            declared=functools.partial(declared_rate, self._env),
+            facts=self._tiles.facts,
+            strict=options.strict,
+        )
+        self._videos(self._video).begin()
+
+    def _videos(self, video: VideoRecorder) -> LiveVideos:
+        return LiveVideos([video], tolerates=self._tolerates)
+
+    def _tolerates(self, error: Exception) -> bool:
+        if self._options.on_error != WARN or self._video is None:
+            return False
+        logger.warning("The tiled video %s: %s", self._video.path, error)
+        return True
+
+    def _end_early(self, reason: str) -> None:
+        self._end({"complete": False, **(self._ending or {"reason": reason})})
+
+    def _end(self, facts: Mapping[str, Any]) -> None:
+        if self._video is not None:
+            self._videos(self._video).end({**facts, **self._progress}, self._list)
+
+    def _list(self, video: VideoRecorder) -> None:
+        self._video = None
+        self._first._recorder.add_video(video)

@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a recording was made with: packages, machine, variables, command line, code.
+
+Looking takes a third of a second and more, nearly all of it in other processes. It is
+done once, on a thread, and asked for when a manifest is written.
+
+Reading the files of a hundred packages keeps Python busy for a fifth of a second. On a
+thread of a process that simulates this costs more than its share: whenever a step lets
+go of the interpreter's lock, the thread keeps it for five milliseconds, and a
+simulation stands still until all is read (200 steps of HalfCheetah in a tenth of a
+second instead of 1600). So a process of its own, `python -m` this module, reads them.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.metadata
+import json
+import logging
+import os
+import platform
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .child_python import environment_of_child, python_command, take_standard_output
+from .machine import cpu_flags, cpu_model, machine_fingerprint, usable_cpus
+
+logger = logging.getLogger(__name__)
+
+# What changes pictures, the last bits of numbers, or which library is loaded.
+_VARIABLES = frozenset(
+    {
+        *("CUDA_VISIBLE_DEVICES", "DISPLAY", "GLIBC_TUNABLES", "LD_LIBRARY_PATH"),
+        *("LD_PRELOAD", "PYOPENGL_PLATFORM", "PYTHONHASHSEED", "PYTHONPATH"),
+    }
+)
+_PREFIXES = (
+    *("EGL_", "GALLIUM_", "GALLIVM_", "LIBGL_", "LP_", "MESA_", "MJREC_", "MKL_"),
+    *("MUJOCO_", "NVIDIA_", "OMP_", "OPENBLAS_", "__EGL_"),
+)
+# What an installer adds to the files of a wheel, or changes.
+_OF_INSTALLATION = ("INSTALLER", "REQUESTED", "RECORD", "direct_url.json")
+_SECONDS_FOR_PACKAGES = 60.0
+_SECONDS_FOR_GIT = 5.0
+# Leaving is quick.
+_SECONDS_AT_THE_END = 2.0
+
+
+class Provenance:
+    """What a process records with, found on a thread of its own.
+
+    Args:
+        root: the directory of the user's code.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._found: dict[str, Any] | None = None
+        # What can be overwritten later is taken at once.
+        self._command = list(sys.orig_argv)
+        self._directory = str(Path.cwd())
+        self._variables = {
+            name: value
+            for name, value in sorted(os.environ.items())
+            if name in _VARIABLES or name.startswith(_PREFIXES)
+        }
+        self._thread = threading.Thread(
+            target=self._look, name="mjrec-provenance", daemon=True
+        )
+        self._thread.start()
+
+    def found(self, *, wait: bool) -> Mapping[str, Any] | None:
+        """Return what was found.
+
+        Args:
+            wait: whether to wait for it, two seconds at most.
+
+        Returns:
+            None if it is not there yet, or could not be found. Else `command`,
+            `working_directory`, `packages` (names to `version` and `record_sha256`,
+            the sha256 of what the wheel's own list of its files says, or None),
+            `machine` (see `machine_fingerprint`), `cpu` (`model`, `flags`, `usable`),
+            `system`, `python`, `variables`, and `code` (`root`, `commit`, `dirty`,
+            `remote`) or None where the user's code is in no git repository, or git
+            has not answered yet.
+        """
+        if wait:
+            self._thread.join(_SECONDS_AT_THE_END)
+        return self._found if wait or not self._thread.is_alive() else None
+
+    def _look(self) -> None:
+        try:
+            found = {
+                "command": self._command,
+                "working_directory": self._directory,
+                "python": sys.version,
+                "packages": installed_packages(),
+                "machine": dict(machine_fingerprint()),
+                "cpu": {
+                    "model": cpu_model(),
+                    "flags": list(cpu_flags()),
+                    "usable": usable_cpus(),
+                },
+                "system": platform.platform(),
+                "variables": self._variables,
+            }
+            # Of a large repository git says it late, or never.
+            self._found = {**found, "code": None}
+            self._found = {**found, "code": _code(self._root)}
+        except Exception:
+            # No recording is to fail of it.
+            logger.warning("The provenance is not known.", exc_info=True)
+
+
+@functools.cache
+def look_around() -> Provenance:
+    """Return the provenance of this process, which is looked for from now on."""
+    return Provenance(_code_root())
+
+
+# A child that is forked while the thread looks has no such thread.
+os.register_at_fork(after_in_child=look_around.cache_clear)
+
+
+def _code_root() -> Path:
+    """Return where the user's program is: its script's directory, or the working one.
+
+    What is run by its name, or with `-m`, from among what is installed, is not it.
+    """
+    file = getattr(sys.modules.get("__main__"), "__file__", None)
+    if file is None:
+        return Path.cwd()
+    directory = Path(file).absolute().parent
+    is_installed = directory.is_relative_to(sys.prefix) or "site-packages" in (
+        directory.parts
+    )
+    return Path.cwd() if is_installed else directory
+
+
+def _code(root: Path) -> dict[str, Any] | None:
+    commit = _git(root, "rev-parse", "HEAD")
+    top = _git(root, "rev-parse", "--show-toplevel")
+    if commit is None or top is None:
+        return None
+    changes = _git(root, "status", "--porcelain", "--untracked-files=no")
+    return {
+        "root": top,
+        "commit": commit,
+        "dirty": None if changes is None else bool(changes),
+        "remote": _git(root, "config", "--get", "remote.origin.url"),
+    }
+
+
+def _git(root: Path, *arguments: str) -> str | None:
+    """Return what git says; None where there is none, no repository, or no answer."""
+    try:
+        done = subprocess.run(
+            # A repository's own configuration could name a program to run.
+            ["git", "-c", "core.fsmonitor=false", *arguments],
+            cwd=root,
+            env={**os.environ, "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_SECONDS_FOR_GIT,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.decode(errors="replace").strip()
+
+
+def installed_packages() -> dict[str, Any]:
+    """Return what is installed where this process looks for modules.
+
+    Waits for a process that finds it out, without keeping other threads from running.
+
+    Returns:
+        By the names of the packages, in their order, `version` and `record_sha256`:
+        the sha256 of what the wheel's own list of its files says, None without one.
+    """
+    places = [entry for entry in sys.path if isinstance(entry, str)]
+    # One that is part of another program has no Python to start.
+    if sys.executable and not getattr(sys, "frozen", False):
+        try:
+            finished = subprocess.run(
+                python_command(__name__),
+                input=json.dumps(places).encode(),
+                env=environment_of_child(os.environ),
+                capture_output=True,
+                timeout=_SECONDS_FOR_PACKAGES,
+                check=True,
+            )
+            return dict(json.loads(finished.stdout))
+        except (OSError, RuntimeError, subprocess.SubprocessError, ValueError) as error:
+            logger.debug("Packages are looked for in this process: %s", error)
+    return _packages_in(places)
+
+
+def _packages_in(places: Sequence[str]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for distribution in importlib.metadata.distributions(path=list(places)):
+        # Parsed at each access.
+        metadata = distribution.metadata
+        name = metadata["Name"]
+        # The first on the path is the one that is imported.
+        if name and name not in found:
+            found[name] = {
+                "version": metadata["Version"],
+                "record_sha256": _record_sha256(distribution),
+            }
+    return dict(sorted(found.items(), key=lambda item: item[0].lower()))
+
+
+def _record_sha256(distribution: importlib.metadata.Distribution) -> str | None:
+    """Return the sha256 of the sorted lines of what a wheel says it consists of.
+
+    Lines of what an installer adds, such as compiled Python, are left out, so that two
+    installations of one wheel have the same.
+    """
+    text = distribution.read_text("RECORD")
+    if not text:
+        return None
+    lines = (line.strip() for line in text.splitlines())
+    own = sorted(line for line in lines if line and not _is_of_installation(line))
+    return hashlib.sha256("\n".join(own).encode()).hexdigest()
+
+
+def _is_of_installation(line: str) -> bool:
+    path = line.rsplit(",", 2)[0].strip('"')
+    return (
+        path.startswith(("..", "/"))
+        or path.endswith(".pyc")
+        or path.rpartition("/")[2] in _OF_INSTALLATION
+    )
+
+
+def _main() -> None:
+    descriptor = take_standard_output()
+    packages = _packages_in(json.load(sys.stdin))
+    with os.fdopen(descriptor, "w") as output:
+        json.dump(packages, output)
+
+
+if __name__ == "__main__":
+    _main()

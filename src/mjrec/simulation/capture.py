@@ -1,0 +1,521 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The states of a MuJoCo simulation inside an environment, ready to be recorded."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ClosedError, PicturesDiffer
+from ..formats.trajectory import RowLayout, StateComponent
+from .authored_model import AuthoredModel
+from .cameras import is_tracking, raw_data, raw_model
+from .fields import VIEW_PREFIXES, is_settable
+from .layout import (
+    STATE_SPEC,
+    needs_constraints,
+    snapshot_layout,
+    state_components,
+    state_words,
+)
+from .looks import Looks
+from .model_store import ModelStore
+from .self_check import scene_difference
+from .snapshot import SnapshotSource
+from .view import SceneView
+
+T = TypeVar("T")
+
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+
+# Fields of a model that `snapshot_layout` looks at, which environments leave alone.
+_SETTLING_THE_LAYOUT = (
+    *("tendon_limited", "tendon_matid", "tendon_plasticadr"),
+    "sensor_",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeStart:
+    """What is known of a simulation when an episode begins.
+
+    Attributes:
+        state: the components of a state.
+        snapshot: of what frames are drawn from; without fields where `refusal` says
+            why there are none.
+        model: where the model is stored, for the facts of a trajectory.
+        scene: how it is shown, likewise; None where there are no snapshots.
+        model_fields: what is other than in the stored model.
+        refusal: why no frame can be drawn from snapshots of this model; None where it
+            can, which was checked.
+        words: state and snapshot in `memory.WORDS`, from which rows can be gathered
+            while `is_current`; None where each moment needs a closer look.
+        is_current: tells that nothing but the state is other than at the capture
+            before, which is usual: the memory then holds this moment, until the
+            environment is called again. It keeps the words alive.
+    """
+
+    state: tuple[StateComponent, ...]
+    snapshot: RowLayout
+    model: Mapping[str, Any]
+    scene: Mapping[str, Any] | None
+    model_fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    refusal: str | None = None
+    words: NDArray[np.intp] | None = None
+    is_current: Callable[[], bool] = lambda: False
+
+
+class Capture:
+    """Takes down the states of a simulation, episode by episode. Needs no OpenGL.
+
+    The simulation is only read. What does not change between captures is kept, so that
+    a capture takes microseconds; what has changed is found by comparing memory.
+
+    Args:
+        simulation: returns the model and the data of this moment, MuJoCo's own or
+            dm_control's. The model may be another one after a reset.
+        view: returns how the scene is shown; asked when an episode begins. The camera
+            and the option in it are watched: they may be the environment's own.
+        at_picture: calls what it is given in the moment at which the environment would
+            draw, and then puts everything back; None where any moment is as good.
+        resetting: returns what to put around a reset.
+        authored: returns what the model was made from, where that is known.
+        obstacle: returns why the frame of this moment cannot be made from the state,
+            or None.
+        is_unmoved: tells, faster than the others do, that simulation and view are as
+            when `view` was asked, and nothing stands in the way: no other is then
+            called. What is in model, camera and option is looked at besides.
+        forget: lets the view be again as if nothing had been shown.
+    """
+
+    def __init__(
+        self,
+        simulation: Callable[[], tuple[Any, Any]],
+        *,
+        view: Callable[[], SceneView],
+        at_picture: Callable[[Callable[[], None]], None] | None = None,
+        resetting: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
+        authored: Callable[[], AuthoredModel | None] = lambda: None,
+        obstacle: Callable[[], str | None] = lambda: None,
+        is_unmoved: Callable[[], bool] | None = None,
+        forget: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.resetting = resetting
+        self._simulation = simulation
+        self._view = view
+        self._at_picture = at_picture or (lambda capture: capture())
+        self._authored = authored
+        self._obstacle = obstacle
+        self._is_unmoved = is_unmoved
+        self._forget = forget
+        self._store: ModelStore | None = None
+        self._stored: _StoredModel | None = None
+        self._frames: _Frames | None = None
+        self._refusal: str | None = None
+        self._looks_at_everything = False
+        self._quick: _QuickLook | None = None
+        # As `simulation` gave them last; they may be dm_control's wrappers.
+        self._seen: tuple[Any, Any] = (None, None)
+
+    def open(self, directory: Path) -> None:
+        """Store models in `directory` from here on."""
+        self._store = ModelStore(directory)
+        self._stored = self._frames = None
+
+    def begin_episode(self) -> EpisodeStart:
+        """Return what is there now, just after a reset.
+
+        A model that was not seen before is stored; of one that was, the fields that
+        are other than then are returned.
+        """
+        self._seen = self._simulation()
+        data = raw_data(self._seen[1])
+        stored, fields = self._stored_model(raw_model(self._seen[0]))
+        self._looks_at_everything = False
+        frames = self._frames_of(stored, data, self._view(), fields)
+        refusal = self._refusal = self._reason_against(frames, fields)
+        self._quick = None
+        if self._is_unmoved is not None and refusal is None and not frames.scene:
+            self._quick = _QuickLook(self._is_unmoved, stored.looks, frames)
+        quick = self._quick
+        return EpisodeStart(
+            state=stored.components,
+            snapshot=frames.layout if refusal is None else RowLayout(),
+            model=stored.facts,
+            scene=frames.facts() if refusal is None else None,
+            model_fields=fields,
+            refusal=refusal,
+            words=None if quick is None else frames.words,
+            is_current=(lambda: False) if quick is None else quick.is_current,
+        )
+
+    def capture_state(self, out: NDArray[np.float64]) -> None:
+        """Write the state of this moment into `out`, `(state_length,)`.
+
+        Raises:
+            PicturesDiffer: the environment has gone over to another model.
+        """
+        stored, frames = self._followed()
+        mujoco.mj_getState(stored.model, frames.data, out, STATE_SPEC)
+
+    def capture_snapshot(
+        self, out: NDArray[np.uint8]
+    ) -> Mapping[str, NDArray[Any]] | None:
+        """Write what a frame of this moment is drawn from into `out`.
+
+        Args:
+            out: `(snapshot.size,)`, contiguous, at a multiple of 8 bytes.
+
+        Returns:
+            Model and view fields that are other than at the capture before, or at the
+            beginning of the episode; None, which is usual, where all are the same.
+
+        Raises:
+            PicturesDiffer: the frame of this moment cannot be made from a snapshot,
+                which was possible when the episode began.
+        """
+        quick = self._quick
+        if quick is not None and quick.is_current():
+            # The usual case, in half the time of the others.
+            quick.take(out)
+            return None
+        _, frames = self._followed()
+        reason = self._refusal or self._obstacle()
+        if reason is not None:
+            raise _differs(reason)
+        return self._at_moment(lambda: self._captured(frames, out))
+
+    def changed_fields(self) -> Mapping[str, NDArray[Any]] | None:
+        """Return what of the model is other than at the capture before."""
+        changed = self._changed() or {}
+        own = {k: v for k, v in changed.items() if not k.startswith(VIEW_PREFIXES)}
+        return own or None
+
+    def model_changed(self) -> None:
+        """Note that anything in the model may be another; the next capture looks."""
+        self._looks_at_everything = True
+        self._end_quick_look()
+
+    def forget_pictures(self) -> None:
+        """Let the next episode's frames depend on none that was made before.
+
+        To be called between episodes. Cameras that are placed at the first frame, or
+        that each frame moves, are as in a simulation that has just been made.
+        """
+        self._forget()
+        self._frames = None
+        if self._stored is not None:
+            self._stored.scene = None
+
+    def finish(self) -> None:
+        """Wait until every model is stored.
+
+        Raises:
+            FileNotWritten: one could not be.
+        """
+        if self._store is not None:
+            self._store.finish()
+
+    def close(self) -> None:
+        """Let go of model and data; idempotent. What waits is still stored."""
+        if self._store is not None:
+            self._store.leave()
+        self._end_quick_look()
+        self._stored = self._frames = None
+        self._seen = (None, None)
+
+    def _stored_model(
+        self, model: mujoco.MjModel
+    ) -> tuple[_StoredModel, dict[str, NDArray[Any]]]:
+        """Return the model as stored, and what of it is other than that now."""
+        if self._stored is not None and self._stored.looks.is_of(model):
+            fields = self._stored.looks.since_stored()
+            if all(map(is_settable, fields)):
+                return self._stored, fields
+        if self._store is None:
+            raise ClosedError("Call open() with a directory before the first episode.")
+        self._stored = _StoredModel(model, self._store.add(model, self._authored()))
+        self._frames = None
+        return self._stored, {}
+
+    def _frames_of(
+        self,
+        stored: _StoredModel,
+        data: mujoco.MjData,
+        view: SceneView,
+        fields: Iterable[str],
+    ) -> _Frames:
+        """Return what takes the episode's snapshots: if it can be, that of before."""
+        stored.looks.follow(view)
+        key = (
+            *(data._address, id(view.camera), id(view.option), view.max_geom),
+            *(view.fresh, view.height, view.width, view.label),
+            stored.looks.view_bytes(),
+            # Then the layout may be another one, and nothing is equal to this.
+            object() if any(n.startswith(_SETTLING_THE_LAYOUT) for n in fields) else 0,
+        )
+        if self._frames is None or self._frames.key != key:
+            self._frames = _Frames(stored, data, view, key)
+        return self._frames
+
+    def _reason_against(self, frames: _Frames, fields: Mapping[str, Any]) -> str | None:
+        reason = self._obstacle()
+        if reason is not None:
+            return reason
+        if frames.is_sound(fields):
+            return frames.objection(fields) if fields else None
+        return self._at_moment(lambda: frames.objection(fields))
+
+    def _at_moment(self, do: Callable[[], T]) -> T:
+        """Return what `do` returns in the moment when a frame would be drawn."""
+        results: list[T] = []
+        self._at_picture(lambda: results.append(do()))
+        return results[-1]
+
+    def _captured(
+        self, frames: _Frames, out: NDArray[np.uint8]
+    ) -> dict[str, NDArray[Any]] | None:
+        frames.source.take(out)
+        changed = self._changed()
+        if changed is not None:
+            reason = frames.objection_after(changed, out)
+            if reason is not None:
+                raise _differs(reason)
+        return frames.drawn(changed)
+
+    def _changed(self) -> dict[str, NDArray[Any]] | None:
+        if self._stored is None:
+            raise _not_begun()
+        changed = self._stored.looks.changed(anything=self._looks_at_everything)
+        self._looks_at_everything = False
+        fixed = [name for name in changed or () if not is_settable(name)]
+        if fixed:
+            raise _differs(
+                f"{', '.join(fixed)} of the model has changed in mid-episode, which "
+                "changes what the model consists of"
+            )
+        return changed
+
+    def _end_quick_look(self) -> None:
+        """Look closely from here on, whoever has been told of the memory."""
+        if self._quick is not None:
+            self._quick.end()
+            self._quick = None
+
+    def _followed(self) -> tuple[_StoredModel, _Frames]:
+        """Take note of other objects in mid-episode."""
+        model, data = self._simulation()
+        stored, frames = self._stored, self._frames
+        if stored is None or frames is None:
+            raise _not_begun()
+        if model is not self._seen[0] or data is not self._seen[1]:
+            if not stored.looks.is_of(raw_model(model)):
+                raise _differs("the environment has gone over to another model")
+            self._end_quick_look()
+            frames = self._frames = _Frames(stored, raw_data(data), frames.view, None)
+            self._seen = (model, data)
+        return stored, frames
+
+
+class _StoredModel:
+    """A model that is stored, and what is known of it.
+
+    Args:
+        model: the model.
+        facts: where it is stored.
+
+    Attributes:
+        scene: where each frame leaves its two cameras; None before the first.
+        options: the visual options with which a snapshot was found to suffice.
+        fields: those that were other than in the stored model then.
+    """
+
+    def __init__(self, model: mujoco.MjModel, facts: dict[str, Any]) -> None:
+        self.model = model
+        self.facts = facts
+        self.looks = Looks(model)
+        self.components = state_components(model)
+        self.scene: mujoco.MjvScene | None = None
+        self.options: set[bytes] = set()
+        self.fields: set[str] = set()
+
+
+class _Frames:
+    """Takes snapshots of one simulation in one view, and tells whether they suffice.
+
+    Where a frame has an influence on the next one, it follows what each leaves behind:
+    an infinite plane is drawn around the camera of the frame before, and a camera that
+    tracks a body goes a fifth of the way to it in each frame. Positions are those that
+    MuJoCo computes, without any drawing.
+
+    Args:
+        stored: the model; kept alive, as is the data.
+        data: its data.
+        view: how the scene is shown.
+        key: what it depends on.
+
+    Attributes:
+        layout: of the snapshots.
+        source: of the snapshots themselves.
+        words: of a row, where it can be gathered.
+        scene: has the cameras; None where no frame has an influence on the next.
+    """
+
+    def __init__(
+        self, stored: _StoredModel, data: mujoco.MjData, view: SceneView, key: object
+    ) -> None:
+        model = stored.model
+        self.data, self.view, self.key = data, view, key
+        self.layout = snapshot_layout(model, data, view.option)
+        self.source = SnapshotSource(model, data, self.layout)
+        state = state_words(model, data)
+        self.words: NDArray[np.intp] | None = None
+        if state is not None and self.source.words is not None:
+            self.words = np.concatenate([state, self.source.words])
+        self._stored = stored
+        self._facts = view.facts()
+        # Moved as frames move it; the environment's own stays where it is.
+        self._camera = copy.copy(view.camera)
+        self._lookat = self._camera.lookat.tolist()
+        self.scene: mujoco.MjvScene | None = None
+        if is_tracking(view.camera) or (not view.fresh and _has_infinite_plane(model)):
+            self.scene = stored.scene or mujoco.MjvScene(model, maxgeom=1)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts of the scene, and what the frame before left in it."""
+        facts = {**self._facts}
+        if self.scene is not None and not self.view.fresh:
+            before = self._stored.scene
+            if before is not None:
+                facts["previous_cameras"] = [c.pos.tolist() for c in before.camera]
+        if is_tracking(self._camera):
+            self._lookat = self._camera.lookat.tolist()
+            facts["camera"] = {**facts["camera"], "lookat": self._lookat}
+        return facts
+
+    def is_sound(self, fields: Iterable[str]) -> bool:
+        """Tell whether a snapshot was found to suffice with these fields changed.
+
+        That is checked of the first frame, and again of the first one that has a
+        visual option, or a changed field of the model, that none before it had.
+        """
+        stored = self._stored
+        is_known = stored.looks.option_bytes() in stored.options
+        return is_known and stored.fields.issuperset(fields)
+
+    def objection(
+        self, fields: Collection[str], row: NDArray[np.uint8] | None = None
+    ) -> str | None:
+        """Say why frames of this moment cannot be drawn from snapshots.
+
+        Args:
+            fields: of the model, other than in the stored one.
+            row: the snapshot of this moment; it is taken, if None.
+        """
+        stored, view = self._stored, self.view
+        reason = needs_constraints(stored.model, view.option)
+        if reason is not None or self.is_sound(fields):
+            return reason
+        if row is None:
+            row = np.empty(self.layout.size, np.uint8)
+            self.source.take(row)
+        found = scene_difference(stored.model, self.data, self.layout, row, view)
+        if found is not None:
+            return f"drawn from its snapshot the scene is another one: {found}"
+        stored.options.add(stored.looks.option_bytes())
+        stored.fields.update(fields)
+        return None
+
+    def objection_after(
+        self, changed: Iterable[str], row: NDArray[np.uint8]
+    ) -> str | None:
+        """Say why snapshots do not suffice any longer, after something has changed.
+
+        Args:
+            changed: the fields of model and view that have.
+            row: the snapshot of this moment.
+        """
+        fields = [name for name in changed if not name.startswith("camera.")]
+        if self.is_sound(fields):
+            return None
+        now = snapshot_layout(self._stored.model, self.data, self.view.option)
+        missing = _names(now) - _names(self.layout)
+        reason = needs_constraints(self._stored.model, self.view.option)
+        if reason is None and missing:
+            return (
+                f"it now needs {', '.join(sorted(missing))} as well, which the "
+                "recording of this episode was not begun with"
+            )
+        return reason or self.objection(fields, row)
+
+    def drawn(
+        self, changed: dict[str, NDArray[Any]] | None
+    ) -> dict[str, NDArray[Any]] | None:
+        """Let the cameras move as a frame moves them, and add that to what changed."""
+        if any(name.startswith(VIEW_PREFIXES) for name in changed or ()):
+            self._camera = copy.copy(self.view.camera)
+            self._lookat = self._camera.lookat.tolist()
+        if self.scene is None:
+            return changed
+        lookat = self._camera.lookat
+        if is_tracking(self._camera) and lookat.tolist() != self._lookat:
+            self._lookat = lookat.tolist()
+            changed = {**(changed or {}), "camera.lookat": lookat.copy()}
+        model = self._stored.model
+        mujoco.mjv_updateCamera(model, self.data, self._camera, self.scene)
+        self._stored.scene = self.scene
+        return changed
+
+
+class _QuickLook:
+    """Tells whether only the state has changed, and takes snapshots while it is so.
+
+    Attributes:
+        take: writes a snapshot.
+    """
+
+    def __init__(
+        self, is_unmoved: Callable[[], bool], looks: Looks, frames: _Frames
+    ) -> None:
+        self._is_unmoved = is_unmoved
+        self._seen, self._present = [*looks.seen], [*looks.present]
+        self.take = frames.source.take
+
+    def is_current(self) -> bool:
+        """Tell whether view and model are as they were at the capture before."""
+        # Not `self._is_unmoved()`: calling an attribute takes CPython twice as long.
+        is_unmoved = self._is_unmoved
+        return self._seen == self._present and is_unmoved()
+
+    def end(self) -> None:
+        """A closer look is needed from here on."""
+        self._seen.clear()
+
+
+def _has_infinite_plane(model: mujoco.MjModel) -> bool:
+    planes = model.geom_size[model.geom_type == _PLANE]
+    return bool((planes[:, :2] <= 0).any())
+
+
+def _names(layout: RowLayout) -> set[str]:
+    return {field.name for field in layout.fields}
+
+
+def _differs(reason: str) -> PicturesDiffer:
+    return PicturesDiffer(
+        f"The picture of this moment cannot be made from the recorded state: {reason}. "
+        'Record the environment\'s own pictures with render="live".'
+    )
+
+
+def _not_begun() -> ClosedError:
+    return ClosedError("No episode is recorded: call begin_episode() first.")

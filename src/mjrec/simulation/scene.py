@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is drawn: a recorded episode or given states, brought back frame by frame."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
+from ..formats.trajectory import ModelChange, TrajectoryReader
+from .authored_model import with_embedded_files
+from .cameras import check_camera, raw_model
+from .canvas import is_kept_by_context
+from .fields import apply_fields, read_member
+from .model_store import load_model
+from .snapshot import restore_snapshot
+from .view import view_from_facts
+
+_BLOCK_BYTES = 1 << 20
+_MODEL, _STATES = "model.mjb", "states.npy"
+
+
+class RecordedScene:
+    """A model and its data, as they were at a frame of a trajectory.
+
+    Only what the visualiser reads is put back into the data; it is for drawing.
+
+    Args:
+        reader: of the trajectory; used as long as this object is.
+
+    Raises:
+        UnreadableFile: what it says of its scene cannot be, or its model is missing,
+            damaged or of another MuJoCo.
+
+    Attributes:
+        model: the model, as it was at the frame last brought back.
+        data: its data, likewise.
+        view: how the environment showed it. The camera and the option change with the
+            frames.
+        previous_cameras: where the two cameras of the environment's scene stood before
+            the first frame, `(2, 3)`.
+        count: how many frames there are.
+    """
+
+    def __init__(self, reader: TrajectoryReader) -> None:
+        self._reader = reader
+        facts = reader.header.facts
+        try:
+            self.view = view_from_facts(facts["scene"])
+            self.previous_cameras = _positions(facts["scene"].get("previous_cameras"))
+        # Not all that NumPy and the bindings refuse is looked for.
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            raise UnreadableFile(reader.path, f"of its scene: {error}") from error
+        if not isinstance(facts.get("model"), dict):
+            raise UnreadableFile(reader.path, "it does not say which model it is of")
+        self.model = load_model(reader.path.parent, facts["model"])
+        self.data = mujoco.MjData(self.model)
+        self.count = reader.frame_count
+        self._restart()
+        self._originals: dict[str, NDArray[Any]] = {}
+        self._block = range(0)
+        self._values: dict[str, NDArray[Any]] = {}
+
+    def bring_to(self, index: int) -> bool:
+        """Bring back what was there at frame `index`, one of `count`.
+
+        Returns:
+            Whether something has changed in the model that an OpenGL context keeps.
+
+        Raises:
+            UnreadableFile: the file is damaged, or does not fit its model.
+        """
+        try:
+            changed = self._change_model(int(self._reader.frame_steps[index]))
+            check_camera(self.model, self.view.camera)
+            restore_snapshot(self._values_of(index), self.model, self.data)
+        except InvalidArgument as error:
+            raise UnreadableFile(self._reader.path, error) from error
+        return any(map(is_kept_by_context, changed))
+
+    def _restart(self) -> None:
+        self._changes: Iterator[ModelChange] = self._reader.iter_model_changes()
+        self._next = next(self._changes, None)
+        self._step = -1
+
+    def _change_model(self, step: int) -> dict[str, NDArray[Any]]:
+        """Make the model what it was after `step`; return what changed."""
+        fields: dict[str, NDArray[Any]] = {}
+        if step < self._step:
+            fields.update(self._originals)
+            self._restart()
+        self._step = step
+        # All changes together may be more than the memory holds.
+        while self._next is not None and self._next.step <= step:
+            fields.update(self._next.fields)
+            self._next = next(self._changes, None)
+        for name in fields.keys() - self._originals.keys():
+            # One that there is not is an error of `apply_fields`.
+            with contextlib.suppress(AttributeError):
+                self._originals[name] = self._read(name)
+        apply_fields(
+            self.model, fields, camera=self.view.camera, option=self.view.option
+        )
+        return fields
+
+    def _read(self, name: str) -> NDArray[Any]:
+        struct, _, member = name.partition(".")
+        if struct in ("camera", "option"):
+            return read_member(getattr(self.view, struct), member)
+        return read_member(self.model, name)
+
+    def _values_of(self, index: int) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a snapshot, read in blocks."""
+        layout = self._reader.header.snapshot
+        if index not in self._block:
+            rows = max(1, _BLOCK_BYTES // max(1, layout.size))
+            start = index - index % rows
+            self._block = range(start, min(start + rows, self.count))
+            packed = self._reader.snapshots(self._block.start, self._block.stop)
+            self._values = layout.unpack(packed)
+        place = index - self._block.start
+        return {name: values[place] for name, values in self._values.items()}
+
+
+def check_states(model: Any, states: ArrayLike, spec: int) -> NDArray[np.float64]:
+    """Return `states` as `(n, size) float64`.
+
+    Args:
+        model: a `mujoco.MjModel`, or dm_control's wrapper of one.
+        states: one row for each state.
+        spec: which components a row has, a combination of `mujoco.mjtState`.
+
+    Raises:
+        InvalidArgument: `spec` is no combination of states, or the shape is another.
+    """
+    try:
+        size = int(mujoco.mj_stateSize(raw_model(model), int(spec)))
+    except (TypeError, ValueError, mujoco.FatalError) as error:
+        raise InvalidArgument(
+            f"spec must be a combination of mujoco.mjtState, got {spec!r}: {error}."
+        ) from error
+    rows = np.asarray(states)
+    if rows.dtype.kind not in "iuf":
+        raise InvalidArgument(f"States are numbers, got an array of {rows.dtype}.")
+    if rows.ndim == 3 and rows.shape[2] == size:
+        raise InvalidArgument(
+            f"States are wanted as (n, {size}), got {rows.shape}: the shape that "
+            "mujoco.rollout gives, many runs of many steps. Give one run, states[k], "
+            f"or states.reshape(-1, {size}) for all, one after the other."
+        )
+    if rows.ndim != 2 or rows.shape[1] != size:
+        raise InvalidArgument(
+            f"States are wanted as (n, {size}), because mujoco.mj_stateSize(model, "
+            f"{int(spec)}) is {size}, got {rows.shape}. Give the spec that the rows "
+            "were made with, and the model that they belong to."
+        )
+    return np.ascontiguousarray(rows, np.float64)
+
+
+def save_states(directory: Path, model: Any, states: NDArray[np.float64]) -> None:
+    """Write what `GivenStates` reads.
+
+    Raises:
+        FileNotWritten: the disk is full.
+    """
+    whole = with_embedded_files(raw_model(model))
+    try:
+        mujoco.mj_saveModel(whole, str(directory / _MODEL), None)
+        np.save(directory / _STATES, states, allow_pickle=False)
+    except (OSError, mujoco.FatalError) as error:
+        raise FileNotWritten(directory, error) from error
+
+
+class GivenStates:
+    """A model and its data in one of the states that `save_states` has written.
+
+    Everything that follows from a state is computed, as `mj_forward` does; what the
+    rows leave out is as in a new `MjData`. So each frame depends on its row alone.
+
+    Args:
+        directory: where `save_states` wrote.
+        spec: which components a row has.
+
+    Attributes:
+        model: the model.
+        data: its data, in the state last brought to.
+        count: how many rows there are.
+    """
+
+    def __init__(self, directory: Path, spec: int) -> None:
+        self.model = mujoco.MjModel.from_binary_path(str(directory / _MODEL))
+        self.data = mujoco.MjData(self.model)
+        self._spec = spec
+        # Only the rows that are asked for come into memory.
+        self._states = np.load(directory / _STATES, mmap_mode="r", allow_pickle=False)
+        self.count = len(self._states)
+
+    def bring_to(self, index: int) -> bool:
+        """Put a row into the data; return False: the model never changes."""
+        mujoco.mj_resetData(self.model, self.data)
+        # A copy: mujoco 3.3 takes none that it could not write to.
+        state = np.array(self._states[index])
+        mujoco.mj_setState(self.model, self.data, state, self._spec)
+        mujoco.mj_forward(self.model, self.data)
+        return False
+
+
+def _positions(previous: Any) -> NDArray[np.float64]:
+    if previous is None:
+        return np.zeros((2, 3))
+    positions = np.asarray(previous, np.float64)
+    if positions.shape != (2, 3):
+        raise InvalidArgument(f"previous_cameras is {previous!r:.200}")
+    return positions

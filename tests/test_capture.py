@@ -1,0 +1,532 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The states of a simulation, as a recorder asks for them."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from touch_grid import TOUCH_GRID
+
+from mjrec.errors import ClosedError, PicturesDiffer
+from mjrec.simulation.capture import Capture, EpisodeStart
+from mjrec.simulation.fields import apply_fields
+from mjrec.simulation.layout import read_state
+from mjrec.simulation.memory import WORDS
+from mjrec.simulation.model_store import load_model
+from mjrec.simulation.self_check import differences
+from mjrec.simulation.snapshot import restore_snapshot
+from mjrec.simulation.view import SceneView, view_from_facts
+
+BALL = """
+<mujoco>
+  <asset><texture name="t" type="2d" builtin="checker" width="64" height="64"/>
+    <material name="m" texture="t"/></asset>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <camera name="c" pos="0 -3 1"/>
+    <geom type="plane" size="{plane}" material="m"/>
+    <body name="ball" pos="0 0 .5"><joint name="x" type="slide"/>
+      <joint name="turn" type="hinge"/><geom size=".1"/><site name="s"/></body>
+  </worldbody>
+  <actuator><motor joint="x"/></actuator>
+</mujoco>
+"""
+
+
+class Simulation:
+    """What an environment has, and what takes its states down."""
+
+    def __init__(self, directory: Path, xml: str = BALL, **options: Any) -> None:
+        self.camera, self.option = mujoco.MjvCamera(), mujoco.MjvOption()
+        self.directory = directory
+        self.fresh = options.pop("fresh", False)
+        self.is_unmoved = True
+        self.compile(xml)
+        mujoco.mjv_defaultFreeCamera(self.model, self.camera)
+        self.states = Capture(
+            lambda: (self.model, self.data), view=self.view, **options
+        )
+        self.states.open(directory)
+
+    def compile(self, xml: str, plane: str = "2 2 .1") -> None:
+        self.model = mujoco.MjModel.from_xml_string(xml.format(plane=plane))
+        self.data = mujoco.MjData(self.model)
+        self.step()
+
+    def view(self) -> SceneView:
+        return SceneView(
+            camera=self.camera,
+            option=self.option,
+            max_geom=100,
+            fresh=self.fresh,
+            height=48,
+            width=64,
+            label=-1,
+        )
+
+    def step(self, count: int = 1) -> None:
+        self.data.ctrl[:] = 5
+        mujoco.mj_step(self.model, self.data, nstep=count)
+
+    def begin(self) -> EpisodeStart:
+        self.start = self.states.begin_episode()
+        self.row = np.zeros(self.start.snapshot.size, np.uint8)
+        return self.start
+
+    def begin_scene(self) -> Any:
+        return self.begin().scene
+
+    def capture(self) -> Any:
+        return self.states.capture_snapshot(self.row)
+
+    def captured(self, name: str) -> Any:
+        return self.start.snapshot.unpack(self.row)[name]
+
+    def shown(self, flag: str) -> int:
+        """Show what a flag is for; return its number."""
+        index = int(mujoco.mjtVisFlag.__members__[f"mjVIS_{flag}"])
+        self.option.flags[index] = True
+        return index
+
+
+@pytest.fixture
+def new(tmp_path: Path) -> Iterator[Callable[..., Simulation]]:
+    made: list[Simulation] = []
+
+    def make(*args: Any, **options: Any) -> Simulation:
+        made.append(Simulation(tmp_path, *args, **options))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.states.finish()
+        each.states.close()
+
+
+@pytest.fixture
+def simulation(new: Callable[..., Simulation]) -> Simulation:
+    return new()
+
+
+def test_a_state_is_the_integration_state(simulation: Simulation) -> None:
+    """Byte for byte."""
+    simulation.begin()
+    for _ in range(3):
+        simulation.step()
+        state = np.empty(len(read_state(simulation.model, simulation.data)))
+        simulation.states.capture_state(state)
+        expected = read_state(simulation.model, simulation.data)
+        assert state.tobytes() == expected.tobytes()
+
+
+def test_rows_can_be_gathered_while_only_the_state_changes(
+    new: Callable[..., Simulation],
+) -> None:
+    """State and snapshot; not once model, view or what `model_changed` says moved."""
+    still = new(is_unmoved=lambda: still.is_unmoved)
+    start = still.begin()
+    assert start.words is not None
+    for _ in range(3):
+        still.step()
+        assert start.is_current()
+        assert still.capture() is None
+        state = read_state(still.model, still.data).tobytes()
+        assert WORDS.take(start.words).tobytes() == state + still.row.tobytes()
+    still.model.geom_rgba[0] = (1, 0, 0, 1)
+    assert not start.is_current()
+    assert list(still.capture()) == ["geom_rgba"]
+    assert start.is_current()
+    still.is_unmoved = False
+    assert not start.is_current()
+    still.is_unmoved = True
+    still.states.model_changed()
+    assert not start.is_current()
+    assert still.begin().words is not None
+
+
+def test_rows_are_not_gathered_where_a_closer_look_is_needed(
+    simulation: Simulation,
+) -> None:
+    """Nothing tells here whether the view has moved."""
+    start = simulation.begin()
+    assert (start.words, start.is_current()) == (None, False)
+
+
+def test_changes_of_model_and_view_are_told_once(simulation: Simulation) -> None:
+    """And the stored model, facts, a row and these changes give the scene."""
+    simulation.shown("INERTIA")
+    simulation.model.geom_rgba[0] = (1, 0, 0, 1)
+    start = simulation.begin()
+    assert start.refusal is None
+    simulation.step(7)
+    assert simulation.capture() is None
+    simulation.model.site_rgba[0] = (0, 1, 0, 1)
+    simulation.model.vis.headlight.ambient[:] = 0.5
+    simulation.model.opt.gravity[2] = -1
+    simulation.model.stat.extent = 3
+    simulation.camera.lookat[0] = 2
+    simulation.shown("TRANSPARENT")
+    changed = simulation.capture()
+    assert changed.keys() == {
+        *("site_rgba", "vis.headlight.ambient", "opt.gravity", "stat.extent"),
+        *("camera.lookat", "option.flags"),
+    }
+    assert simulation.capture() is None
+    simulation.states.finish()
+    model = load_model(simulation.directory, start.model)
+    assert start.scene is not None
+    view = view_from_facts(start.scene)
+    apply_fields(model, changed, camera=view.camera, option=view.option)
+    data = mujoco.MjData(model)
+    restore_snapshot(start.snapshot.unpack(simulation.row), model, data)
+    live = mujoco.MjvScene(simulation.model, maxgeom=100)
+    update(live, simulation.model, simulation.data, simulation.view())
+    again = mujoco.MjvScene(model, maxgeom=100)
+    update(again, model, data, view)
+    assert list(differences(live, again, view.option)) == []
+
+
+def update(scene: Any, model: Any, data: Any, view: SceneView) -> None:
+    mujoco.mjv_updateScene(model, data, view.option, None, view.camera, 7, scene)
+
+
+def test_long_arrays_are_looked_at_when_somebody_says_so(
+    simulation: Simulation,
+) -> None:
+    """Textures, for example; and at the next reset, without a word."""
+    simulation.begin()
+    simulation.model.tex_data[5] ^= 1
+    assert simulation.capture() is None
+    simulation.states.model_changed()
+    assert simulation.capture().keys() == {"tex_data"}
+    assert simulation.capture() is None
+    assert simulation.begin().model_fields.keys() == {"tex_data"}
+    assert simulation.capture() is None
+    simulation.model.tex_data[5] ^= 1
+    assert simulation.begin().model_fields == {}
+
+
+def test_the_model_is_stored_once_and_differences_are_told(
+    simulation: Simulation,
+) -> None:
+    """Every episode says in what its model is other than the stored one."""
+    first = simulation.begin()
+    assert first.model_fields == {}
+    simulation.model.body_pos[1] = (1, 2, 3)
+    second = simulation.begin()
+    assert second.model == first.model
+    assert second.model_fields["body_pos"][1].tolist() == [1, 2, 3]
+    assert simulation.capture() is None
+    simulation.states.finish()
+    assert len(list(simulation.directory.iterdir())) == 1
+
+
+def test_a_model_that_consists_of_other_things_is_stored_anew(
+    simulation: Simulation,
+) -> None:
+    """In mid-episode that is an error, where it is drawn, because it cannot be set."""
+    first = simulation.begin()
+    simulation.model.geom_type[1] = int(mujoco.mjtGeom.mjGEOM_BOX)
+    second = simulation.begin()
+    assert second.model != first.model
+    assert second.model_fields == {}
+    simulation.model.dof_Madr[0] += 1
+    assert simulation.capture() is None
+    simulation.model.geom_type[1] = int(mujoco.mjtGeom.mjGEOM_SPHERE)
+    with pytest.raises(PicturesDiffer, match="geom_type of the model has changed"):
+        simulation.capture()
+
+
+def test_a_recompiled_model_is_another_one(simulation: Simulation) -> None:
+    """As in composer environments, at every reset; in mid-episode it is an error."""
+    first = simulation.begin()
+    simulation.compile(BALL.replace('size=".1"', 'size=".2"'))
+    second = simulation.begin()
+    assert second.model != first.model
+    simulation.step(3)
+    simulation.capture()
+    assert np.array_equal(simulation.captured("geom_xpos"), simulation.data.geom_xpos)
+    simulation.compile(BALL)
+    with pytest.raises(PicturesDiffer, match="gone over to another model"):
+        simulation.capture()
+    with pytest.raises(PicturesDiffer, match="gone over to another model"):
+        simulation.states.capture_state(np.empty(8))
+    assert simulation.begin().model == first.model
+
+
+def test_other_data_of_the_same_model_is_followed(simulation: Simulation) -> None:
+    """Captures are of the data that the environment has at that moment."""
+    simulation.begin()
+    simulation.data = mujoco.MjData(simulation.model)
+    simulation.data.qpos[0] = 0.75
+    mujoco.mj_forward(simulation.model, simulation.data)
+    assert simulation.capture() is None
+    assert np.array_equal(simulation.captured("geom_xpos"), simulation.data.geom_xpos)
+
+
+@pytest.mark.parametrize(
+    "flag", ["CONTACTPOINT", "CONTACTFORCE", "CONTACTSPLIT", "ISLAND"]
+)
+def test_what_only_constraints_tell_is_refused(
+    simulation: Simulation, flag: str
+) -> None:
+    """States are still recorded, and what changes in the model still told."""
+    if flag == "ISLAND" and hasattr(mujoco.mjtEnableBit, "mjENBL_ISLAND"):
+        simulation.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ISLAND)
+    index = simulation.shown(flag)
+    start = simulation.begin()
+    assert f"mjVIS_{flag} of the visual options" in (start.refusal or "")
+    assert (start.scene, start.snapshot.fields) == (None, ())
+    assert start.state
+    assert simulation.states.changed_fields() is None
+    simulation.model.geom_rgba[0] = 0.5
+    assert (simulation.states.changed_fields() or {}).keys() == {"geom_rgba"}
+    with pytest.raises(PicturesDiffer, match=flag):
+        simulation.capture()
+    simulation.option.flags[index] = False
+    assert simulation.begin().refusal is None
+
+
+def test_an_option_that_snapshots_cannot_follow_is_an_error(
+    simulation: Simulation,
+) -> None:
+    """Turned on in mid-episode it is too late for another row."""
+    simulation.begin()
+    simulation.shown("INERTIA")
+    with pytest.raises(PicturesDiffer, match="xipos"):
+        simulation.capture()
+    assert simulation.begin().refusal is None
+    assert simulation.capture() is None
+    simulation.option.frame = int(mujoco.mjtFrame.mjFRAME_CONTACT)
+    with pytest.raises(PicturesDiffer, match="mjFRAME_CONTACT"):
+        simulation.capture()
+
+
+def test_an_obstacle_is_a_refusal_and_in_mid_episode_an_error(
+    new: Callable[..., Simulation],
+) -> None:
+    """Markers in a viewer, for example."""
+    obstacles: list[str] = ["there is a marker"]
+    simulation = new(obstacle=lambda: obstacles[0] if obstacles else None)
+    assert simulation.begin().refusal == "there is a marker"
+    obstacles.clear()
+    assert simulation.begin().refusal is None
+    assert simulation.capture() is None
+    obstacles.append("there is an arrow")
+    with pytest.raises(PicturesDiffer, match=r'there is an arrow.*render="live"'):
+        simulation.capture()
+
+
+def test_a_plugin_that_draws_is_refused_by_name(
+    new: Callable[..., Simulation],
+) -> None:
+    """Before it has drawn anything."""
+    assert "mujoco.sensor.touch_grid draws" in (new(TOUCH_GRID).begin().refusal or "")
+
+
+def test_a_field_that_is_forgotten_is_refused(
+    simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first frame is compared, whatever the reason for a difference is."""
+    monkeypatch.setattr("mjrec.simulation.layout.ALWAYS", ("geom_xmat",))
+    assert "the scene is another one" in (simulation.begin().refusal or "")
+
+
+def test_a_frame_is_taken_when_the_environment_would_draw(
+    new: Callable[..., Simulation],
+) -> None:
+    """What a render callback moves is in the frame, and put back afterwards."""
+    calls = []
+
+    def at_picture(capture: Callable[[], None]) -> None:
+        kept = simulation.data.geom_xpos.copy()
+        simulation.data.geom_xpos[1] = (7, 8, 9)
+        capture()
+        calls.append(1)
+        simulation.data.geom_xpos[:] = kept
+
+    simulation = new(at_picture=at_picture)
+    simulation.begin()
+    assert len(calls) == 1, "the check is of such a frame too"
+    assert simulation.capture() is None
+    assert simulation.captured("geom_xpos")[1].tolist() == [7, 8, 9]
+    assert simulation.data.geom_xpos[1].tolist() != [7, 8, 9]
+
+
+def check_scenes_that_stay(simulation: Simulation, frames: int) -> None:
+    """Compare scenes that stay, frame by frame: a live and a recorded one."""
+    view = view_from_facts(simulation.begin_scene())
+    own = simulation.view()
+    camera, option = copy.copy(own.camera), copy.copy(own.option)
+    live_view = dataclasses.replace(own, camera=camera, option=option)
+    live = mujoco.MjvScene(simulation.model, maxgeom=100)
+    model = copy.copy(simulation.model)
+    data = mujoco.MjData(model)
+    again = mujoco.MjvScene(model, maxgeom=100)
+    for _ in range(frames):
+        simulation.step(30)
+        changed = simulation.capture() or {}
+        update(live, simulation.model, simulation.data, live_view)
+        apply_fields(model, changed, camera=view.camera, option=view.option)
+        restore_snapshot(simulation.start.snapshot.unpack(simulation.row), model, data)
+        update(again, model, data, view)
+        assert list(differences(live, again, view.option)) == []
+    left = [camera.pos.tolist() for camera in live.camera]
+    assert simulation.begin_scene()["previous_cameras"] == left
+
+
+def test_an_infinite_plane_remembers_the_camera_before(simulation: Simulation) -> None:
+    """An episode says what the last frame before has left, until it is forgotten."""
+    simulation.compile(BALL, plane="0 0 1")
+    simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_FIXED)
+    simulation.camera.fixedcamid = 0
+    assert simulation.begin_scene()["previous_cameras"] is None
+    check_scenes_that_stay(simulation, 3)
+    simulation.states.forget_pictures()
+    assert simulation.begin_scene()["previous_cameras"] is None
+
+
+@pytest.mark.parametrize(("plane", "fresh"), [("2 2 1", False), ("0 0 1", True)])
+def test_only_infinite_planes_in_scenes_that_stay_remember(
+    new: Callable[..., Simulation], plane: str, fresh: bool
+) -> None:
+    """A plane with edges does not, nor does a scene that is made for each frame."""
+    simulation = new(fresh=fresh)
+    simulation.compile(BALL, plane=plane)
+    simulation.begin()
+    simulation.capture()
+    assert simulation.begin_scene()["previous_cameras"] is None
+
+
+def track(simulation: Simulation) -> None:
+    simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
+    simulation.camera.trackbodyid = 1
+
+
+def test_a_camera_that_tracks_moves_from_frame_to_frame(simulation: Simulation) -> None:
+    """Each frame moves it a fifth of the way; where to is part of the recording."""
+    track(simulation)
+    before = simulation.camera.lookat.copy()
+    check_scenes_that_stay(simulation, 4)
+    assert np.array_equal(simulation.camera.lookat, before), "the user's own stays"
+    assert simulation.begin_scene()["camera"]["lookat"] != before.tolist()
+
+
+def test_nothing_is_written_to_the_simulation(simulation: Simulation) -> None:
+    """Model and data are the same bytes before and after."""
+    track(simulation)
+
+    def everything() -> list[bytes]:
+        saved = np.empty(mujoco.mj_sizeModel(simulation.model), np.uint8)
+        mujoco.mj_saveModel(simulation.model, None, saved)
+        data = simulation.data
+        values = [getattr(data, n) for n in dir(data) if not n.startswith("_")]
+        arrays = [value for value in values if isinstance(value, np.ndarray)]
+        return [array.tobytes() for array in (saved, *arrays)]
+
+    before = everything()
+    simulation.begin()
+    simulation.capture()
+    assert everything() == before
+
+
+def test_an_episode_is_the_same_with_and_without_captures(
+    new: Callable[..., Simulation],
+) -> None:
+    """Observations of a real environment do not depend on being recorded."""
+
+    def observations(*, recorded: bool) -> list[bytes]:
+        with gymnasium.make("HalfCheetah-v5") as env:
+            base: Any = env.unwrapped
+            observation, _ = env.reset(seed=3)
+            found = [observation.tobytes()]
+            simulation = new()
+            simulation.model, simulation.data = base.model, base.data
+            if recorded:
+                assert simulation.begin().refusal is None
+            env.action_space.seed(0)
+            for _ in range(20):
+                observation, *_ = env.step(env.action_space.sample())
+                found.append(observation.tobytes())
+                if recorded:
+                    assert simulation.capture() is None
+            return found
+
+    assert observations(recorded=True) == observations(recorded=False)
+
+
+@pytest.mark.dm_control
+def test_dm_controls_objects_are_as_good_as_mujocos(
+    new: Callable[..., Simulation],
+) -> None:
+    """Its wrappers are seen through."""
+    suite = pytest.importorskip("dm_control.suite")
+    physics = suite.load("cartpole", "balance").physics
+    simulation = new(fresh=True)
+    simulation.model, simulation.data = physics.model, physics.data
+    assert simulation.begin().refusal is None
+    physics.step()
+    assert simulation.capture() is None
+    expected = physics.data.ptr.geom_xpos
+    assert np.array_equal(simulation.captured("geom_xpos"), expected)
+
+
+def test_what_belongs_around_a_reset_is_passed_on(
+    new: Callable[..., Simulation],
+) -> None:
+    """It is the environment's own affair."""
+    inside = []
+
+    @contextlib.contextmanager
+    def resetting() -> Iterator[None]:
+        inside.append(1)
+        yield
+
+    with new(resetting=resetting).states.resetting(), new().states.resetting():
+        assert inside
+
+
+def test_calls_out_of_turn_are_errors(simulation: Simulation) -> None:
+    """Nothing can be captured before an episode begins, or after the end."""
+    states = simulation.states
+    for _ in range(2):
+        with pytest.raises(ClosedError, match="begin_episode"):
+            states.capture_state(np.empty(8))
+        with pytest.raises(ClosedError, match="begin_episode"):
+            states.changed_fields()
+        with pytest.raises(ClosedError, match="begin_episode"):
+            states.capture_snapshot(np.zeros(8, np.uint8))
+        simulation.begin()
+        states.close()
+    states.close()
+    unopened = Capture(lambda: (simulation.model, simulation.data), view=states._view)
+    with pytest.raises(ClosedError, match="open"):
+        unopened.begin_episode()
+
+
+def test_no_opengl_is_needed() -> None:
+    """Not even its library is loaded."""
+    code = f"""
+import os, pathlib, sys, tempfile
+os.environ["MUJOCO_GL"] = "disable"
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_capture import Simulation
+simulation = Simulation(pathlib.Path(tempfile.mkdtemp()))
+assert simulation.begin().refusal is None
+simulation.capture()
+simulation.states.finish()
+maps = open("/proc/self/maps").read()
+assert "libEGL" not in maps and "libOSMesa" not in maps, "OpenGL was loaded"
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What strangers have recorded is read in a sandbox first, and once."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import gymnasium
+import pytest
+from sound_files import finished
+from trajectories_by_hand import write_log
+
+import mjrec
+import mjrec.simulation.foreign_trajectories as foreign_trajectories
+from mjrec.rendering.recorded_facts import open_for_rendering
+from mjrec.simulation.model_trust import directory_digest, note_models
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The modules that were started in a sandbox."""
+    modules: list[str] = []
+
+    class Counted(foreign_trajectories.Sandbox):
+        def __init__(self, module: str, *arguments: object, **options: object) -> None:
+            modules.append(module)
+            super().__init__(module, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(foreign_trajectories, "Sandbox", Counted)
+    return modules
+
+
+def test_a_strangers_file_is_vetted_once(tmp_path: Path, started: list[str]) -> None:
+    """Until it is another one."""
+    path = finished(tmp_path)
+    assert mjrec.load_trajectory(path).snapshots
+    open_for_rendering(path).close()
+    assert len(started) == 1
+    os.utime(path, (0, 0))
+    mjrec.load_trajectory(path)
+    assert len(started) == 2
+
+
+def test_ones_own_files_cost_no_process(
+    tmp_path: Path, started: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a directory that this user has recorded into, wherever they moved."""
+    own = tmp_path / "own"
+    with mjrec.Monitor(gymnasium.make("InvertedPendulum-v5"), own, workers=0) as env:
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+    [path] = own.glob("*.h5")
+    mjrec.load_trajectory(path)
+    assert started == []
+    copy = shutil.copytree(own, tmp_path / "copy") / path.name
+    mjrec.load_trajectory(copy)
+    assert len(started) == 1
+    note_models([directory_digest(copy.parent)])
+    os.utime(copy, (0, 0))
+    mjrec.load_trajectory(copy)
+    # Somebody else, who has the same list of models.
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "elsewhere"))
+    mjrec.load_trajectory(path)
+    assert len(started) == 2
+
+
+def test_what_is_in_flight_is_read_directly(tmp_path: Path, started: list[str]) -> None:
+    """Nothing in a log is packed."""
+    mjrec.load_trajectory(write_log(tmp_path))
+    assert started == []
+
+
+def test_in_a_sandbox_there_is_no_other(
+    tmp_path: Path, started: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Verifying reads in one already."""
+    monkeypatch.setenv("MJREC_SANDBOX", "1")
+    mjrec.load_trajectory(finished(tmp_path))
+    assert started == []

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rendering on a given GPU: found among EGL's devices, and said where there is none."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mjrec.errors import InvalidArgument
+from mjrec.gl import EglDevice, probe, render_on_given_gpu, visible_gpus
+from mjrec.gl.devices import device_of_gpu
+
+# As EGL told of them on a machine with one NVIDIA H100 (driver 580.159.04) while
+# CUDA_VISIBLE_DEVICES was not set, "0" or its UUID.
+H100 = EglDevice(
+    index=0,
+    device_file="",
+    cuda_id=0,
+    software=False,
+    in_use=True,
+    uuid="GPU-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b",
+)
+# There, while it was empty, "1", "-1" or another UUID.
+HIDDEN = replace(H100, cuda_id=None)
+# There, in front of the GPU or behind it as the vendor files were ordered.
+LLVMPIPE = EglDevice(index=0, device_file="", cuda_id=None, software=True, in_use=False)
+OTHER = replace(
+    HIDDEN, index=1, in_use=False, uuid="GPU-0f3e5d1c-2b4a-4968-8877-665544332211"
+)
+CHOOSING = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
+
+
+@pytest.fixture(autouse=True)
+def nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test begins with a GPU, and none leaves a choice behind."""
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+
+
+def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run `code` in a Python whose environment chooses no OpenGL but these."""
+    head = (
+        "import logging, os, sys; logging.basicConfig(level='INFO')\n"
+        "from mjrec.gl import render_on_given_gpu\n"
+    )
+    environ = {k: v for k, v in os.environ.items() if k not in CHOOSING}
+    return subprocess.run(
+        [sys.executable, "-P", "-c", head + code],
+        env={**environ, **variables},
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+
+
+def has_gpu() -> bool:
+    return any(not device.software for device in probe("egl").devices)
+
+
+needs_no_gpu = pytest.mark.skipif(
+    "has_gpu()", reason="there is a GPU that EGL can draw on"
+)
+needs_gpu = pytest.mark.skipif(
+    "not has_gpu()", reason="there is no GPU that EGL can draw on"
+)
+
+
+SHOWN = replace(H100, index=2, cuda_id=3)
+
+
+@pytest.mark.parametrize(
+    ("devices", "gpu", "expected"),
+    [
+        # The one that has a number for CUDA, wherever it is in EGL's list; the number
+        # may count all GPUs, or those that are shown.
+        ([H100], "0", H100),
+        ([LLVMPIPE, OTHER, SHOWN], "0", SHOWN),
+        ([HIDDEN, OTHER, SHOWN, replace(OTHER, index=3)], "3", SHOWN),
+        # EGL tells UUIDs also where CUDA shows nothing; the beginning is enough.
+        ([HIDDEN, OTHER], OTHER.uuid, OTHER),
+        ([HIDDEN, OTHER], "GPU-F3544F26", HIDDEN),
+        # Where none or several would do, it is none.
+        ([], "0", None),
+        ([LLVMPIPE], "0", None),
+        ([HIDDEN], "1", None),
+        ([HIDDEN, OTHER], "GPU-", None),
+        ([HIDDEN], "GPU-00000000-0000-0000-0000-000000000000", None),
+        ([HIDDEN], "MIG-f3544f26-6dc5-5ba3-2ea8-e7c7c99e765b", None),
+        ([H100, replace(H100, index=1)], "0", None),
+    ],
+)
+def test_egls_device_of_a_gpu(
+    devices: list[EglDevice], gpu: str, expected: EglDevice | None
+) -> None:
+    """It is found by CUDA's number or the UUID, and never guessed."""
+    assert device_of_gpu(devices, gpu) is expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2,0", ["2", "0"]),
+        (" 1 , GPU-1a2b ", ["1", "GPU-1a2b"]),
+        ("MIG-1a2b", ["MIG-1a2b"]),
+        ("", []),
+        ("-1", []),
+        ("NoDevFiles", []),
+        ("0,-1,2", ["0"]),
+    ],
+)
+def test_visible_gpus_are_the_variables_entries(text: str, expected: list[str]) -> None:
+    """As CUDA reads it, up to the first that it does not understand."""
+    assert visible_gpus({"CUDA_VISIBLE_DEVICES": text}) == expected
+
+
+def test_visible_gpus_without_the_variable(tmp_path: Path) -> None:
+    """CUDA counts those that may be opened, whatever their files are called."""
+    for name in ("nvidia2", "nvidia5", "nvidiactl", "nvidia-uvm", "null"):
+        (tmp_path / name).touch()
+    # Nobody may open a directory for writing, as nobody a GPU that is not granted.
+    (tmp_path / "nvidia6").mkdir()
+    assert visible_gpus({}, devices=tmp_path) == ["0", "1"]
+    assert visible_gpus({}, devices=tmp_path / "none") == []
+
+
+@pytest.mark.parametrize("gpu", ["", "cuda:0", "0,1", "GPU-1,GPU-2", "-1"])
+def test_what_is_no_entry_is_refused(gpu: str) -> None:
+    """Before anything is tried."""
+    with pytest.raises(InvalidArgument, match="CUDA_VISIBLE_DEVICES"):
+        render_on_given_gpu(gpu)
+
+
+@pytest.mark.parametrize("visible", ["", "-1"])
+def test_a_process_that_was_given_none(visible: str) -> None:
+    """It is told so, and nothing is tried."""
+    done = run(
+        "print(render_on_given_gpu().warning)\nrender_on_given_gpu(required=True)",
+        CUDA_VISIBLE_DEVICES=visible,
+    )
+    assert "was given no GPU" in done.stdout
+    assert "mjrec.errors.GLError: This process was given no GPU" in done.stderr
+
+
+@needs_no_gpu
+def test_one_warning_where_the_cpu_draws() -> None:
+    """It names GPU and CPU; no variable changes; an error where a GPU is required."""
+    done = run(
+        "before = dict(os.environ); given = render_on_given_gpu('3')\n"
+        "assert dict(os.environ) == before\n"
+        "assert given.device is None\n"
+        "print(given.warning)\n"
+        "render_on_given_gpu('GPU-1a2b', required=True)"
+    )
+    assert done.stdout.startswith("GPU 3 was given for rendering, and EGL has only")
+    assert done.stdout.strip() in done.stderr
+    assert done.stderr.count("WARNING") == 1
+    assert "GLError: GPU GPU-1a2b was given for rendering" in done.stderr
+
+
+@pytest.mark.parametrize("backend", ["osmesa", "glfw"])
+def test_a_backend_without_a_choice_of_gpus(backend: str) -> None:
+    """`MUJOCO_GL` stands, and what that means is said."""
+    done = run("print(render_on_given_gpu('0').warning)", MUJOCO_GL=backend)
+    assert f"MUJOCO_GL={backend} cannot be told on which GPU" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("first", "variables", "expected"),
+    [
+        ("import mujoco", {"MUJOCO_GL": "off"}, ""),
+        ("import mujoco", {"MUJOCO_GL": ""}, "cannot change to egl any more"),
+        (
+            "import mujoco; context = mujoco.GLContext(16, 16)",
+            {"MUJOCO_GL": "egl"},
+            "has begun to draw by EGL",
+        ),
+    ],
+)
+def test_too_late_in_a_process(
+    first: str, variables: dict[str, str], expected: str
+) -> None:
+    """An error where what was imported cannot change any more."""
+    done = run(f"{first}\nrender_on_given_gpu('0')", DISPLAY="", **variables)
+    assert expected in done.stderr
+    assert (done.returncode == 0) is (not expected)
+
+
+@needs_gpu
+@pytest.mark.parametrize(
+    "name", [lambda d: "0", lambda d: d.uuid, lambda d: d.uuid[:9]]
+)
+def test_the_given_gpu_draws(name: Callable[[EglDevice], str]) -> None:
+    """By its number and by its UUID; mujoco then draws on that device."""
+    gpu = name(next(d for d in probe("egl").devices if d.cuda_id == 0))
+    done = run(
+        f"given = render_on_given_gpu({gpu!r}, required=True)\n"
+        "import mujoco\n"
+        "from mjrec.simulation.gl_info import current_gl_facts\n"
+        "context = mujoco.GLContext(16, 16); context.make_current()\n"
+        "import OpenGL.GL\n"
+        "facts = current_gl_facts()\n"
+        "assert facts['gl_renderer'] == given.gl_renderer, facts\n"
+        "assert facts['gl_device']['index'] == given.device.index, facts\n"
+        "assert facts['gl_device'].get('uuid', '') == given.device.uuid, facts"
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"Rendering on GPU {gpu}: EGL device" in done.stderr
+
+
+@needs_gpu
+def test_a_gpu_that_is_not_there() -> None:
+    """The GPUs that there are are named."""
+    done = run("print(render_on_given_gpu('77').warning)")
+    assert "GPU 77 was given for rendering, and none of EGL's" in done.stdout

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a row holds of a simulation, and the memory that it is gathered from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+
+from mjrec.formats.trajectory import StateComponent
+from mjrec.simulation.layout import read_state, state_components, state_words
+from mjrec.simulation.memory import WORDS, can_be_gathered, words_of
+
+# Something of every component but plugins'.
+FULL = """
+<mujoco>
+  <size nuserdata="3"/>
+  <worldbody>
+    <body name="moved" mocap="true"><geom size=".1"/></body>
+    <body name="free" pos="0 0 1"><freejoint/><geom size=".1"/></body>
+    <body pos="1 0 1"><joint name="x" type="slide"/><geom size=".1"/></body>
+  </worldbody>
+  <actuator><intvelocity joint="x" actrange="-1 1"/></actuator>
+  {equality}
+</mujoco>
+"""
+EQUALITY = '<equality><weld body1="moved" body2="free"/></equality>'
+
+Simulation = tuple[mujoco.MjModel, mujoco.MjData]
+
+
+def simulated(xml: str) -> Simulation:
+    model = mujoco.MjModel.from_xml_string(xml)
+    return model, mujoco.MjData(model)
+
+
+def check_memory(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Check that the same words hold the state, step after step."""
+    words = state_words(model, data)
+    assert words is not None
+    for step in range(5):
+        data.ctrl[:] = 0.1 * step
+        data.xfrc_applied[1:] = step
+        data.qfrc_applied[:] = -step
+        mujoco.mj_step(model, data, nstep=step)
+        assert WORDS.take(words).tobytes() == read_state(model, data).tobytes()
+    mujoco.mj_resetData(model, data)
+    assert WORDS.take(words).tobytes() == read_state(model, data).tobytes()
+
+
+@pytest.mark.parametrize("xml", [FULL.format(equality=""), "<mujoco/>"])
+def test_the_words_of_a_state_are_what_mujoco_gives(xml: str) -> None:
+    """Mocap bodies, user data, activations and forces from outside as well."""
+    model, data = simulated(xml)
+    data.mocap_pos[:] = 7
+    data.userdata[:] = np.arange(len(data.userdata))
+    check_memory(model, data)
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Humanoid-v5", "Pusher-v5"])
+def test_the_states_of_environments_can_be_gathered(env_id: str) -> None:
+    """As Gymnasium makes them."""
+    env: Any = gymnasium.make(env_id).unwrapped
+    check_memory(env.model, env.data)
+
+
+def test_a_component_of_another_type_has_to_be_asked_for() -> None:
+    """Whether an equality is active is a byte here and a number there."""
+    assert state_words(*simulated(FULL.format(equality=EQUALITY))) is None
+
+
+def test_components_are_where_mujoco_puts_them() -> None:
+    """The arrays of `MjData` are found in its vector by name."""
+    model, data = simulated(FULL.format(equality=EQUALITY))
+    data.ctrl[:], data.xfrc_applied[:], data.userdata[:] = 0.3, 0.1, [7, 8, 9]
+    mujoco.mj_step(model, data, nstep=20)
+    row = read_state(model, data)
+    components = state_components(model)
+    parts = {c.name: row[c.offset : c.offset + c.length] for c in components}
+    others = {"time": [data.time], "warmstart": data.qacc_warmstart}
+    for name, values in parts.items():
+        expected = others.get(name, getattr(data, name, None))
+        np.testing.assert_array_equal(values, np.ravel(expected), err_msg=name)
+    assert {"qpos", "qvel", "act", "ctrl", "eq_active", "mocap_quat"} <= parts.keys()
+    assert sum(map(len, parts.values())) == len(row)
+
+
+def test_what_a_model_has_none_of_is_left_out() -> None:
+    """No activations, no motion capture: no component."""
+    # The forces on the world are part of every state.
+    assert state_components(simulated("<mujoco/>")[0]) == (
+        StateComponent("time", 0, 1),
+        StateComponent("xfrc_applied", 1, 6),
+    )
+
+
+def gathered(words: Any) -> bytes:
+    """Gather a row between two others, as recorders do, which stay as they are."""
+    slots = np.full((3, len(words)), 77, np.uint64)
+    WORDS.take(words, None, slots[1], "clip")
+    assert (slots[[0, 2]] == 77).all()
+    return slots[1].tobytes()
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
+def test_gathered_arrays_lie_one_behind_the_other(order: tuple[int, ...]) -> None:
+    """In the order in which they are given, bit for bit, as they are at that moment."""
+    chance = np.random.default_rng(1)
+    arrays: list[Any] = [
+        np.frombuffer(bytearray(chance.bytes(size)), dtype)
+        for size, dtype in [(24, np.float64), (400_000, np.uint8), (16, np.int32)]
+    ]
+    arrays = [arrays[k] for k in order]
+    words = words_of(arrays)
+    for _ in range(2):
+        assert gathered(words) == b"".join(array.tobytes() for array in arrays)
+        arrays[0][0] = 5
+
+
+def test_an_array_that_ends_within_a_word_takes_the_whole_word() -> None:
+    """The next one begins with a word; what lies between is nobody's."""
+    memory = np.frombuffer(bytearray(range(1, 49)), np.uint8)
+    head, tail = memory[:13], memory[24:32]
+    found = gathered(words_of([head, tail]))
+    assert (found[:13], found[16:]) == (head.tobytes(), tail.tobytes())
+
+
+@pytest.mark.parametrize(
+    ("array", "can_be"),
+    [
+        (np.zeros((3, 2)), True),
+        (np.zeros((3, 2)).T, False),
+        (np.zeros(6)[::2], False),
+        (np.zeros(16, np.uint8)[8:], True),
+        (np.zeros(16, np.uint8)[4:], False),
+        (np.zeros(16, np.uint8)[4:4], True),
+        (np.zeros(3, np.uint8), True),
+    ],
+)
+def test_what_does_not_begin_with_a_word_cannot_be_gathered(
+    array: Any, can_be: bool
+) -> None:
+    """Nor what has gaps; an array without elements is no obstacle."""
+    assert can_be_gathered([np.zeros(1), array]) == can_be

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All of a trajectory as arrays, to be compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from mjrec.formats.trajectory import ModelChange, TrajectoryHeader, TrajectoryReader
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectoryContent:
+    header: TrajectoryHeader
+    states: Any
+    actions: Any
+    rewards: Any
+    terminated: Any
+    truncated: Any
+    observations: Any
+    frame_steps: Any
+    snapshots: Any
+    model_changes: tuple[ModelChange, ...] = ()
+    dropped: int = 0
+
+
+def content_of(reader: TrajectoryReader) -> TrajectoryContent:
+    return TrajectoryContent(
+        header=reader.header,
+        states=reader.states(0, reader.row_count),
+        actions=reader.actions(0, reader.step_count),
+        rewards=reader.rewards,
+        terminated=reader.terminated,
+        truncated=reader.truncated,
+        observations=reader.observations(0, reader.row_count),
+        frame_steps=reader.frame_steps,
+        snapshots=reader.snapshots(0, reader.frame_count),
+        model_changes=reader.model_changes,
+        dropped=reader.dropped,
+    )
