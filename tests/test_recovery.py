@@ -92,7 +92,7 @@ def cut_off(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two live episodes and 7 steps of a third, with provenance."""
     directory = tmp_path_factory.mktemp("cut") / "run"
     kill(
-        "from mjrec.surroundings import look_around\nenv = monitor()\nrun(env)\n"
+        "from mjrec.provenance import look_around\nenv = monitor()\nrun(env)\n"
         "look_around().found(wait=True)\nrun(env)\nrun(env, 7)\ndie(env)",
         directory,
     )
