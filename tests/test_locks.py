@@ -25,7 +25,7 @@ WAIT = 'print("held", flush=True)\nsys.stdin.read()\n'
 # A program and a forked child that outlive the process that holds the lock.
 LEFT = {
     "exec": 'subprocess.Popen(["cat"], stdout=subprocess.DEVNULL, close_fds=False)\n',
-    "fork": "if os.fork() == 0: lock.release()\n",
+    "fork": "if os.fork(): sys.stdin.read()\nlock.release()\n",
 }
 # Adds one under the lock, which is removed and made again all the while.
 COUNT = """

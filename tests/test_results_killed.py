@@ -209,7 +209,7 @@ def test_without_a_manifest_something_else_says_what_was_recorded(
     write_journal(tmp_path, "0.7", 1, run={"env_info": env_info})
     if witness == "lock":
         lock = tmp_path / ".openaigym.0.7.lock"
-        lock.write_text(json.dumps({"pid": 1, "env_info": ENV_INFO}))
+        lock.write_text(json.dumps({"pid": 1, "run": {"env_info": ENV_INFO}}))
     elif witness == "log":
         write_log(tmp_path, 1, env_id=ENV_INFO["env_id"])
     elif witness == "metadata":
@@ -219,7 +219,7 @@ def test_without_a_manifest_something_else_says_what_was_recorded(
 
 
 @pytest.mark.parametrize(
-    "lock", ["", "[1]", '{"env_info": {"env_id": 7}}', "\0" * 9, None]
+    "lock", ["", "[1]", '{"run": {"env_info": {"env_id": 7}}}', "\0" * 9, None]
 )
 def test_what_no_file_says_is_left_out(
     tmp_path: Path, lock: str | None, caplog: pytest.LogCaptureFixture
@@ -228,7 +228,7 @@ def test_what_no_file_says_is_left_out(
     write_journal(tmp_path, "0.7", 1)
     path = tmp_path / ".openaigym.0.7.lock"
     if lock is None:
-        (tmp_path / "secret").write_text(json.dumps({"env_info": ENV_INFO}))
+        (tmp_path / "secret").write_text(json.dumps({"run": {"env_info": ENV_INFO}}))
         path.symlink_to("secret")
     else:
         path.write_text(lock)
