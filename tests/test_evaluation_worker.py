@@ -22,7 +22,7 @@ from recordings import in_flight, videos_in
 import mjrec
 from conftest import Corridor
 from evaluated import FOLDER, PENDULUM, facts_of, plan_of, run_job, states_of, worker_of
-from mjrec.carried_errors import unpacked
+from mjrec.child_python import unpacked
 from mjrec.environments.episode_seeds import episode_seeds
 from mjrec.environments.options import EnvironmentOptions
 from mjrec.evaluation.episode_results import EpisodeResult

@@ -19,8 +19,8 @@ ROWS = (
     {
         *("errors", "json_text", "rates", "frames", "schedules", "atomic_files"),
         *("worker_thread", "gl", "machine", "blank_frames", "patience", "signals"),
-        *("annotation", "file_digests", "provenance"),
-        *("carried_errors", "child_python", "sandbox"),
+        *("annotation", "provenance"),
+        *("child_python", "sandbox"),
     },
     {"engines"},
     {"formats"},

@@ -23,8 +23,7 @@ from processes import children
 from rides import FRAMES, HEIGHT, WIDTH, Ride, record
 
 from mjrec import child_python
-from mjrec.carried_errors import carried, unpacked
-from mjrec.child_python import Child, environment_of_child
+from mjrec.child_python import Child, carried, environment_of_child, unpacked
 from mjrec.errors import (
     ClosedError,
     DirectoryNotWritable,

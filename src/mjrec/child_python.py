@@ -4,6 +4,9 @@
 Not with multiprocessing, whose children import the caller's main module (a script
 without a guard would run again), cannot be started from daemonic processes, and with
 "fork" inherit OpenGL's locks without its threads.
+
+Errors come home from there as JSON (`carried`, `unpacked`): pickle would let a process
+that writes into the pipe run code here.
 """
 
 from __future__ import annotations
@@ -19,10 +22,13 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
+
+from .errors import KINDS, Error
 
 logger = logging.getLogger(__name__)
 
@@ -302,3 +308,44 @@ def _is_of_main(entry: str) -> bool:
     return entry == "" or (
         file is not None and Path(entry).resolve() == Path(file).resolve().parent
     )
+
+
+def carried(error: BaseException) -> dict[str, Any]:
+    """Return what `unpacked` makes an error like `error` of, in plain JSON."""
+    if not isinstance(error, Error):
+        told = "".join(traceback.format_exception(error)).strip()
+        return {
+            "type": "Error",
+            "message": f"A worker failed in a way that nobody foresaw.\n{told}",
+        }
+    # One that a module made of its own is known by the nearest that everybody knows.
+    kinds = (kind.__name__ for kind in type(error).__mro__)
+    return {
+        "type": next(name for name in kinds if name in KINDS),
+        "message": str(error),
+        "facts": {k: _plain(v) for k, v in vars(error).items() if _is_plain(v)},
+    }
+
+
+def unpacked(plain: Mapping[str, Any]) -> Error:
+    """Return the error that was carried.
+
+    It has the class, the message and, of the attributes, numbers, texts, lists of them
+    and paths.
+    """
+    kind = KINDS.get(plain["type"], Error)
+    error = kind.__new__(kind)
+    error.args = (plain["message"],)
+    for key, value in plain.get("facts", {}).items():
+        setattr(error, key, Path(value["path"]) if isinstance(value, dict) else value)
+    return error
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, list):
+        return all(isinstance(item, str | int | float) for item in value)
+    return value is None or isinstance(value, str | int | float | Path)
+
+
+def _plain(value: Any) -> Any:
+    return {"path": str(value)} if isinstance(value, Path) else value

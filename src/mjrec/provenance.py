@@ -25,6 +25,7 @@ import sys
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from .child_python import environment_of_child, python_command, take_standard_output
@@ -248,3 +249,21 @@ def _main() -> None:
 
 if __name__ == "__main__":
     _main()
+
+
+_PACKAGES = (
+    *("mjrec", "mujoco", "gymnasium", "gymnasium-robotics", "dm-control", "numpy"),
+    "imageio-ffmpeg",
+)
+
+
+@functools.cache
+def versions() -> Mapping[str, str]:
+    """Return the versions of Python and of the packages that are installed."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return MappingProxyType(found)

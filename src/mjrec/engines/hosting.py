@@ -25,8 +25,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from ..carried_errors import carried, unpacked
-from ..child_python import said_in
+from ..child_python import carried, said_in, unpacked
 from ..errors import Error
 from .gpu_shares import GpuShare
 from .home_log import HomeLog

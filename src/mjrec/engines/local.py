@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..carried_errors import unpacked
-from ..child_python import environment_of_child
+from ..child_python import environment_of_child, unpacked
 from ..errors import Error, InvalidArgument
 from ..gl.devices import CUDA_VISIBLE_DEVICES, visible_gpus
 from ..machine import usable_cpus

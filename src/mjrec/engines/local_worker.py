@@ -39,8 +39,7 @@ import threading
 from collections.abc import Mapping
 from typing import Any, cast
 
-from ..carried_errors import carried
-from ..child_python import say_stacks_when_asked
+from ..child_python import carried, say_stacks_when_asked
 from ..gl.devices import render_on_given_gpu
 from ..signals import Terminated, exiting_on_signals, received
 from .work import Handler

@@ -27,7 +27,7 @@ from ..errors import (
 )
 from ..formats.locks import try_lock
 from ..gl.choice import choose
-from ..recorder.versions import versions
+from ..provenance import versions
 from ..rendering.engine_jobs import environ_for_drawing, given_engine
 from ..simulation.model_trust import stored_models
 from .chosen_videos import ChosenVideos, drawn_by_workers, render_chosen

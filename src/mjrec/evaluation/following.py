@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..carried_errors import unpacked
+from ..child_python import unpacked
 from ..engines.work import Job, JobOutcome, Run
 from ..errors import EnvironmentNotMade, PicturesDiffer
 from ..formats.monitor_directory import Infix

@@ -9,8 +9,8 @@ where it is an object. Jobs, by their `kind`, each of which may be done again:
 `check`    `{"task"}`: makes the environment and the policy, and takes no step. Returns
            `{"env_id", "step_limit", "deferrable", "reason", "velocities"}`, the last
            one the number of degrees of freedom (0 without MuJoCo), or `{"error": ...}`
-           where they cannot be: as `carried_errors` packs it, so that it comes home
-           as what it is, and leaves no traceback in the log that nobody needs.
+           where they cannot be: as `child_python.carried` packs it, so that it comes
+           home as what it is, and leaves no traceback in the log.
 `run`      `{"task", "folder", "seed", "episodes"}`: runs the episodes of a batch; where
            somebody has begun it before, those that no ledger has. Returns
            `{"episodes": how many it ran, "models": [sha256 of compiled ones, ...]}`,
@@ -33,7 +33,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..carried_errors import carried
+from ..child_python import carried
 from ..engines.work import AGAIN
 from ..errors import Error, GLError
 from ..gl import use_gl

@@ -25,8 +25,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
+from ..atomic_files import file_sha256
 from ..errors import EncoderError, Error, InvalidArgument, MissingDependency
-from ..file_digests import file_sha256
 from ..frames import Frame
 from ..patience import Patience
 

@@ -20,9 +20,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from ..atomic_files import write_text
+from ..atomic_files import file_sha256, write_text
 from ..errors import DirectoryNotWritable
-from ..file_digests import file_sha256
 from ..json_text import dumps
 from .ffmpeg import FfmpegProcess, as_file, every_frame_arguments
 from .frame_hashes import cut_frame_hashes, frame_hash_path

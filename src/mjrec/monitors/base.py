@@ -12,7 +12,6 @@ from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVa
 
 from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
-from ..recorder.declared_rate import declared_rate
 from ..recorder.deferred_video import DeferredVideo
 from ..recorder.endings import last_error
 from ..recorder.exit_guard import ExitGuard
@@ -28,7 +27,7 @@ from ..recorder.options import (
 from ..recorder.recorder import Recorder
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.subject import Subject
-from ..recorder.video_recorder import VideoRecorder
+from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..rendering.background import Background
 from ..simulation.inside import simulation_time
 from .cameras import CameraPictures

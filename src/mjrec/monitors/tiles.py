@@ -11,11 +11,10 @@ from typing import Any
 from ..environments.gymnasium_pictures import gymnasium_pictures
 from ..errors import InvalidArgument, NoPictures
 from ..formats.monitor_directory import Infix, video_prefix
-from ..recorder.declared_rate import declared_rate
 from ..recorder.endings import CLOSE, RESET, ending
 from ..recorder.live_videos import LiveVideos
 from ..recorder.options import OFF, WARN, RecorderOptions
-from ..recorder.video_recorder import VideoRecorder
+from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..schedules import disable_videos, to_schedule
 from ..simulation.inside import simulation_time
 from .base import MonitorBase

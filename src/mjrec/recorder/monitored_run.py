@@ -20,16 +20,15 @@ from ..formats.monitor_directory import (
 from ..formats.span_writer import SpanLogs
 from ..formats.video_names import second_name_of
 from ..machine import machine_fingerprint
-from .episode_videos import EpisodeVideos
-from .faults import Faults, What
+from ..provenance import versions
 from .finisher import Finisher
 from .opening import OpenDirectory
 from .options import LIVE, RecorderOptions
-from .run_journal import RunJournal
+from .run_journal import Faults, RunJournal, What
 from .stats_recorder import StatsRecorder
 from .subject import EpisodePictures, Subject, check_refusal
+from .tracking import EpisodeVideos
 from .trajectory_recorder import Pace
-from .versions import versions
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:

@@ -31,19 +31,17 @@ from .deferred_video import DeferredVideo
 from .endings import CLOSE, INTERRUPT, RESET, ending
 from .episode_choice import EpisodeChoice
 from .episode_recording import EpisodeRecording
-from .episode_videos import EpisodeVideos
 from .fast_path import FastPath
-from .faults import Faults
 from .finisher import Finisher, LaterFinisher
 from .kept_videos import KeptVideos
 from .monitored_run import BegunEpisode, MonitoredRun
 from .opening import OpenDirectory, open_directory
 from .options import LIVE, RecorderOptions, type_of_mode
-from .run_journal import RunJournal, facts_of
+from .run_journal import Faults, RunJournal, facts_of
 from .selection import Standing
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import Subject, check_pictures
-from .tracking import FinishedEpisode, Run, Trackers
+from .tracking import EpisodeVideos, FinishedEpisode, Run, Trackers
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:

@@ -14,6 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..formats.monitor_directory import episode_of
+from ..formats.video_metadata import (
+    finished_videos,
+    is_broken,
+    is_done,
+    metadata_path,
+)
 from ..formats.video_names import view_of
 
 logger = logging.getLogger(__name__)
@@ -166,13 +173,13 @@ class Trackers:
         Args:
             finished: the number of the episode, the video and its metadata.
         """
-        for episode_id, path, metadata_path in finished:
+        for episode_id, path, about in finished:
             self._tell(
                 episode_id,
                 "video",
                 FinishedVideo(
                     path=path,
-                    metadata_path=metadata_path,
+                    metadata_path=about,
                     episode_id=episode_id,
                     episode=self._episodes.get(episode_id),
                     view=view_of(path.name),
@@ -198,3 +205,32 @@ class Trackers:
                 # So that it lets go of what it holds open, as far as it still can.
                 with contextlib.suppress(Exception):
                     tracker.end(self._run)
+
+
+class EpisodeVideos:
+    """Watches for videos, whoever makes them."""
+
+    def __init__(self) -> None:
+        self._awaited: dict[Path, None] = {}
+
+    def expect(self, video: Path) -> None:
+        """Watch for the first video of an episode or a clip."""
+        self._awaited[video] = None
+
+    def news(self) -> list[tuple[int, Path, Path]]:
+        """Return what is finished since the last call.
+
+        A video counts as soon as its metadata is there, which is written last.
+
+        Returns:
+            The number of the episode, the video and its metadata, of each.
+        """
+        done = [video for video in self._awaited if is_done(video)]
+        for video in done:
+            del self._awaited[video]
+        return [
+            (episode_of(name) or 0, video.with_name(name), video.with_name(about))
+            for video in done
+            if not is_broken(metadata_path(video))
+            for name, about in finished_videos(video)
+        ]

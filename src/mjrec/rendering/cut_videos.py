@@ -3,6 +3,9 @@
 
 The encoder goes on to the end of what it was given, and finishes its hidden file. A
 note beside it says what it is.
+
+Text recordings are on the disk frame by frame, and have no note: their frames tell the
+rate, and the trajectory, where there is one, the episode.
 """
 
 from __future__ import annotations
@@ -16,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import EncoderError, Error, MissingDependency, UnreadableFile
+from ..formats.asciicast import AsciicastWriter, unfinished_recording
 from ..formats.ffmpeg import ffmpeg_executable, ffmpeg_sha256, ffmpeg_version
 from ..formats.locks import is_locked
-from ..formats.monitor_directory import episode_of
+from ..formats.monitor_directory import episode_of, video_prefix
 from ..formats.unfinished_video import UnfinishedVideo, VideoFile, VideoNote, read_note
 from ..formats.video_metadata import (
     StepRuns,
@@ -221,3 +225,56 @@ def _encoder(note: VideoNote) -> dict[str, Any]:
     )
     encoder["sha256"] = ffmpeg_sha256() if is_same else None
     return encoder
+
+
+_TOLD_BY_TRAJECTORY = ("type", "env_id", "seed", "options", "versions")
+
+
+def finish_text(part: Path, known: KnownEpisodes) -> RecoveredFile | None:
+    """Make a text recording, and its metadata, of the frames that are there.
+
+    Args:
+        part: the hidden file that the frames were written into.
+        known: what is known of the monitor's episodes.
+
+    Returns:
+        What was made; None where it was there already.
+
+    Raises:
+        UnreadableFile: there is no whole frame in it.
+        Error: the files cannot be written.
+    """
+    number = episode_of(part.name)
+    assert number is not None
+    path = part.with_name(f"{video_prefix(known.infix, number)}.json")
+    if metadata_path(path).exists():
+        part.unlink(missing_ok=True)
+        return None
+    rate, frames = unfinished_recording(part)
+    ending = known.ending(number)
+    sums = known.sums(number)
+    if ending is None or sums.get("length") != len(frames) - 1:
+        ending = {"complete": False, "reason": "killed"}
+    writer = AsciicastWriter(path, rate=rate)
+    for frame in frames:
+        writer.write(frame)
+    writer.close()
+    facts: dict[str, Any] = dict(known.facts(number))
+    write_metadata(
+        path,
+        {
+            "episode_id": number,
+            "content_type": "video/vnd.openai.ansivid",
+            "encoder_version": {"backend": "TextEncoder", "version": 1},
+            "recording": "live",
+            **{key: facts[key] for key in _TOLD_BY_TRAJECTORY if key in facts},
+            **ending,
+            **sums,
+            **timing_facts(StepRuns(range(len(frames))), fps=rate, timestep=None),
+            "recovered": True,
+        },
+    )
+    part.unlink(missing_ok=True)
+    cut = "" if ending["complete"] else f", incomplete: {ending['reason']}"
+    count = f"{len(frames)} {'frame' if len(frames) == 1 else 'frames'}"
+    return RecoveredFile(path.name, count + cut)

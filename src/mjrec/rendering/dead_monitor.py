@@ -30,8 +30,7 @@ from ..json_text import loads
 from ..results.listing import Listing, listing_lock, write_listing
 from ..results.recorded_environment import locked_run
 from ..results.sources import MonitorResults
-from .cut_texts import finish_text
-from .cut_videos import finish_video
+from .cut_videos import finish_text, finish_video
 from .known_episodes import KnownEpisodes
 from .recorded_facts import open_for_rendering, video_path
 from .recordings import claim, key_of, parts_of

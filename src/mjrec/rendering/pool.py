@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ..carried_errors import unpacked
-from ..child_python import Child
+from ..child_python import Child, unpacked
 from ..errors import ClosedError, Error, GLError, InvalidArgument
 from ..frames import Frame
 from ..gl import backend_for_children

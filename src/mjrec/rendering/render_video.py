@@ -26,9 +26,9 @@ from ..formats.video_names import second_name_of
 from ..formats.video_sink import VideoSink
 from ..frames import Frame, grid_shape
 from ..machine import machine_fingerprint
+from ..provenance import versions
 from ..rates import to_rate
 from ..recorder.endings import KILLED
-from ..recorder.versions import versions
 from .jobs import Variant
 from .pool import WorkerPool
 from .recorded_facts import (

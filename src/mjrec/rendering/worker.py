@@ -33,8 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from ..carried_errors import carried
-from ..child_python import say_stacks_when_asked, take_standard_output
+from ..child_python import carried, say_stacks_when_asked, take_standard_output
 from ..simulation.canvas import KeptCanvas
 from ..simulation.gl_probe import try_backend
 from .drawing import open_drawing

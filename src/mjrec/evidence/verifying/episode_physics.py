@@ -19,7 +19,7 @@ from ...environments.made_again import (
 )
 from ...errors import InvalidArgument, UnreadableFile
 from ...formats.trajectory import TrajectoryReader
-from ...recorder.versions import versions
+from ...provenance import versions
 from ...simulation.fields import changed_model, differing_from, keeps_paths
 from ...simulation.model_store import model_digest
 from ..verification import Check, Level, Verdict

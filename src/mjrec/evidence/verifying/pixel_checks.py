@@ -37,7 +37,7 @@ from ...formats.json_fields import read_object
 from ...formats.monitor_directory import iter_monitor_files
 from ...frames import Frame
 from ...machine import machine_fingerprint, usable_cpus
-from ...recorder.versions import versions
+from ...provenance import versions
 from ...rendering.pool import WorkerPool
 from ...simulation.model_trust import trusting_models
 from ..verification import Check, Level, Verdict

@@ -25,7 +25,7 @@ from typing import Any, Final
 import numpy as np
 
 from ...machine import machine_fingerprint
-from ...recorder.versions import versions
+from ...provenance import versions
 from ...simulation.replay import has_jumping_contacts, turns_by_rk4
 
 _TOLERANCE: Final = 1e-9
