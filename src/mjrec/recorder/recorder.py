@@ -102,7 +102,7 @@ class Recorder:
             resume=options.resume,
             uid=options.uid,
             env_info={"gym_version": GYM_VERSION, "env_id": subject.env_id},
-            facts=facts_of(self._choice),
+            facts={**facts_of(self._choice), "views": [*subject.further_views]},
         )
         self._next_episode_id = self._place.first_episode_id
         for states in self._all_states():

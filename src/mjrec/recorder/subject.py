@@ -9,6 +9,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import NoPictures, PicturesDiffer
+from ..formats.video_names import further_parts
 from .options import RenderingChoice
 from .video_recorder import PictureSource, can_give_pictures
 
@@ -58,6 +59,11 @@ class Subject:
     clip_states: Capture | None = None
     environment: Mapping[str, Any] | None = None
     random_state: Callable[[], Any] = lambda: None
+
+    @property
+    def further_views(self) -> list[str]:
+        """What the names of further cameras' videos have before their ending."""
+        return further_parts(self.cameras) or list(self.further_pictures)
 
 
 def check_pictures(subject: Subject) -> None:

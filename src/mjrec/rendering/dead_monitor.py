@@ -12,6 +12,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -48,6 +49,9 @@ logger = logging.getLogger(__name__)
 _MOMENT = 0.05
 _LONGEST_LOCK = 1 << 16
 _LONGEST_LINE = 1 << 26
+_CLIP_METADATA = re.compile(
+    r"(?P<video>.*\.video(?P<episode>\d{6,18})\.step\d+)\.meta\.json", re.ASCII
+)
 
 
 class DeadMonitors:
@@ -117,6 +121,7 @@ class DeadMonitors:
         has_news = len(self.files) > before
         self._sweep(look_through(self._directory, remains.infix), kept)
         if _has_recordings(remains) and (has_news or lacks_results(remains)):
+            lines += _missing_live_clips(look_through(self._directory, remains.infix))
             self._complete_journal(remains, lines)
             listing = write_listing(self._directory, remains.infix, is_own=True)
             assert listing is not None
@@ -283,6 +288,17 @@ def _missing_clips(remains: Remains) -> Iterator[tuple[str, Mapping[str, Any]]]:
                     "video": video_path(parts[0], facts).name,
                 },
             )
+
+
+def _missing_live_clips(
+    remains: Remains,
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield the clips of which there is metadata; most of them the journal has."""
+    for path in remains.paths:
+        match = _CLIP_METADATA.fullmatch(path.name)
+        if match is not None:
+            number = int(match["episode"])
+            yield "clip", {"episode_id": number, "video": f"{match['video']}.mp4"}
 
 
 def _facts_of(path: Path) -> Mapping[str, Any]:

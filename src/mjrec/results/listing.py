@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from .. import json_text
 from ..errors import DirectoryNotWritable, UnreadableFile
-from ..formats.in_flight import recordings_in_flight
-from ..formats.json_fields import read_object
+from ..formats.in_flight import is_in_flight
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.manifest import Manifest, read_manifest, write_manifest
 from ..formats.monitor_directory import (
@@ -28,6 +26,7 @@ from ..formats.monitor_directory import (
     infix_of,
     is_manifest,
     iter_monitor_files,
+    journal_name,
     lock_name,
     manifest_lock_name,
     manifest_name,
@@ -35,17 +34,22 @@ from ..formats.monitor_directory import (
     trajectory_prefix,
     video_prefix,
 )
-from ..formats.pending_videos import failure_path, reason_of
+from ..formats.pending_videos import forget_failure, reason_of
+from ..formats.spans import FINISHED
 from ..formats.stats_file import StatsFile, read_stats_file, write_stats_file
-from ..formats.video_metadata import is_done, metadata_path
-from ..formats.video_names import tiled_name
+from ..formats.video_metadata import (
+    finished_videos,
+    is_broken,
+    is_done,
+    metadata_path,
+)
+from ..formats.video_names import tiled_name, with_part
 from .monitor_files import MonitorFiles
 from .recorded_environment import GYM_VERSION
 from .run import Run
 from .sources import MonitorResults
 
 _FORMAT_VERSION = 1
-_FIRST_METADATA = re.compile(r"(?P<video>.*\.video\d{6,18}(\.step\d+)?)\.meta\.json")
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ class Listing:
 
 
 def write_listings(directory: Path) -> None:
-    """Bring the manifests of all monitors that are closed up to date.
+    """Bring the manifests of closed monitors up to date that call videos pending.
 
     Raises:
         UnreadableFile: one is damaged; the others are updated.
@@ -83,8 +87,8 @@ def write_listings(directory: Path) -> None:
         infix = Infix.parse(infix_of(path.name) or "")
         if infix is not None and is_manifest(path.name):
             try:
-                # One that says nothing of us is gym's own.
-                if read_manifest(path).mjrec is not None:
+                # Of the others nothing can be new; those of gym have no such key.
+                if (read_manifest(path).mjrec or {}).get("pending"):
                     write_listing(directory, infix)
             except UnreadableFile as error:
                 damaged = damaged or error
@@ -136,11 +140,11 @@ def write_listing(
         is_new_stats = stats is not None and _saved(directory / name) != stats
         if stats is not None and is_new_stats:
             write_stats_file(directory / name, stats)
-        manifest = _manifest(directory, infix, files, results, run, stats_name=name)
+        manifest = _manifest(directory, infix, results, run, stats_name=name)
         is_new = old is None or _as_read(manifest) != old
         if is_new:
             write_manifest(directory / manifest_name(infix), manifest)
-        _forget_failures(directory, files, manifest)
+        _forget_failures(directory, results.details, manifest)
     return Listing(manifest, stats, is_new, is_new_stats)
 
 
@@ -162,12 +166,13 @@ def listing_lock(directory: Path, infix: Infix) -> Iterator[None]:
 
 
 def _files_of(directory: Path, infix: Infix) -> MonitorFiles:
-    own = f".{infix}."
-    with os.scandir(directory) as entries:
-        names = [e.name for e in entries if own in e.name]
-    paths = (directory / n for n in names if infix_of(n) == str(infix))
-    in_flight = (each.path for each in recordings_in_flight(directory, infix))
-    return MonitorFiles(str(infix), (*paths, *in_flight))
+    """Return what results are read from.
+
+    By their names: a folder may hold the files of thousands of monitors.
+    """
+    names = (manifest_name(infix), f"{stats_prefix(infix)}.stats.json")
+    paths = [directory / name for name in (*names, journal_name(infix))]
+    return MonitorFiles(str(infix), [path for path in paths if path.exists()])
 
 
 def _stats_of(results: MonitorResults) -> StatsFile | None:
@@ -193,21 +198,15 @@ def _as_read(manifest: Manifest) -> Manifest:
 
 
 def _manifest(
-    directory: Path,
-    infix: Infix,
-    files: MonitorFiles,
-    results: MonitorResults,
-    run: Run,
-    *,
-    stats_name: str,
+    directory: Path, infix: Infix, results: MonitorResults, run: Run, *, stats_name: str
 ) -> Manifest:
     """Return the manifest; what the journal lost, the old one may still say."""
     old = results.details
-    finished, broken = _videos(directory, files)
-    pending = _pending(directory, infix, files, run, old)
+    finished, broken = _videos(_first_videos(directory, infix, run, results), run)
+    pending = _pending(directory, infix, run, old)
     if run.facts or not old:
         names = [*(video for video, _ in finished), *broken]
-        details = _details(run, files, old, pending, names)
+        details = _details(run, old, pending, names)
     else:
         details = {**old}
     return Manifest(
@@ -222,7 +221,6 @@ def _manifest(
 
 def _details(
     run: Run,
-    files: MonitorFiles,
     old: Mapping[str, Any],
     pending: Sequence[Mapping[str, Any]],
     names: Sequence[str],
@@ -231,7 +229,6 @@ def _details(
 
     Args:
         run: as its journal tells it.
-        files: of the monitor.
         old: what the manifest that is there says.
         pending: the videos that are pending.
         names: of those that are there, or broken.
@@ -245,14 +242,15 @@ def _details(
         numbers = [*map(episode_of, names), *(e.get("episode_id") for e in pending)]
         chosen.update(number for number in numbers if number is not None)
         chosen = set(keep.pop("recorded", chosen))
-    following = max(run.last_episode_id, files.last_episode_id) + 1
     faults = [fault for fault in old.get("faults") or () if fault not in run.faults]
     return {
         "format_version": _FORMAT_VERSION,
         "schedule": {"name": name, "recorded": sorted(chosen)},
         **({} if keep is None else {"keep": keep}),
         "first_episode_id": run.facts.get("first_episode_id", 0),
-        "next_episode_id": max(following, old.get("next_episode_id") or 0),
+        "next_episode_id": max(
+            run.last_episode_id + 1, old.get("next_episode_id") or 0
+        ),
         "faults": [*faults, *run.faults],
         "versions": run.facts.get("versions", {}),
         "surroundings": run.surroundings or old.get("surroundings"),
@@ -275,50 +273,53 @@ def _keep(run: Run) -> dict[str, Any] | None:
     }
 
 
+def _first_videos(
+    directory: Path, infix: Infix, run: Run, results: MonitorResults
+) -> list[Path]:
+    """Return the videos that there may be, in order, but for further cameras'."""
+    names = {f"{video_prefix(infix, number)}.mp4" for number in run.filmed}
+    names.update(run.clips)
+    if not run.facts and results.manifest is not None:
+        # The journal is gone, or its beginning.
+        manifest, old = results.manifest, results.details
+        names.update(video for video, _ in manifest.videos)
+        names.update(f"{_stem(about)}.mp4" for about in old.get("broken") or ())
+        pending = filter(_names_video, old.get("pending") or ())
+        names.update(entry["video"] for entry in pending)
+    return [directory / name for name in sorted(names)]
+
+
 def _videos(
-    directory: Path, files: MonitorFiles
+    firsts: Iterable[Path], run: Run
 ) -> tuple[list[tuple[str, str]], list[str]]:
     """Return finished videos, each with its metadata, and the metadata of broken ones.
 
-    A further camera's names its first video, whose metadata comes last of all. One that
-    was rendered another way names none, and is nobody's but its maker's.
+    A video of further cameras is there once its first video is, whose metadata comes
+    last of all. The tiled one of a vector environment is there by itself.
     """
-    finished: list[tuple[str, str]] = []
-    broken: list[str] = []
-    names = {path.name for path in files.all_metadata}
-    for path in files.all_metadata:
-        try:
-            said = read_object(path)
-        except (OSError, ValueError):
-            said = {}
-        video = _video_of(path, said, names)
-        if video is None:
-            continue
-        if said.get("broken"):
-            broken.append(path.name)
-        elif video.exists():
-            finished.append((video.name, path.name))
-    return finished, broken
-
-
-def _video_of(metadata: Path, said: Mapping[str, Any], names: set[str]) -> Path | None:
-    """Return the video that a manifest lists with its metadata; None for others."""
-    stem = metadata.name.removesuffix(".meta.json")
-    video = metadata.with_name(f"{stem}.mp4")
-    if _FIRST_METADATA.fullmatch(metadata.name):
-        text = video.with_suffix(".json")
-        return text if not video.exists() and text.exists() else video
-    first = said.get("first_video")
-    if isinstance(first, str) and metadata_path(Path(first)).name in names:
-        return video
-    number = episode_of(metadata.name)
-    prefix = stem.rpartition(".")[0]
-    is_tiled = number is not None and video.name == tiled_name(f"{prefix}.mp4")
-    return video if is_tiled and said.get("tiled") else None
+    finished: dict[tuple[str, str], None] = {}
+    broken: dict[str, None] = {}
+    for first in firsts:
+        views = [first, first.with_name(tiled_name(first.name))]
+        if metadata_path(first).exists():
+            names = (with_part(first.name, view) for view in run.facts.get("views", ()))
+            views += map(first.with_name, names)
+            views += (first.with_name(name) for name, _ in finished_videos(first))
+        for video in views:
+            about = metadata_path(video)
+            text = video.with_suffix(".json")
+            if not about.exists():
+                continue
+            if is_broken(about):
+                broken[about.name] = None
+            elif video.exists() or text.exists():
+                there = video if video.exists() else text
+                finished[there.name, about.name] = None
+    return sorted(finished), sorted(broken)
 
 
 def _pending(
-    directory: Path, infix: Infix, files: MonitorFiles, run: Run, old: Mapping[str, Any]
+    directory: Path, infix: Infix, run: Run, old: Mapping[str, Any]
 ) -> list[Mapping[str, Any]]:
     """Return how a manifest names the videos that are still to be rendered."""
     keep = run.keep or {}
@@ -331,12 +332,13 @@ def _pending(
             "video": f"{video_prefix(infix, number)}.mp4",
         }
         for number in sorted(wanted & run.deferred)
-        if number in files.trajectories
+        if _is_recorded(directory / f"{trajectory_prefix(infix, number)}{FINISHED}")
     ]
     clips = [
         {key: clip[key] for key in ("episode_id", "clip", "video")}
         for clip in run.clips.values()
-        if clip.get("clip") in files.clip_parts
+        if ClipPart.parse(str(clip.get("clip"))) is not None
+        and _is_recorded(directory / str(clip["clip"]))
     ]
     entries += sorted(clips, key=lambda clip: str(clip["video"]))
     if not run.facts:
@@ -347,6 +349,14 @@ def _pending(
         for entry in entries
         if not _names_video(entry) or not is_done(directory / entry["video"])
     ]
+
+
+def _is_recorded(path: Path) -> bool:
+    try:
+        return path.is_file() or is_in_flight(path)
+    except UnreadableFile:
+        # It may be in the list that cannot be read.
+        return True
 
 
 def _names_video(entry: Mapping[str, Any]) -> bool:
@@ -366,15 +376,17 @@ def _with_reason(directory: Path, entry: Mapping[str, Any]) -> Mapping[str, Any]
     return said if reason is None else {**said, "reason": reason}
 
 
-def _forget_failures(directory: Path, files: MonitorFiles, manifest: Manifest) -> None:
+def _forget_failures(
+    directory: Path, old: Mapping[str, Any], manifest: Manifest
+) -> None:
     """Remove what was said of videos that are not pending any more."""
-    pending = (manifest.mjrec or {}).get("pending") or ()
-    said = {
-        failure_path(directory / str(entry[key])).name
-        for entry in pending
-        for key in ("video", "clip")
-        if key in entry and _names_video(entry)
-    }
-    for path in files.failures:
-        if path.name not in said:
-            path.unlink(missing_ok=True)
+    waiting = {entry.get("video") for entry in (manifest.mjrec or {})["pending"]}
+    for entry in filter(_names_video, old.get("pending") or ()):
+        if entry["video"] not in waiting:
+            forget_failure(directory / entry["video"])
+            if ClipPart.parse(str(entry.get("clip"))) is not None:
+                forget_failure(directory / str(entry["clip"]))
+
+
+def _stem(metadata: str) -> str:
+    return metadata.removesuffix(".meta.json")

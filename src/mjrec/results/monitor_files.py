@@ -10,14 +10,12 @@ from pathlib import Path
 from ..formats.in_flight import recordings_in_flight
 from ..formats.journal import MOST_EPISODES
 from ..formats.monitor_directory import (
-    ClipPart,
     Infix,
     episode_of,
     infix_of,
     is_manifest,
     iter_monitor_files,
 )
-from ..formats.pending_videos import FAILED
 
 # Videos of further cameras have the camera's name before the ending.
 _VIDEO = re.compile(r".*\.video(?P<episode>\d{6,})\.(?P<kind>meta\.json|mp4|avi|json)")
@@ -39,9 +37,6 @@ class MonitorFiles:
         videos: its videos, by the numbers of their episodes.
         metadata: their metadata, likewise.
         trajectories: the recorded states, likewise; also what is not finished yet.
-        clip_parts: what the parts of clips in flight are called.
-        all_metadata: that of all videos, also of further cameras and of clips, sorted.
-        failures: what says why videos could not be rendered.
         last_episode_id: the highest number of an episode in a name, also of a file
             that was never finished; -1 where there is none.
     """
@@ -55,11 +50,8 @@ class MonitorFiles:
         self.videos: dict[int, Path] = {}
         self.metadata: dict[int, Path] = {}
         self.trajectories: dict[int, Path] = {}
-        self.clip_parts: set[str] = set()
-        self.all_metadata: list[Path] = []
-        self.failures: list[Path] = []
         self.last_episode_id = -1
-        for path in sorted(paths):
+        for path in paths:
             self._sort_in(path)
 
     def _sort_in(self, path: Path) -> None:
@@ -68,13 +60,7 @@ class MonitorFiles:
         if number is not None and number < MOST_EPISODES:
             self.last_episode_id = max(self.last_episode_id, number)
         video = _VIDEO.fullmatch(path.name)
-        if path.name.endswith(".meta.json"):
-            self.all_metadata.append(path)
-        if ClipPart.parse(path.name) is not None:
-            self.clip_parts.add(path.name)
-        elif path.name.endswith(FAILED):
-            self.failures.append(path)
-        elif is_manifest(path.name):
+        if is_manifest(path.name):
             self.manifest = path
         elif path.name.endswith(".stats.json"):
             self.stats = path

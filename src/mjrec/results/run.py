@@ -23,12 +23,15 @@ class Run:
 
     Attributes:
         facts: what the journal's first line says: `env_info`, `schedule` (its name),
-            `keep` (`rule`, `left_open`), `first_episode_id`, `versions`.
+            `keep` (`rule`, `left_open`), `first_episode_id`, `versions`, and `views`,
+            what the names of further cameras' videos have before their ending.
         surroundings: what was around it; None where that is not known.
         last_episode_id: the highest number of an episode that has begun; -1 before.
         chosen: the episodes that the schedule chose.
-        deferred: those whose video is to be rendered from their states.
-        clips: the clips that are to be rendered, as a manifest lists them.
+        filmed: those that have a video of their own, or will have one.
+        deferred: those of them whose video is to be rendered from their states.
+        clips: the clips, by the names of their videos. One that is to be rendered says
+            what its first part is called, `clip`.
         faults: what could not be recorded, likewise.
         keep: the latest word on which videos are kept; None before there is one.
         dropped: episodes whose video fell out, though their trajectory stays.
@@ -39,6 +42,7 @@ class Run:
     surroundings: Mapping[str, Any] | None = None
     last_episode_id: int = -1
     chosen: set[int] = field(default_factory=set)
+    filmed: set[int] = field(default_factory=set)
     deferred: set[int] = field(default_factory=set)
     clips: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     faults: list[Mapping[str, Any]] = field(default_factory=list)
@@ -101,6 +105,8 @@ class Run:
         self.last_episode_id = max(self.last_episode_id, number)
         if chosen:
             self.chosen.add(number)
+        if recording:
+            self.filmed.add(number)
         if recording == "deferred":
             self.deferred.add(number)
 
