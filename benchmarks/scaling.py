@@ -26,7 +26,7 @@ from mjrec.evaluation.results_files import write_results
 from mjrec.evaluation.settling import settle_monitor
 from mjrec.evaluation.summaries import Bootstrap
 from mjrec.evaluation.summarizing import summarize_results
-from mjrec.recorder.selection import UNDECIDED
+from mjrec.recorder.keep_rules import UNDECIDED
 from mjrec.rendering.recordings import remove_unfinished
 
 from .children import call

@@ -18,8 +18,8 @@ from trajectories_by_hand import add_row, new_logs
 from mjrec.formats.monitor_directory import Infix
 from mjrec.formats.trajectory import ModelChange, TrajectoryHeader
 from mjrec.simulation.cameras import Camera, resolve_camera
+from mjrec.simulation.captured_arrays import snapshot_layout
 from mjrec.simulation.fields import read_fields
-from mjrec.simulation.layout import snapshot_layout
 from mjrec.simulation.model_store import ModelStore
 from mjrec.simulation.renderer import SceneRenderer
 from mjrec.simulation.snapshot import SnapshotSource

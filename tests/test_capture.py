@@ -20,10 +20,10 @@ from touch_grid import TOUCH_GRID
 
 from mjrec.errors import ClosedError, PicturesDiffer
 from mjrec.simulation.capture import Capture, EpisodeStart
+from mjrec.simulation.captured_arrays import read_state
 from mjrec.simulation.fields import apply_fields
-from mjrec.simulation.layout import read_state
-from mjrec.simulation.memory import WORDS
 from mjrec.simulation.model_store import load_model, saved_model
+from mjrec.simulation.raw_memory import WORDS
 from mjrec.simulation.self_check import differences
 from mjrec.simulation.snapshot import restore_snapshot
 from mjrec.simulation.view import SceneView, view_from_facts
@@ -339,7 +339,7 @@ def test_a_field_that_is_forgotten_is_refused(
     simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first frame is compared, whatever the reason for a difference is."""
-    monkeypatch.setattr("mjrec.simulation.layout.ALWAYS", ("geom_xmat",))
+    monkeypatch.setattr("mjrec.simulation.captured_arrays.ALWAYS", ("geom_xmat",))
     assert "the scene is another one" in (simulation.begin().refusal or "")
 
 

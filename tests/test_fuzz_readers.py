@@ -42,7 +42,7 @@ from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.formats.video_metadata import is_broken
 from mjrec.json_text import dumps, loads
 from mjrec.rendering.recorded_facts import open_for_rendering
-from mjrec.results.listing import write_listings
+from mjrec.results.manifest_and_stats import update_manifests
 
 FEW = settings(
     derandomize=True,
@@ -155,7 +155,7 @@ def manifest(path: Path) -> None:
     assert all(len(os.fsencode(name)) <= 255 for name in names)
     write_manifest(path, found)
     # It uses more of it than reading checks.
-    write_listings(path.parent)
+    update_manifests(path.parent)
 
 
 def statistics(path: Path) -> None:

@@ -41,7 +41,7 @@ from mjrec.formats.monitor_directory import Infix, episode_of, infix_of
 from mjrec.formats.trajectory import ModelChange, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.json_text import dumps, loads
-from mjrec.results.listing import write_listings
+from mjrec.results.manifest_and_stats import update_manifests
 from mjrec.simulation.model_trust import note_models
 from mjrec.simulation.source_compiler import compile_within
 
@@ -256,7 +256,7 @@ def test_a_pending_video_elsewhere_is_not_looked_at(directory: Path) -> None:
     path = manifest(directory)
     entry = {"pending": [{"episode_id": 0, "video": name}]}
     path.write_text(json.dumps({**json.loads(path.read_text()), "mjrec": entry}))
-    write_listings(directory)
+    update_manifests(directory)
     assert read_manifest(path).videos == ()
 
 

@@ -28,7 +28,7 @@ from recordings import (
 import mjrec
 from conftest import Corridor
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.recorder.selection import UNDECIDED
+from mjrec.recorder.keep_rules import UNDECIDED
 from mjrec.recorder.tracking import FinishedVideo, Tracker
 from mjrec.rendering.finish import finish
 

@@ -45,7 +45,7 @@ from mjrec.rendering.recordings import (
     may_be_left,
     recorded_episodes,
 )
-from mjrec.results.listing import write_listing, write_listings
+from mjrec.results.manifest_and_stats import update_manifests, write_manifest_and_stats
 
 pytestmark = pytest.mark.usefixtures("painter")
 
@@ -303,7 +303,7 @@ def test_other_manifests_are_not_rewritten(tmp_path: Path) -> None:
     gyms.write_text('{"stats": "s.json", "videos": [], "env_info": {}, "more": 1}')
     paths = (gyms, write_pending_manifest(tmp_path, 3))
     before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in paths]
-    write_listings(tmp_path)
+    update_manifests(tmp_path)
     assert [(path.read_bytes(), path.stat().st_mtime_ns) for path in paths] == before
 
 
@@ -314,7 +314,7 @@ def test_a_manifest_names_no_video_elsewhere(name: Any, tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     content["mjrec"]["pending"][0]["video"] = name
     path.write_text(json.dumps(content))
-    write_listing(tmp_path, INFIX)
+    write_manifest_and_stats(tmp_path, INFIX)
     assert manifest_in(tmp_path) == content
 
 
@@ -338,7 +338,7 @@ def test_a_long_reason_is_cut_in_its_middle(tmp_path: Path) -> None:
     write_pending_manifest(tmp_path, 0)
     reason = "It failed. " + 10**4 * "x" + " No space left."
     note_failure(tmp_path, f"{VIDEO}.mp4", reason)
-    write_listing(tmp_path, INFIX)
+    write_manifest_and_stats(tmp_path, INFIX)
     [entry] = manifest_in(tmp_path)["mjrec"]["pending"]
     assert len(entry["reason"]) <= 1000
     assert re.fullmatch(

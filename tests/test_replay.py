@@ -17,7 +17,7 @@ from parts import parametrize
 import mjrec
 from mjrec.errors import InvalidArgument
 from mjrec.formats.trajectory import StateComponent
-from mjrec.simulation.layout import read_state, state_components
+from mjrec.simulation.captured_arrays import read_state, state_components
 from mjrec.simulation.replay import set_state
 
 GYMNASIUM = ["HalfCheetah-v5", "Humanoid-v5", "Pusher-v5"]

@@ -25,7 +25,7 @@ from mjrec.environments.options import EnvironmentOptions
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.pool import WorkerPool
 from mjrec.simulation.cameras import raw_data, raw_model
-from mjrec.simulation.inside import simulation_in
+from mjrec.simulation.find_simulation import simulation_in
 
 HEIGHT, WIDTH = 48, 64
 STEPS = 5

@@ -10,7 +10,7 @@ from touch_grid import TOUCH_GRID
 
 from mjrec.formats.trajectory import RowLayout
 from mjrec.simulation import self_check
-from mjrec.simulation.layout import read_state, snapshot_layout
+from mjrec.simulation.captured_arrays import read_state, snapshot_layout
 from mjrec.simulation.self_check import (
     differences,
     drawing_plugin,

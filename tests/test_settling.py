@@ -24,7 +24,7 @@ from mjrec.evaluation.ledger import read_ledgers
 from mjrec.evaluation.settling import settle, unsettled_monitors
 from mjrec.evidence.verification import Verdict
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.recorder.selection import UNDECIDED
+from mjrec.recorder.keep_rules import UNDECIDED
 from mjrec.rendering.finish import finish
 from mjrec.rendering.recordings import recorded_episodes
 
@@ -152,7 +152,8 @@ def test_trajectories_that_are_final_already_are_settled_too(
 
 
 @pytest.mark.parametrize(
-    "step", ["add_facts", "finish_trajectory", "_journal_choice", "write_listing"]
+    "step",
+    ["add_facts", "finish_trajectory", "_journal_choice", "write_manifest_and_stats"],
 )
 @pytest.mark.parametrize("times", [0, 1])
 def test_it_goes_on_where_it_was_killed(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mjrec.errors import InvalidArgument
-from mjrec.simulation.layout import needs_constraints, snapshot_layout
+from mjrec.simulation.captured_arrays import needs_constraints, snapshot_layout
 from mjrec.simulation.self_check import differences, updated_scene
 from mjrec.simulation.snapshot import SnapshotSource, restore_snapshot
 from mjrec.simulation.tendon_colours import has_limited_tendons

@@ -20,7 +20,7 @@ from mjrec.errors import InvalidArgument, UnknownName, UnreadableFile
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.simulation.layout import STATE_SPEC, state_components
+from mjrec.simulation.captured_arrays import STATE_SPEC, state_components
 from mjrec.simulation.model_store import ModelStore
 
 HALF_CHEETAH = (

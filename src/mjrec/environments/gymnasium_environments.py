@@ -22,7 +22,7 @@ from ..errors import (
     NoPictures,
     UnknownName,
 )
-from ..simulation.inside import simulation_in
+from ..simulation.find_simulation import simulation_in
 from .episode_seeds import EpisodeSeeds
 from .options import EnvironmentOptions
 from .working_directory import working_directory_importable

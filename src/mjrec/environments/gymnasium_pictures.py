@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 
 from ..errors import InvalidArgument
-from ..simulation.inside import simulation_in
+from ..simulation.find_simulation import simulation_in
 from .no_pictures import NoPictureSource
 
 _ANOTHER_VIEW = (

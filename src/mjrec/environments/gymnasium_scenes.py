@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from ..simulation.inside import simulation_in
+from ..simulation.find_simulation import simulation_in
 from .robotics_scenes import drawn_part, has_known_render, picture_moment
 from .scenes import (
     Scenes,

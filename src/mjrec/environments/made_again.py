@@ -21,7 +21,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs import registration
 
-from ..simulation.inside import simulation_in
+from ..simulation.find_simulation import simulation_in
 from .environment_arguments import VIEW_ARGUMENTS, shown_arguments
 from .names import DmControlName, parse_environment_name
 from .robotics_scenes import drawn_part

@@ -27,13 +27,13 @@ from ..environments.working_directory import working_directory_importable
 from ..errors import Error, InvalidArgument, PolicyError
 from ..monitors import Monitor
 from ..monitors.base import rendering_choice
+from ..recorder.keep_rules import UNDECIDED
 from ..recorder.opening import JOIN
 from ..recorder.options import DEFERRED, RenderingChoice
-from ..recorder.selection import UNDECIDED
 from ..recorder.tracking import FinishedEpisode, Run, Tracker
 from ..schedules import schedule_from_text
 from ..signals import Terminated
-from ..simulation.inside import simulation_in
+from ..simulation.find_simulation import simulation_in
 from .episode_results import EpisodeResult
 from .kept_episodes import keep_rule
 from .ledger import Ledger, ledger_name, read_ledgers

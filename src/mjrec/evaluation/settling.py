@@ -41,7 +41,7 @@ from ..formats.trajectory_file import (
 from ..formats.video_metadata import is_done
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.recordings import RecordingKey, claim, recorded_episodes
-from ..results.listing import listing_lock, write_listing
+from ..results.manifest_and_stats import manifest_lock, write_manifest_and_stats
 from ..results.run import Run
 
 # Under `scope`, in a manifest: the choice was made over all monitors of one.
@@ -125,7 +125,7 @@ def settle_monitor(
             if _settle_episode(folder, key, verdicts):
                 promised.append(key.number)
     _journal_choice(folder, infix, rule, promised)
-    write_listing(folder, infix)
+    write_manifest_and_stats(folder, infix)
 
 
 def finish_logs(folder: Path, monitor: str) -> None:
@@ -230,7 +230,10 @@ def _journal_choice(
         "recorded": list(promised),
     }
     keep.pop("left_open", None)
-    with listing_lock(folder, infix), contextlib.closing(JournalWriter(path)) as writer:
+    with (
+        manifest_lock(folder, infix),
+        contextlib.closing(JournalWriter(path)) as writer,
+    ):
         try:
             writer.note("keep", keep)
         except OSError as error:

@@ -38,7 +38,7 @@ from ..engines.work import AGAIN
 from ..errors import Error, GLError
 from ..gl import use_gl
 from ..recorder.options import DEFERRED
-from ..simulation.inside import simulation_in
+from ..simulation.find_simulation import simulation_in
 from ..simulation.model_trust import note_models, noting_models
 from .dataclass_json import from_json
 from .plan import Batch, EvaluationPlan

@@ -13,9 +13,9 @@ from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVa
 from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
 from ..recorder.deferred_video import DeferredVideo
-from ..recorder.endings import last_error
+from ..recorder.ending_reasons import last_error
 from ..recorder.exit_guard import ExitGuard
-from ..recorder.finisher import Finisher
+from ..recorder.finishing_process import Finisher
 from ..recorder.options import (
     DEFERRED,
     LIVE,
@@ -29,7 +29,7 @@ from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.subject import Subject
 from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..rendering.background import Background
-from ..simulation.inside import simulation_time
+from ..simulation.find_simulation import simulation_time
 from .cameras import CameraPictures
 from .progress import render_progress
 

@@ -16,7 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from ..environments.gymnasium_pictures import close_environment, gymnasium_pictures
 from ..environments.gymnasium_scenes import gymnasium_scenes
-from ..recorder.finisher import Finisher
+from ..recorder.finishing_process import Finisher
 from ..recorder.options import RecorderOptions
 from .base import MonitorBase
 from .cameras import camera_pictures

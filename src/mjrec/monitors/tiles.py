@@ -11,12 +11,12 @@ from typing import Any
 from ..environments.gymnasium_pictures import gymnasium_pictures
 from ..errors import InvalidArgument, NoPictures
 from ..formats.monitor_directory import Infix, video_prefix
-from ..recorder.endings import CLOSE, RESET, ending
+from ..recorder.ending_reasons import CLOSE, RESET, ending
 from ..recorder.live_videos import LiveVideos
 from ..recorder.options import OFF, WARN, RecorderOptions
 from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..schedules import disable_videos, to_schedule
-from ..simulation.inside import simulation_time
+from ..simulation.find_simulation import simulation_time
 from .base import MonitorBase
 from .cameras import Tiles
 

@@ -18,7 +18,7 @@ import numpy as np
 from ..environments.gymnasium_pictures import close_environment, free_viewers
 from ..errors import Error, ResetNeeded, ResetNotAllowed
 from ..formats.monitor_directory import infix_of, iter_monitor_files
-from ..recorder.endings import last_error
+from ..recorder.ending_reasons import last_error
 from ..recorder.exit_guard import ExitGuard
 from ..recorder.options import RecorderOptions
 from ..rendering.background import Background

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from ..schedules import Schedule, disable_videos, schedule_name, to_schedule
+from .keep_rules import Selection, selection_from
 from .options import OFF, RecorderOptions
-from .selection import Selection, selection_from
 
 _EVALUATION = "e"
 

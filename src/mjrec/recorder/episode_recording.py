@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from .deferred_video import DeferredVideo
 from .episode_trajectory import EpisodeTrajectory
 from .fast_path import FastPath, counting
+from .keep_rules import Standing
 from .kept_videos import KeptVideos
 from .live_videos import LiveVideos
 from .monitored_run import MonitoredRun
 from .options import DEFERRED, LIVE
-from .selection import Standing
 from .trajectory_recorder import TrajectoryRecorder
 from .video_recorder import VideoRecorder
 

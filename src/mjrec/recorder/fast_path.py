@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..formats.row_log import TAIL_HEAD
 from ..formats.span_writer import ROW_HEAD, SpanWriter
 from ..formats.spans import FRAME, STEP
-from ..simulation.memory import WORDS
+from ..simulation.raw_memory import WORDS
 from .stats_recorder import StatsRecorder
 
 # Rewards are NumPy's float64 as a rule: `+` would make one of the sum, too.

@@ -22,8 +22,8 @@ from ..formats.in_flight import add_facts, drop_recording
 from ..formats.json_fields import read_object, unreadable
 from ..formats.second_names import give_second_names
 from .deferred_video import DeferredVideo
+from .keep_rules import Selection, Standing
 from .monitored_run import MonitoredRun
-from .selection import Selection, Standing
 from .tracking import FinishedEpisode
 from .video_recorder import VideoRecorder
 

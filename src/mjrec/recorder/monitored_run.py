@@ -21,7 +21,7 @@ from ..formats.span_writer import SpanLogs
 from ..formats.video_names import second_name_of
 from ..machine import machine_fingerprint
 from ..provenance import versions
-from .finisher import Finisher
+from .finishing_process import Finisher
 from .opening import OpenDirectory
 from .options import LIVE, RecorderOptions
 from .run_journal import Faults, RunJournal, What

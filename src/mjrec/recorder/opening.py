@@ -38,8 +38,8 @@ from ..formats.monitor_directory import (
     manifest_name,
 )
 from ..results import clear_monitor_files
+from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
-from ..results.sources import MonitorResults
 
 # To record beside monitors that are of the same environment, without a look at them.
 JOIN = "join"

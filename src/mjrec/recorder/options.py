@@ -19,8 +19,8 @@ from ..formats.row_log import TAIL_BYTES
 from ..frames import check_quality
 from ..rates import to_rate
 from ..schedules import check_takes_one
+from .keep_rules import selection_from
 from .opening import JOIN
-from .selection import selection_from
 from .tracking import FinishedEpisode, Tracker
 
 DEFERRED, LIVE, OFF = "deferred", "live", "off"

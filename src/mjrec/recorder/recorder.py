@@ -22,23 +22,23 @@ from ..formats.monitor_directory import (
     stats_prefix,
     video_prefix,
 )
-from ..formats.pending_videos import note_failure, reason_of
+from ..formats.render_failures import note_failure, reason_of
 from ..formats.spans import FINISHED
-from ..results.listing import write_listing
+from ..results.manifest_and_stats import write_manifest_and_stats
 from ..results.recorded_environment import GYM_VERSION
 from .clips import Clips
 from .deferred_video import DeferredVideo
-from .endings import CLOSE, INTERRUPT, RESET, ending
+from .ending_reasons import CLOSE, INTERRUPT, RESET, ending
 from .episode_choice import EpisodeChoice
 from .episode_recording import EpisodeRecording
 from .fast_path import FastPath
-from .finisher import Finisher, LaterFinisher
+from .finishing_process import Finisher, LaterFinisher
+from .keep_rules import Standing
 from .kept_videos import KeptVideos
 from .monitored_run import BegunEpisode, MonitoredRun
 from .opening import OpenDirectory, open_directory
 from .options import LIVE, RecorderOptions, type_of_mode
 from .run_journal import Faults, RunJournal, facts_of
-from .selection import Standing
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import Subject, check_pictures
 from .tracking import EpisodeVideos, FinishedEpisode, Run, Trackers
@@ -653,7 +653,7 @@ class Recorder:
         return f"{video_prefix(self._place.infix, number)}.mp4"
 
     def _write_results(self) -> int:
-        listing = write_listing(
+        listing = write_manifest_and_stats(
             self.directory,
             self._place.infix,
             run=self._journal.run,

@@ -15,8 +15,8 @@ from ..formats.journal import JournalEntry, JournalWriter
 from ..provenance import look_around, versions
 from ..results.run import Run
 from .episode_choice import EpisodeChoice
+from .keep_rules import Selection
 from .options import WARN, RecorderOptions
-from .selection import Selection
 
 logger = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from ..errors import PicturesDiffer
 from ..formats.span_writer import SpanLogs, SpanWriter
 from ..formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
 from ..rates import rate_from_timestep, stride_for
-from ..simulation.memory import words_of
+from ..simulation.raw_memory import words_of
 from .fast_path import FastPath, gathering
 from .stats_recorder import StatsRecorder
 from .step_arrays import StepArray, action_array, step_array

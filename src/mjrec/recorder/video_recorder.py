@@ -20,7 +20,7 @@ from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
 from ..formats.video_sink import VideoSink
 from ..frames import Frame, check_frame
 from ..rates import rate_from_timestep, stride_for, to_rate
-from ..simulation.inside import simulation_in, simulation_time
+from ..simulation.find_simulation import simulation_in, simulation_time
 
 logger = logging.getLogger(__name__)
 

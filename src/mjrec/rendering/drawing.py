@@ -18,8 +18,8 @@ from ..errors import InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
 from ..simulation.cameras import Camera, camera_from_members, is_tracking
 from ..simulation.canvas import KeptCanvas
+from ..simulation.recorded_scene import GivenStates, RecordedScene
 from ..simulation.renderer import SceneRenderer
-from ..simulation.scene import GivenStates, RecordedScene
 from ..simulation.warnings import log_mujoco_warnings
 from .recorded_facts import open_for_rendering
 from .recorded_frames import check_has_frames

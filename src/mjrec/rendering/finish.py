@@ -23,11 +23,11 @@ from ..errors import (
     GLError,
     InvalidArgument,
 )
-from ..formats import pending_videos
+from ..formats import render_failures
 from ..formats.in_flight import drop_recording, list_paths, remove_if_done
 from ..formats.second_names import give_all_second_names
 from ..formats.trajectory_file import finish_trajectory
-from ..results.listing import write_listings
+from ..results.manifest_and_stats import update_manifests
 from .jobs import Outcome, VideoJob
 from .progress import Progress
 from .recorded_facts import further_video_paths, video_facts
@@ -136,7 +136,7 @@ def bring_up_to_date(directory: Path) -> None:
         # Those of a process that died between finishing the last and removing them.
         with contextlib.suppress(DirectoryNotWritable):
             remove_if_done(spans)
-    write_listings(directory)
+    update_manifests(directory)
 
 
 def note_failure(directory: Path, name: str, reason: str) -> None:
@@ -149,7 +149,7 @@ def note_failure(directory: Path, name: str, reason: str) -> None:
     """
     key = key_of(name)
     if name.endswith(".mp4") or (key is not None and key.is_clip):
-        pending_videos.note_failure(directory / name, reason)
+        render_failures.note_failure(directory / name, reason)
 
 
 class Finisher:

@@ -11,8 +11,8 @@ from pathlib import Path
 from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.second_names import give_all_second_names
+from .killed_leftovers import Remains, has_work, is_open, model_leftovers, remains_of
 from .recovery_report import Recovery
-from .remains import Remains, has_work, is_open, model_leftovers, remains_of
 
 # One recovery of a directory at a time.
 _LOCK = ".openaigym.recover.lock"
@@ -56,7 +56,7 @@ def recover(
         return Recovery(path, open_monitors=open_monitors)
     # Not at the top: it loads HDF5, which a simulation that goes on where a closed
     # monitor left off has no use for.
-    from .dead_monitor import DeadMonitors
+    from .killed_monitors import KilledMonitors
 
     if not os.access(path, os.W_OK | os.X_OK):
         raise DirectoryNotWritable(path, "permission denied")
@@ -67,14 +67,14 @@ def recover(
     try:
         # Once more, because another process may have done it meanwhile.
         dead, open_monitors = _sorted_out(path)
-        dead_monitors = DeadMonitors(path, seconds=seconds)
+        killed_monitors = KilledMonitors(path, seconds=seconds)
         for remains in dead:
-            dead_monitors.put_in_order(remains.infix)
-        dead_monitors.sweep_models()
+            killed_monitors.put_in_order(remains.infix)
+        killed_monitors.sweep_models()
         give_all_second_names(path)
     finally:
         lock.release()
-    files, failures = tuple(dead_monitors.files), tuple(dead_monitors.failures)
+    files, failures = tuple(killed_monitors.files), tuple(killed_monitors.failures)
     return Recovery(path, files, failures, open_monitors)
 
 

@@ -144,7 +144,7 @@ def render_states(
         GLError, Error: as `render`.
     """
     # Here, because drawing recorded episodes needs no simulator in this process.
-    from ..simulation.scene import check_states, save_states
+    from ..simulation.recorded_scene import check_states, save_states
 
     view = View(
         camera=plain_camera(camera), height=height, width=width, quality=quality

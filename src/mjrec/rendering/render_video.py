@@ -28,7 +28,7 @@ from ..frames import Frame, grid_shape
 from ..machine import machine_fingerprint
 from ..provenance import versions
 from ..rates import to_rate
-from ..recorder.endings import KILLED
+from ..recorder.ending_reasons import KILLED
 from .jobs import Variant
 from .pool import WorkerPool
 from .recorded_facts import (

@@ -24,9 +24,9 @@ from ..errors import UnreadableFile
 from ..evaluation.results_files import ReadResults, read_results, read_summaries
 from ..evaluation.summaries import AcrossTasks, Bootstrap, TaskSummary
 from ..results.episodes import episodes_of
+from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
 from ..results.recorded_environment import recorded_env_info
-from ..results.sources import MonitorResults
 from .contents import EpisodeColumns, ReportContents, ReportTask, ReportVideo, Verdict
 from .episode_columns import (
     EpisodeRows,

@@ -18,8 +18,8 @@ from ..errors import Error, UnreadableFile
 from ..evaluation.kept_episodes import keep_rule
 from ..evaluation.plan import SEEDED, EvaluationPlan
 from ..evaluation.results_files import ReadResults
+from ..results.journal_or_stats import MonitorResults
 from ..results.recorded_environment import GYM_VERSION
-from ..results.sources import MonitorResults
 from .contents import EpisodeColumns
 from .recorded_videos import RecordedVideo
 

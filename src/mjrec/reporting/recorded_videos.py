@@ -17,7 +17,7 @@ from ..formats.monitor_directory import episode_of
 from ..formats.regular_files import regular_path
 from ..formats.video_metadata import finished_videos, is_broken, metadata_path
 from ..formats.video_names import view_of
-from ..results.sources import MonitorResults
+from ..results.journal_or_stats import MonitorResults
 from .contents import ReportVideo
 
 _SHA256: Final = re.compile(r"[0-9a-f]{64}", re.ASCII)

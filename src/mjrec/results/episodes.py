@@ -13,9 +13,9 @@ from ..errors import UnreadableFile
 from ..formats.in_flight import find_recording
 from ..formats.journal import MOST_EPISODES, JournalEntry, read_journal
 from ..formats.stats_file import StatsFile
+from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles, monitors_of
 from .numbering import NumberedEpisode, number_episodes
-from .sources import MonitorResults
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 from ..formats.stats_file import StatsFile, read_stats_file
 from ..formats.video_metadata import is_broken
+from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles, monitors_of
 from .recorded_environment import GYM_VERSION
-from .sources import MonitorResults
 
 logger = logging.getLogger(__name__)
 

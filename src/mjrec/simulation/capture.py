@@ -19,15 +19,15 @@ from ..errors import ClosedError, PicturesDiffer
 from ..formats.trajectory import RowLayout, StateComponent
 from .authored_model import AuthoredModel
 from .cameras import is_tracking, raw_data, raw_model
-from .fields import VIEW_PREFIXES, is_settable
-from .layout import (
+from .captured_arrays import (
     STATE_SPEC,
     needs_constraints,
     snapshot_layout,
     state_components,
     state_words,
 )
-from .looks import Looks
+from .change_detection import Looks
+from .fields import VIEW_PREFIXES, is_settable
 from .model_store import ModelStore
 from .self_check import scene_difference
 from .snapshot import SnapshotSource

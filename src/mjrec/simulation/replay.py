@@ -24,14 +24,14 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument
 from ..formats.trajectory import RowLayout, StateComponent
-from .fields import apply_fields
-from .layout import (
+from .captured_arrays import (
     STATE_BITS,
     STATE_SPEC,
     drawn_readings,
     read_state,
     state_components,
 )
+from .fields import apply_fields
 from .snapshot import SnapshotSource, layout_objection
 
 # What a simulation with these keeps outside its state, so that no step follows from it.

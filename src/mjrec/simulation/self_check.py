@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.trajectory import RowLayout
-from .layout import TENDON_RGBA
+from .captured_arrays import TENDON_RGBA
 from .snapshot import restore_snapshot
 from .view import SceneView
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument
 from ..formats.trajectory import RowLayout
-from .layout import ALWAYS, SNAPSHOT_ARRAYS, TENDON_RGBA, array_kind
-from .memory import WORDS, can_be_gathered, words_of
+from .captured_arrays import ALWAYS, SNAPSHOT_ARRAYS, TENDON_RGBA, array_kind
+from .raw_memory import WORDS, can_be_gathered, words_of
 from .tendon_colours import TendonColours
 
 # Indices of geoms and of each other, which the visualiser follows unseen.

@@ -38,9 +38,9 @@ from ...formats.monitor_directory import (
     where_recordings_are,
 )
 from ...formats.regular_files import regular_path
+from ...rendering.killed_leftovers import Remains, has_work, is_open, remains_of
 from ...rendering.recorded_facts import open_for_rendering
 from ...rendering.recordings import look_at, recordings
-from ...rendering.remains import Remains, has_work, is_open, remains_of
 from ...results import iter_episodes
 from ...results.monitor_files import monitors_of
 

@@ -15,8 +15,8 @@ from ...formats.json_fields import read_object, unreadable
 from ...formats.monitor_directory import episode_of, infix_of, iter_monitor_files
 from ...formats.trajectory_file import open_trajectory
 from ...results import Episode, iter_episodes
+from ...results.journal_or_stats import MonitorResults
 from ...results.monitor_files import MonitorFiles, monitors_of
-from ...results.sources import MonitorResults
 from .statements import Statements
 
 _SHOWN = 3

@@ -16,7 +16,7 @@ from ...errors import InvalidArgument, UnreadableFile
 from ...formats.journal import UNKNOWN, JournalEntry
 from ...formats.monitor_directory import Infix, video_prefix
 from ...formats.trajectory_file import open_trajectory
-from ...recorder.selection import Selection, selection_from
+from ...recorder.keep_rules import Selection, selection_from
 from ...recorder.tracking import FinishedEpisode
 from ...schedules import (
     Schedule,

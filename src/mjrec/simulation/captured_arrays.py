@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.trajectory import Array, RowLayout, StateComponent
-from .memory import WORDS, address_of, can_be_gathered, raw_memory, words_of
+from .raw_memory import WORDS, address_of, can_be_gathered, raw_memory, words_of
 from .tendon_colours import has_limited_tendons, has_plastic_tendons
 
 STATE_SPEC = int(mujoco.mjtState.mjSTATE_INTEGRATION)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mjrec.formats.trajectory import StateComponent
-from mjrec.simulation.layout import read_state, state_components, state_words
-from mjrec.simulation.memory import WORDS, can_be_gathered, words_of
+from mjrec.simulation.captured_arrays import read_state, state_components, state_words
+from mjrec.simulation.raw_memory import WORDS, can_be_gathered, words_of
 
 # Something of every component but plugins'.
 FULL = """

@@ -14,7 +14,7 @@ from recordings import events_of, manifest_of, stats_of
 
 import mjrec
 from mjrec.formats.monitor_directory import Infix
-from mjrec.results.listing import write_listing
+from mjrec.results.manifest_and_stats import write_manifest_and_stats
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "deferred": {"video_callable": lambda episode: episode % 2 == 0},
@@ -56,12 +56,12 @@ def test_another_process_computes_the_same(
     [path] = tmp_path.glob("*.manifest.json")
     infix = Infix.parse(path.name.split(".manifest.")[1])
     assert infix is not None
-    listing = write_listing(tmp_path, infix)
+    listing = write_manifest_and_stats(tmp_path, infix)
     assert listing is not None
     assert (listing.is_new_manifest, listing.is_new_stats) == (False, False)
     for written in (path, *tmp_path.glob("*.stats.json")):
         written.unlink()
-    write_listing(tmp_path, infix)
+    write_manifest_and_stats(tmp_path, infix)
     assert manifest_of(tmp_path) == manifest
     first = stats.pop("initial_reset_timestamp")
     anew = stats_of(tmp_path)
@@ -99,7 +99,7 @@ def test_manifests_of_open_monitors_are_left_to_them(
         env.reset()
         infix = Infix.parse(env.infix)
         assert infix is not None
-        assert write_listing(tmp_path, infix) is None
+        assert write_manifest_and_stats(tmp_path, infix) is None
         assert not list(tmp_path.glob("*.manifest.json"))
 
 
@@ -112,7 +112,7 @@ def test_a_reason_goes_with_the_video_that_comes(tmp_path: Path) -> None:
     [path] = tmp_path.glob("*.manifest.json")
     infix = Infix.parse(path.name.split(".manifest.")[1])
     assert infix is not None
-    write_listing(tmp_path, infix)
+    write_manifest_and_stats(tmp_path, infix)
     [entry] = [e for e in manifest_of(tmp_path)["mjrec"]["pending"] if "reason" in e]
     assert (entry["video"], entry["reason"]) == (video, "no paint")
     assert not mjrec.render_videos(tmp_path).failures

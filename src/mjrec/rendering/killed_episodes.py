@@ -12,8 +12,8 @@ from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry, JournalReader
 from ..formats.monitor_directory import episode_of
 from ..formats.trajectory_file import find_trajectory
+from .killed_leftovers import Remains
 from .recorded_facts import open_for_rendering
-from .remains import Remains
 
 
 class KnownEpisodes:

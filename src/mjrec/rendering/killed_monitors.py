@@ -28,21 +28,25 @@ from ..formats.trajectory import FORMAT_VERSION
 from ..formats.trajectory_file import finish_trajectory, open_trajectory
 from ..formats.video_metadata import is_done
 from ..json_text import loads
-from ..results.listing import Listing, listing_lock, write_listing
+from ..results.journal_or_stats import MonitorResults
+from ..results.manifest_and_stats import (
+    Written,
+    manifest_lock,
+    write_manifest_and_stats,
+)
 from ..results.recorded_environment import locked_run
-from ..results.sources import MonitorResults
-from .cut_videos import finish_text, finish_video
-from .known_episodes import KnownEpisodes
-from .recorded_facts import open_for_rendering, video_path
-from .recordings import claim, key_of, parts_of
-from .recovery_report import RecoveredFile
-from .remains import (
+from .killed_episodes import KnownEpisodes
+from .killed_leftovers import (
     Remains,
     lacks_results,
     look_through,
     model_leftovers,
     unfinished_logs,
 )
+from .killed_videos import finish_text, finish_video
+from .recorded_facts import open_for_rendering, video_path
+from .recordings import claim, key_of, parts_of
+from .recovery_report import RecoveredFile
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +58,7 @@ _CLIP_METADATA = re.compile(
 )
 
 
-class DeadMonitors:
+class KilledMonitors:
     """Puts monitors in order, and says what it did.
 
     Args:
@@ -90,7 +94,7 @@ class DeadMonitors:
             lock.release()
             # A process that rendered meanwhile took the monitor for open.
             if (self._directory / manifest_name(infix)).exists():
-                write_listing(self._directory, infix)
+                write_manifest_and_stats(self._directory, infix)
 
     def sweep_models(self) -> None:
         """Remove unfinished files of models."""
@@ -123,7 +127,9 @@ class DeadMonitors:
         if _has_recordings(remains) and (has_news or lacks_results(remains)):
             lines += _missing_live_clips(look_through(self._directory, remains.infix))
             self._complete_journal(remains, lines)
-            listing = write_listing(self._directory, remains.infix, is_own=True)
+            listing = write_manifest_and_stats(
+                self._directory, remains.infix, is_own=True
+            )
             assert listing is not None
             for file in _listed(remains.infix, listing):
                 self._note(file)
@@ -135,7 +141,7 @@ class DeadMonitors:
         path = self._directory / journal_name(remains.infix)
         writer = JournalWriter(path, run=_run_facts(remains))
         try:
-            with listing_lock(self._directory, remains.infix):
+            with manifest_lock(self._directory, remains.infix):
                 for kind, facts in (*lines, ("recovered", {})):
                     if kind == "episode":
                         writer.append(entry_of(facts))
@@ -388,7 +394,7 @@ def _is_newer(line: bytes) -> bool:
     return isinstance(version, int) and version > FORMAT_VERSION
 
 
-def _listed(infix: Infix, listing: Listing) -> Iterator[RecoveredFile]:
+def _listed(infix: Infix, listing: Written) -> Iterator[RecoveredFile]:
     """Yield the statistics and the manifest, as far as they were written."""
     if listing.stats is not None and listing.is_new_stats:
         count = len(listing.stats.timestamps)

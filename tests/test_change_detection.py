@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mjrec.simulation import looks as module
+from mjrec.simulation.change_detection import Looks
 from mjrec.simulation.fields import (
     array_names,
     holder_of,
@@ -18,7 +19,6 @@ from mjrec.simulation.fields import (
     read_member,
     struct_names,
 )
-from mjrec.simulation.looks import Looks
 from mjrec.simulation.view import SceneView
 
 # With a texture, a mesh and a height field.

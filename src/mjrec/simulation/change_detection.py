@@ -27,7 +27,7 @@ from .fields import (
     read_member,
     struct_names,
 )
-from .memory import address_of, raw_memory
+from .raw_memory import address_of, raw_memory
 from .view import SceneView
 
 # What each frame is drawn from; whole groups, because a few long pieces are compared

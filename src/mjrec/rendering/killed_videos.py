@@ -32,7 +32,7 @@ from ..formats.video_metadata import (
     timing_facts,
     write_metadata,
 )
-from .known_episodes import KnownEpisodes
+from .killed_episodes import KnownEpisodes
 from .recovery_report import RecoveredFile
 
 _MOMENT = 0.05

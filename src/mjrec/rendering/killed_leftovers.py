@@ -30,8 +30,8 @@ from ..formats.monitor_directory import (
 from ..formats.spans import SPANS
 from ..formats.unfinished_video import note_path
 from ..formats.video_metadata import is_broken, metadata_path
+from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles
-from ..results.sources import MonitorResults
 
 # A note is rewritten as every file is: an unfinished one has both endings.
 _PART = re.compile(

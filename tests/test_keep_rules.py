@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mjrec.errors import InvalidArgument, UnknownName
-from mjrec.recorder.selection import (
+from mjrec.recorder.keep_rules import (
     Selection,
     Standing,
     selection_from,

@@ -34,7 +34,7 @@ from ..formats.monitor_directory import (
     trajectory_prefix,
     video_prefix,
 )
-from ..formats.pending_videos import forget_failure, reason_of
+from ..formats.render_failures import forget_failure, reason_of
 from ..formats.spans import FINISHED
 from ..formats.stats_file import StatsFile, read_stats_file, write_stats_file
 from ..formats.video_metadata import (
@@ -44,16 +44,16 @@ from ..formats.video_metadata import (
     metadata_path,
 )
 from ..formats.video_names import tiled_name, with_part
+from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles
 from .recorded_environment import GYM_VERSION
 from .run import Run
-from .sources import MonitorResults
 
 _FORMAT_VERSION = 1
 
 
 @dataclass(frozen=True)
-class Listing:
+class Written:
     """What was written.
 
     Attributes:
@@ -74,7 +74,7 @@ class Listing:
         return list((self.manifest.mjrec or {}).get("pending", ()))
 
 
-def write_listings(directory: Path) -> None:
+def update_manifests(directory: Path) -> None:
     """Bring the manifests of closed monitors up to date that call videos pending.
 
     Raises:
@@ -89,21 +89,21 @@ def write_listings(directory: Path) -> None:
             try:
                 # Of the others nothing can be new; those of gym have no such key.
                 if (read_manifest(path).mjrec or {}).get("pending"):
-                    write_listing(directory, infix)
+                    write_manifest_and_stats(directory, infix)
             except UnreadableFile as error:
                 damaged = damaged or error
     if damaged is not None:
         raise damaged
 
 
-def write_listing(
+def write_manifest_and_stats(
     directory: Path,
     infix: Infix,
     *,
     run: Run | None = None,
     stats: StatsFile | None = None,
     is_own: bool = False,
-) -> Listing | None:
+) -> Written | None:
     """Write statistics and manifest of a monitor, unless they are there already.
 
     Args:
@@ -127,7 +127,7 @@ def write_listing(
         # First of all: it tells a directory that is full, or gone.
         write_stats_file(directory / f"{stats_prefix(infix)}.stats.json", stats)
     # A monitor that is open has nobody beside it.
-    with contextlib.nullcontext() if run else listing_lock(directory, infix):
+    with contextlib.nullcontext() if run else manifest_lock(directory, infix):
         if not is_own and is_locked(directory / lock_name(infix)):
             return None
         files = _files_of(directory, infix)
@@ -145,11 +145,11 @@ def write_listing(
         if is_new:
             write_manifest(directory / manifest_name(infix), manifest)
         _forget_failures(directory, results.details, manifest)
-    return Listing(manifest, stats, is_new, is_new_stats)
+    return Written(manifest, stats, is_new, is_new_stats)
 
 
 @contextlib.contextmanager
-def listing_lock(directory: Path, infix: Infix) -> Iterator[None]:
+def manifest_lock(directory: Path, infix: Infix) -> Iterator[None]:
     """Hold the lock for writing a monitor's manifest, or its journal once it is closed.
 
     Raises:
