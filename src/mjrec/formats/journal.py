@@ -67,6 +67,9 @@ EVENTS = (
 
 UNKNOWN = "unknown"
 
+# The reason of an episode that ended with its process.
+KILLED = "killed"
+
 # The seed and the options are for people to read; more of them is cut off.
 _LONGEST_REPR = 1000
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import UnreadableFile
 from .in_flight import find_recording, remove_if_done
+from .journal import KILLED
 from .json_fields import unreadable
 from .monitor_directory import Infix, trajectory_prefix
 from .regular_files import open_regular
@@ -120,7 +121,7 @@ def _how_it_ended(reader: SpanReader, facts: Mapping[str, Any]) -> dict[str, Any
         return {}
     known: dict[str, Any] = {
         "complete": False,
-        "reason": "killed",
+        "reason": KILLED,
         "length": reader.step_count,
         "reward": added_up(reader.rewards),
     }

@@ -8,13 +8,7 @@ from typing import Any
 
 from ..signals import received
 
-CLOSE, EXCEPTION, INTERRUPT, KILLED, RESET = (
-    "close",
-    "exception",
-    "interrupt",
-    "killed",
-    "reset",
-)
+CLOSE, EXCEPTION, INTERRUPT, RESET = "close", "exception", "interrupt", "reset"
 
 _LONGEST_MESSAGE = 1000
 

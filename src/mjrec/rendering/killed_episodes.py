@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
-from ..formats.journal import JournalEntry, JournalReader
+from ..formats.journal import KILLED, JournalEntry, JournalReader
 from ..formats.monitor_directory import episode_of
 from ..formats.trajectory_file import find_trajectory
 from .killed_leftovers import Remains
@@ -76,7 +76,7 @@ class KnownEpisodes:
     def ending(self, number: int | None) -> dict[str, Any] | None:
         """Return how an episode ended; None where it was cut off."""
         facts = self.facts(number)
-        if "complete" in facts and facts.get("reason") != "killed":
+        if "complete" in facts and facts.get("reason") != KILLED:
             keys = ("complete", "terminated", "truncated", "reason", "exception")
             return {key: facts[key] for key in keys if key in facts}
         entry = None if number is None else self.entry(number)

@@ -20,7 +20,7 @@ from typing import Any
 
 from ..errors import Error, FileNotWritten, UnreadableFile
 from ..formats.in_flight import drop_recording, remove_list
-from ..formats.journal import JournalWriter, entry_of, run_facts
+from ..formats.journal import KILLED, JournalWriter, entry_of, run_facts
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import Infix, episode_of, journal_name, manifest_name
 from ..formats.spans import FORMAT
@@ -271,7 +271,7 @@ def _missing_episodes(
         if is_complete:
             yield "episode", {**facts, **line}
         else:
-            yield "cut", {**line, "reason": facts.get("reason", "killed")}
+            yield "cut", {**line, "reason": facts.get("reason", KILLED)}
 
 
 def _missing_clips(remains: Remains) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -21,6 +21,7 @@ from typing import Any
 from ..errors import EncoderError, Error, MissingDependency, UnreadableFile
 from ..formats.asciicast import AsciicastWriter, unfinished_recording
 from ..formats.ffmpeg import ffmpeg_executable, ffmpeg_sha256, ffmpeg_version
+from ..formats.journal import KILLED
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import episode_of, video_prefix
 from ..formats.unfinished_video import UnfinishedVideo, VideoFile, VideoNote, read_note
@@ -157,7 +158,7 @@ def _give_up(
 
 def _metadata_without_video(note: VideoNote, known: KnownEpisodes) -> Mapping[str, Any]:
     number = episode_of(note.video.path.name)
-    ending = known.ending(number) or {"complete": False, "reason": "killed"}
+    ending = known.ending(number) or {"complete": False, "reason": KILLED}
     return {
         **note.metadata,
         **ending,
@@ -181,7 +182,7 @@ def _metadata(
         steps = itertools.chain(range(0, length, stride), [length])
     else:
         # The last frames were on their way to the encoder.
-        ending = {"complete": False, "reason": "killed"}
+        ending = {"complete": False, "reason": KILLED}
         steps = range(0, file.frame_count * stride, stride)
     timing = timing_facts(
         StepRuns(steps, stride=stride),
@@ -254,7 +255,7 @@ def finish_text(part: Path, known: KnownEpisodes) -> RecoveredFile | None:
     ending = known.ending(number)
     sums = known.sums(number)
     if ending is None or sums.get("length") != len(frames) - 1:
-        ending = {"complete": False, "reason": "killed"}
+        ending = {"complete": False, "reason": KILLED}
     writer = AsciicastWriter(path, rate=rate)
     for frame in frames:
         writer.write(frame)

@@ -19,6 +19,7 @@ from typing import Any
 
 from ..annotation import Caption, check_annotation
 from ..errors import EncoderError, NoPictures
+from ..formats.journal import KILLED
 from ..formats.second_names import give_second_names, take_second_names
 from ..formats.unfinished_video import VideoFile
 from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
@@ -28,7 +29,6 @@ from ..frames import Frame, grid_shape
 from ..machine import machine_fingerprint
 from ..provenance import versions
 from ..rates import to_rate
-from ..recorder.ending_reasons import KILLED
 from .jobs import Variant
 from .pool import WorkerPool
 from .recorded_facts import (
