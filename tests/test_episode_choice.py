@@ -26,7 +26,6 @@ def test_a_schedule_is_asked_once_for_a_number() -> None:
     chosen = choice(video_callable=schedule)
     assert [chosen.decide(k) for k in (0, 0, 1, 1, 2)] == [True, True, False, False, 1]
     assert asked == [0, 1, 2]
-    assert chosen.scheduled == [0, 2]
 
 
 def test_what_was_decided_last_is_known() -> None:

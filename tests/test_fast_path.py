@@ -131,7 +131,7 @@ def test_usual_steps_are_shown_by_any_camera(camera: Any, tmp_path: Path) -> Non
 
     def check(number: int, monitor: Any) -> None:
         assert is_fast(monitor) == (number > 1)
-        assert number < 3 or monitor._recorder._states._quick.is_current()
+        assert number < 3 or monitor._recorder._subject.states._quick.is_current()
 
     directories = tmp_path / "usual", tmp_path / "other"
     env = make(max_episode_steps=5)

@@ -555,7 +555,7 @@ def test_a_gzip_bomb_is_not_unpacked(inspector: Inspector, directory: Path) -> N
     assert "it holds more" in inspector.refuses("model", path)
     facts = {**facts_of(directory), "bytes": (1 << 31) - 1}
     (directory / "facts.json").write_text(json.dumps(facts))
-    assert "too small" in inspector.refuses("model", path)
+    assert "memory" in inspector.refuses("model", path)
 
 
 def put_zip(
@@ -669,4 +669,4 @@ def test_files_and_directories_are_not_multiplied(
     meshes = "".join(f'<mesh file="{i}"/>' for i in range(20_000))
     xml = f"<mujoco>{compilers}<asset>{meshes}</asset></mujoco>"
     path = put_zip(directory, {"source/main.xml": xml.encode()})
-    assert "than any model" in inspector.refuses("model", path)
+    assert "opening file" in inspector.refuses("model", path)

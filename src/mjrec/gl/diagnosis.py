@@ -9,12 +9,12 @@ attribute 'Renderer'`. What they mean stands in one table, `diagnosis.toml`.
 from __future__ import annotations
 
 import functools
-import importlib.resources
 import os
 import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from .backends import platforms_contradict, rendering_is_off
 
@@ -84,7 +84,7 @@ def diagnose(
 @functools.cache
 def _table() -> list[dict[str, str]]:
     """Return the rows of `diagnosis.toml`, with its words put in."""
-    file = importlib.resources.files(__package__) / "diagnosis.toml"
+    file = Path(__file__).with_name("diagnosis.toml")
     content = tomllib.loads(file.read_text("utf-8"))
     words: dict[str, str] = content["words"]
 
