@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjrec.simulation import looks as module
+from mjrec.simulation import change_detection as module
 from mjrec.simulation.change_detection import Looks
 from mjrec.simulation.fields import (
     array_names,

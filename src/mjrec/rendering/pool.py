@@ -410,7 +410,8 @@ class _Worker:
         self.messages = _messages(pipe)
 
     def give_back(self) -> None:
-        """Owe again what has arrived and was not taken."""
+        """Owe again what has arrived and was not taken, and forget what went wrong."""
+        self.error = self.lost_at = None
         first = self.owes.start - self.owes.step * len(self.arrived)
         self.owes = range(first, self.owes.stop, self.owes.step)
         self.arrived.clear()

@@ -380,7 +380,8 @@ def _forget_failures(
     directory: Path, old: Mapping[str, Any], manifest: Manifest
 ) -> None:
     """Remove what was said of videos that are not pending any more."""
-    waiting = {entry.get("video") for entry in (manifest.mjrec or {})["pending"]}
+    pending = (manifest.mjrec or {})["pending"]
+    waiting = {entry["video"] for entry in filter(_names_video, pending)}
     for entry in filter(_names_video, old.get("pending") or ()):
         if entry["video"] not in waiting:
             forget_failure(directory / entry["video"])
