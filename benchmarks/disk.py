@@ -13,8 +13,8 @@ from typing import Any
 
 import mjrec
 from mjrec.formats.in_flight import recordings_in_flight
-from mjrec.formats.span_reader import rows_size
-from mjrec.formats.trajectory_file import finish_trajectory
+from mjrec.formats.spans import row_dtype
+from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 
 from .children import call
 from .results import Result
@@ -90,7 +90,10 @@ def record_and_finish(name: str, steps: int) -> dict[str, float]:
         else:
             env = _recorded_gymnasium(name, steps, directory)
         [recording] = recordings_in_flight(Path(directory))
-        sizes = {"log": rows_size(recording)}
+        assert recording.spans.header is not None
+        row = row_dtype(recording.spans.header).itemsize
+        with open_trajectory(recording.path) as reader:
+            sizes = {"log": reader.row_count * row}
         start = time.perf_counter()
         finished = finish_trajectory(recording.path)
         seconds = time.perf_counter() - start

@@ -28,13 +28,11 @@ from trajectories_by_hand import INFIX, write_log
 from trajectory_contents import content_of
 
 from mjrec import UnreadableFile
-from mjrec.formats.in_flight import recordings_in_flight
 from mjrec.formats.journal import JournalWriter, read_journal
 from mjrec.formats.manifest import read_manifest, write_manifest
 from mjrec.formats.model_changes import pack_change
 from mjrec.formats.monitor_directory import states_name, trajectory_prefix
 from mjrec.formats.row_log import TAIL_HEAD
-from mjrec.formats.span_reader import rows_size
 from mjrec.formats.span_writer import LOOK_PREFIX
 from mjrec.formats.stats_file import read_stats_file, write_stats_file
 from mjrec.formats.trajectory import ModelChange
@@ -286,8 +284,6 @@ def read_log(path: Path) -> Any:
             content = content_of(reader)
         with contextlib.suppress(UnreadableFile):
             open_for_rendering(path).close()
-        for found in recordings_in_flight(path.parent):
-            rows_size(found)
         return content
     except UnreadableFile as error:
         refusal = error

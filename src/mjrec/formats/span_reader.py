@@ -208,22 +208,6 @@ class SpanReader(TrajectoryReader):
         return ClosedError(f"The trajectory {self.path} is closed.")
 
 
-def rows_size(recording: Recording) -> int:
-    """Return the bytes of a recording's rows, so far.
-
-    Raises:
-        UnreadableFile: the log cannot be read.
-    """
-    assert recording.spans.header is not None
-    size = row_dtype(recording.spans.header).itemsize
-    with unreadable(recording.spans.log):
-        rows = RowLogReader(recording.spans.log, size)
-        try:
-            return max(0, _stop_of(recording, rows.count) - recording.row) * size
-        finally:
-            rows.close()
-
-
 def _stop_of(recording: Recording, count: int) -> int:
     """Return the row behind the last of a recording, of `count` in the log."""
     if recording.stop is not None:
