@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all but drawing costs: `python -m benchmarks.cheap_frames`.
+
+A thousand steps of HalfCheetah-v5, from `make` to the closed mp4, with frames that cost
+next to nothing: 64x64, without shadows and multisampling. Each run is a process of its
+own, and the variants take turns. With `MUJOCO_GL` unset mjrec chooses the backend.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+from gymnasium.envs import mujoco as environments
+
+import mjrec
+
+ROUNDS = 7
+STEPS = 1000
+QUALITY = '<visual><quality shadowsize="0" offsamples="0"/></visual>'
+VARIANTS = {
+    "RecordVideo": ("record_video", "egl"),
+    "mjrec": ("monitor", "egl"),
+    "mjrec, MUJOCO_GL unset": ("monitor", None),
+}
+
+
+def record(how: str) -> float:
+    """Record one episode; return the seconds from `make` to the closed video."""
+    assets = Path(environments.__file__).parent / "assets"
+    xml = (assets / "half_cheetah.xml").read_text()
+    with tempfile.TemporaryDirectory() as directory:
+        model, videos = Path(directory) / "cheap.xml", Path(directory) / "videos"
+        model.write_text(xml.replace("<worldbody>", f"{QUALITY}<worldbody>", 1))
+        began = time.perf_counter()
+        env: Any = gymnasium.make(
+            "HalfCheetah-v5",
+            xml_file=str(model),
+            render_mode="rgb_array",
+            width=64,
+            height=64,
+            max_episode_steps=STEPS,
+        )
+        if how == "monitor":
+            env = mjrec.Monitor(env, videos, lambda episode: True, workers=2)
+        else:
+            env = gymnasium.wrappers.RecordVideo(
+                env, str(videos), episode_trigger=lambda episode: True
+            )
+        env.action_space.seed(0)
+        env.reset(seed=0)
+        for _ in range(STEPS):
+            env.step(env.action_space.sample())
+        env.close()
+        seconds = time.perf_counter() - began
+        assert len(list(videos.glob("*.mp4"))) == 1, "there is no video"
+    return seconds
+
+
+def seconds_of(how: str, backend: str | None) -> float:
+    """Return what `record` returns, in a process of its own."""
+    environ = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    if backend is not None:
+        environ["MUJOCO_GL"] = backend
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.cheap_frames", how],
+        env=environ,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        check=True,
+    )
+    return float(done.stdout.split()[-1])
+
+
+def main() -> None:
+    """Print the median of each variant, and what it is of RecordVideo's."""
+    found: dict[str, list[float]] = {name: [] for name in VARIANTS}
+    for _ in range(ROUNDS):
+        for name, variant in VARIANTS.items():
+            found[name].append(seconds_of(*variant))
+    medians = {name: statistics.median(times) for name, times in found.items()}
+    for name, median in medians.items():
+        ratio = median / medians["RecordVideo"]
+        print(f"{name:24}{median:6.2f} s  {ratio:.2f}  {sorted(found[name])}")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        print(record(sys.argv[1]))
+    else:
+        main()
