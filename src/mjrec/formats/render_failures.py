@@ -48,7 +48,7 @@ def forget_failure(video: Path) -> None:
 
 
 def reason_of(video: Path) -> str | None:
-    """Return why a video could not be rendered; None where nobody has failed."""
+    """Return why a video could not be rendered; None where it has not failed."""
     try:
         reason = read_object(failure_path(video)).get("reason")
     except (OSError, ValueError):

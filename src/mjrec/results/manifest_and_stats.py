@@ -60,7 +60,7 @@ class Written:
         manifest: as it is now.
         stats: the statistics, as they are now; None where they cannot be had.
         is_new_manifest: it had to be written.
-        is_new_stats: they had to be written.
+        is_new_stats: they were not there; a monitor writes its own in any case.
     """
 
     manifest: Manifest
@@ -123,7 +123,8 @@ def write_manifest_and_stats(
         DirectoryNotWritable: there can be no lock in the directory.
         FileNotWritten: the disk is full; what was there before still is.
     """
-    if run is not None and stats is not None:
+    has_written = run is not None and stats is not None
+    if has_written and stats is not None:
         # First of all: it tells a directory that is full, or gone.
         write_stats_file(directory / f"{stats_prefix(infix)}.stats.json", stats)
     # A monitor that is open has nobody beside it.
@@ -137,9 +138,11 @@ def write_manifest_and_stats(
             run = Run() if files.journal is None else Run.read(files.journal)
         stats = _stats_of(results) if stats is None else stats
         name = f"{stats_prefix(infix)}.stats.json" if old is None else old.stats
-        is_new_stats = stats is not None and _saved(directory / name) != stats
-        if stats is not None and is_new_stats:
-            write_stats_file(directory / name, stats)
+        is_new_stats = False
+        if stats is not None and not has_written:
+            is_new_stats = _saved(directory / name) != stats
+            if is_new_stats:
+                write_stats_file(directory / name, stats)
         manifest = _manifest(directory, infix, results, run, stats_name=name)
         is_new = old is None or _as_read(manifest) != old
         if is_new:
