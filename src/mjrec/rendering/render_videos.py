@@ -6,19 +6,20 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
 from ..annotation import check_annotation
-from ..engines.work import Engine
+from ..engines.choice import given_engine
 from ..errors import InvalidArgument, UnreadableFile
 from ..formats.in_flight import is_in_flight, list_paths, read_list
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_models
-from .engine_jobs import do_on_engine, given_engine
+from .engine_jobs import do_on_engine
 from .finish import bring_up_to_date, do_jobs
 from .jobs import Outcome, Variant, VideoJob
 from .progress import Progress
@@ -107,7 +108,7 @@ def render_videos(
     workers: int | None = None,
     strict: bool = False,
     trust_models: bool = False,
-    engine: Engine | str | None = None,
+    engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> RenderedVideos:
     """Render the pending videos of a directory, or recorded episodes again.
@@ -191,7 +192,7 @@ def iter_rendered_videos(
     workers: int | None = None,
     strict: bool = False,
     trust_models: bool = False,
-    engine: Engine | str | None = None,
+    engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> Iterator[Outcome]:
     """Do what `render_videos` does, and yield what became of each as it is over.
