@@ -20,7 +20,7 @@ from typing import Any
 
 from ..errors import Error, FileNotWritten, UnreadableFile
 from ..formats.in_flight import drop_recording, remove_list
-from ..formats.journal import KILLED, JournalWriter, entry_of, run_facts
+from ..formats.journal import KILLED, JournalWriter, entry_of
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import Infix, episode_of, journal_name, manifest_name
 from ..formats.spans import FORMAT
@@ -28,13 +28,13 @@ from ..formats.trajectory import FORMAT_VERSION
 from ..formats.trajectory_file import finish_trajectory, open_trajectory
 from ..formats.video_metadata import is_done
 from ..json_text import loads
-from ..results.journal_or_stats import MonitorResults
+from ..results.journal_or_stats import MonitorResults, locked_run
 from ..results.manifest_and_stats import (
     Written,
     manifest_lock,
     write_manifest_and_stats,
 )
-from ..results.recorded_environment import locked_run
+from ..results.run import Run
 from .killed_episodes import KnownEpisodes
 from .killed_leftovers import (
     Remains,
@@ -251,7 +251,7 @@ def _missing_episodes(
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield what the journal lacks of episodes with a trajectory or a video."""
     journal = remains.files.journal
-    is_choosing = bool(journal and (run_facts(journal) or {}).get("keep"))
+    is_choosing = bool(journal and Run.read(journal).facts.get("keep"))
     names = (path.name.removeprefix(".") for path in remains.paths)
     filmed = {episode_of(n) for n in names if n.startswith("openaigym.video.")}
     for number in sorted(known.numbers - known.journaled):
