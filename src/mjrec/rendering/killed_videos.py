@@ -10,24 +10,20 @@ rate, and the trajectory, where there is one, the episode.
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 import struct
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..errors import EncoderError, Error, MissingDependency, UnreadableFile
+from ..errors import EncoderError, Error, UnreadableFile
 from ..formats.asciicast import AsciicastWriter, unfinished_recording
-from ..formats.ffmpeg import ffmpeg_executable, ffmpeg_sha256, ffmpeg_version
 from ..formats.journal import KILLED
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import episode_of, video_prefix
-from ..formats.unfinished_video import UnfinishedVideo, VideoFile, VideoNote, read_note
+from ..formats.unfinished_video import UnfinishedVideo, read_note
 from ..formats.video_metadata import (
     StepRuns,
-    file_facts,
     further_live_videos,
     metadata_path,
     timing_facts,
@@ -60,33 +56,29 @@ def finish_video(
         Error: its encoder is still at it, or the files cannot be written.
     """
     try:
-        note = read_note(note_file)
+        video = read_note(note_file)
     except UnreadableFile:
         # Whoever writes a note writes it before there is a video.
         note_file.unlink(missing_ok=True)
         return None
-    video = note.video
     _wait_for_encoder(video, is_over)
     if metadata_path(video.path).exists() or not _is_begun(video):
         _forget(note_file, video)
         return None
     if not _holds_pictures(video):
         # It was killed before its encoder had been given a frame.
-        write_metadata(video.path, _metadata_without_video(note, known))
+        write_metadata(video.path, _metadata_without_video(video, known))
         _forget(note_file, video)
         return RecoveredFile(metadata_path(video.path).name, "there was no frame yet")
     try:
-        file = video.check()
-    except MissingDependency:
-        raise
-    except Error as error:
-        return _give_up(note_file, note, known, error)
-    video.rename(file, cut=True)
-    file = dataclasses.replace(file, encoder=_encoder(note))
-    metadata = _metadata(note, file, known)
+        facts = video.finish()
+    except EncoderError as error:
+        return _give_up(note_file, video, known, error)
+    metadata = _metadata(video, facts, known)
     write_metadata(video.path, metadata)
     _forget(note_file, video)
-    frames = f"{file.frame_count} {'frame' if file.frame_count == 1 else 'frames'}"
+    count = facts["frame_count"]
+    frames = f"{count} {'frame' if count == 1 else 'frames'}"
     ending = "" if metadata["complete"] else f", incomplete: {metadata['reason']}"
     return RecoveredFile(video.path.name, frames + ending)
 
@@ -138,29 +130,30 @@ def _forget(note_file: Path, video: UnfinishedVideo) -> None:
 
 
 def _give_up(
-    note_file: Path, note: VideoNote, known: KnownEpisodes, error: Error
+    note_file: Path, video: UnfinishedVideo, known: KnownEpisodes, error: EncoderError
 ) -> RecoveredFile:
-    video = note.video
-    said = error.stderr.strip().splitlines() if isinstance(error, EncoderError) else []
+    said = error.stderr.strip().splitlines()
     why = said[-1] if said else str(error)
     reason = (
         "the recording process was killed, and its encoder before it had finished the "
         f"file: {why}"
     )
     failure = {"broken": True, "broken_reason": reason}
-    write_metadata(video.path, {**_metadata_without_video(note, known), **failure})
-    if note.video.hashes is not None:
-        note.video.hashes.unlink(missing_ok=True)
+    write_metadata(video.path, {**_metadata_without_video(video, known), **failure})
+    if video.hashes is not None:
+        video.hashes.unlink(missing_ok=True)
     return RecoveredFile(
         video.path.name, f"broken ({why}); its data is in {video.temporary.name}"
     )
 
 
-def _metadata_without_video(note: VideoNote, known: KnownEpisodes) -> Mapping[str, Any]:
-    number = episode_of(note.video.path.name)
+def _metadata_without_video(
+    video: UnfinishedVideo, known: KnownEpisodes
+) -> Mapping[str, Any]:
+    number = episode_of(video.path.name)
     ending = known.ending(number) or {"complete": False, "reason": KILLED}
     return {
-        **note.metadata,
+        **video.metadata,
         **ending,
         **known.sums(number),
         "empty": True,
@@ -169,38 +162,32 @@ def _metadata_without_video(note: VideoNote, known: KnownEpisodes) -> Mapping[st
 
 
 def _metadata(
-    note: VideoNote, file: VideoFile, known: KnownEpisodes
+    video: UnfinishedVideo, facts: dict[str, Any], known: KnownEpisodes
 ) -> Mapping[str, Any]:
-    number = episode_of(note.video.path.name)
-    timestep, stride = note.timing["timestep"], note.timing["stride"]
+    number = episode_of(video.path.name)
+    frame_count, stride = facts["frame_count"], facts["stride"]
+    frames_per_step = facts.pop("frames_per_step")
     sums = known.sums(number)
     ending = known.ending(number)
     length: Any = sums.get("length")
-    steps: Iterable[int]
-    if ending is not None and _is_whole(note, file, length):
-        # The last step is always among them.
-        steps = itertools.chain(range(0, length, stride), [length])
+    steps: Iterable[int] = range(0, frame_count * stride, stride)
+    # The last step is always among them.
+    whole = [*range(0, length, stride), length] if isinstance(length, int) else []
+    if ending is not None and frames_per_step == 1 and len(whole) == frame_count:
+        steps = whole
     else:
         # The last frames were on their way to the encoder.
         ending = {"complete": False, "reason": KILLED}
-        steps = range(0, file.frame_count * stride, stride)
-    timing = timing_facts(
-        StepRuns(steps, stride=stride),
-        fps=file.fps,
-        timestep=timestep,
-        stride=stride,
-        frames_per_step=note.timing["frames_per_step"],
-    )
-    if note.timing["frames_per_step"] != 1:
-        # How many frames each step gave is not known.
-        timing.update(frame_count=file.frame_count, frame_steps=None)
+    runs = StepRuns(steps, stride=stride)
+    # How many frames each step gave is known only where it is one.
+    frame_steps = runs.ranges if frames_per_step == 1 else None
     return {
-        **note.metadata,
+        **video.metadata,
+        **facts,
         **ending,
         **sums,
-        **timing,
-        **file_facts(file),
-        **_further_videos(note.video.path),
+        "frame_steps": frame_steps,
+        **_further_videos(video.path),
         "recovered": True,
     }
 
@@ -209,23 +196,6 @@ def _further_videos(video: Path) -> dict[str, Any]:
     """Return what the first video of an episode says of those of further cameras."""
     names = further_live_videos(video)
     return {"further_videos": names} if names else {}
-
-
-def _is_whole(note: VideoNote, file: VideoFile, length: Any) -> bool:
-    """Tell whether a file has all the frames of an episode of some length."""
-    if not isinstance(length, int) or note.timing["frames_per_step"] != 1:
-        return False
-    return file.frame_count == len(range(0, length, note.timing["stride"])) + 1
-
-
-def _encoder(note: VideoNote) -> dict[str, Any]:
-    encoder = dict(note.video.encoder)
-    is_same = (
-        Path(ffmpeg_executable()).stat().st_size == note.ffmpeg_size
-        and ffmpeg_version() == encoder["version"]
-    )
-    encoder["sha256"] = ffmpeg_sha256() if is_same else None
-    return encoder
 
 
 _TOLD_BY_TRAJECTORY = ("type", "env_id", "seed", "options", "versions")
