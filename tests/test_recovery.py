@@ -204,7 +204,7 @@ def test_hashes_of_frames_that_never_reached_the_encoder_are_left_out(
 ) -> None:
     """The process was killed between the two. Without any frame no video is broken."""
     directory = killed(
-        "import mjrec.formats.video_writer as v\n"
+        "import mjrec.formats.video_file as v\n"
         "write, count = v.FfmpegProcess.write, iter(range(9))\n"
         "def some(process, data):\n"
         "    is_frame = not isinstance(data, bytes)\n"

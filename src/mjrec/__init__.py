@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from .evidence.verification import Verification as Verification
     from .evidence.verifying import verify as verify
     from .formats.archive import write_archive as write_archive
-    from .formats.frames_to_videos import save_video as save_video
     from .formats.video_writer import VideoWriter as VideoWriter
+    from .formats.video_writer import save_video as save_video
     from .gl import use_gl as use_gl
     from .monitors import Monitor as Monitor
     from .monitors.dm_env_monitor import DmEnvMonitor as DmEnvMonitor
@@ -126,7 +126,7 @@ _LAZY = {
     "render": "rendering.render_frames",
     "render_states": "rendering.render_frames",
     "render_videos": "rendering.render_videos",
-    "save_video": "formats.frames_to_videos",
+    "save_video": "formats.video_writer",
     "use_gl": "gl",
     "verify": "evidence.verifying",
     "write_archive": "formats.archive",

@@ -10,24 +10,20 @@ rate, and the trajectory, where there is one, the episode.
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 import struct
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from ..errors import EncoderError, Error, UnreadableFile
 from ..formats.asciicast import AsciicastWriter, unfinished_recording
-from ..formats.ffmpeg import ffmpeg_executable, ffmpeg_sha256, ffmpeg_version
 from ..formats.journal import KILLED
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import episode_of
-from ..formats.unfinished_video import UnfinishedVideo, VideoFile, VideoNote, read_note
+from ..formats.unfinished_video import UnfinishedVideo, read_note
 from ..formats.video_metadata import (
     StepRuns,
-    file_facts,
     further_live_videos,
     metadata_path,
     timing_facts,
@@ -64,23 +60,24 @@ def finish_video(
         Error: its encoder is still at it, or the files cannot be written.
     """
     try:
-        note = read_note(note_file)
+        video = read_note(note_file)
     except UnreadableFile:
         # A note is written before there is a video.
         note_file.unlink(missing_ok=True)
         return
-    video = note.video
     _wait_for_encoder(video, deadline)
     if not metadata_path(video.path).exists() and _is_begun(video):
         ending = known if "complete" in known else {**known, **_CUT}
-        without_video = {**note.metadata, **ending, "empty": True, "recovered": True}
+        without_video = {**video.metadata, **ending, "empty": True, "recovered": True}
         try:
             if not _holds_frames(video):
                 # It was killed before its encoder had been given a frame.
                 write_metadata(video.path, without_video)
                 yield metadata_path(video.path).name, "there was no frame yet"
             else:
-                yield video.path.name, _finish(note, known)
+                metadata = _metadata(video, video.finish(), known)
+                write_metadata(video.path, metadata)
+                yield video.path.name, _counted(metadata["frame_count"], metadata)
         except EncoderError as error:
             why = (error.stderr.strip().splitlines() or [str(error)])[-1]
             broken = {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
@@ -95,17 +92,6 @@ def finish_video(
         video.hashes.unlink(missing_ok=True)
     # The note last, which says what they were.
     note_file.unlink(missing_ok=True)
-
-
-def _finish(note: VideoNote, known: Mapping[str, Any]) -> str:
-    """Give a video its name and its metadata; return what it is."""
-    video = note.video
-    file = video.check()
-    video.rename(file, cut=True)
-    file = dataclasses.replace(file, encoder=_encoder(note))
-    metadata = _metadata(note, file, known)
-    write_metadata(video.path, metadata)
-    return _counted(file.frame_count, metadata)
 
 
 def _counted(count: int, metadata: Mapping[str, Any]) -> str:
@@ -152,35 +138,26 @@ def _holds_frames(video: UnfinishedVideo) -> bool:
 
 
 def _metadata(
-    note: VideoNote, file: VideoFile, known: Mapping[str, Any]
+    video: UnfinishedVideo, facts: dict[str, Any], known: Mapping[str, Any]
 ) -> dict[str, Any]:
-    timestep, stride = note.timing["timestep"], note.timing["stride"]
-    steps: Iterable[int]
-    frames_per_step = note.timing["frames_per_step"]
+    frame_count, stride = facts["frame_count"], facts["stride"]
+    frames_per_step = facts.pop("frames_per_step")
     length = known.get("length", 0)
     # The last step is always among them.
-    steps = itertools.chain(range(0, length, stride), [length])
-    is_whole = file.frame_count == len(range(0, length, stride)) + 1
-    if not is_whole or frames_per_step != 1 or "complete" not in known:
+    steps = [*range(0, length, stride), length]
+    is_whole = len(steps) == frame_count and frames_per_step == 1
+    if not is_whole or "complete" not in known:
         # The last frames were on their way to the encoder.
-        steps = range(0, file.frame_count * stride, stride)
+        steps = [*range(0, frame_count * stride, stride)]
         known = {**_sums(known), **_CUT}
-    timing = timing_facts(
-        StepRuns(steps, stride=stride),
-        fps=file.fps,
-        timestep=timestep,
-        stride=stride,
-        frames_per_step=frames_per_step,
-    )
-    if frames_per_step != 1:
-        # How many frames each step gave is not known.
-        timing.update(frame_count=file.frame_count, frame_steps=None)
-    further = further_live_videos(note.video.path)
+    # How many frames each step gave is known only where it is one.
+    is_known = frames_per_step == 1
+    further = further_live_videos(video.path)
     return {
-        **note.metadata,
+        **video.metadata,
+        **facts,
         **known,
-        **timing,
-        **file_facts(file),
+        "frame_steps": StepRuns(steps, stride=stride).ranges if is_known else None,
         **({"further_videos": further} if further else {}),
         "recovered": True,
     }
@@ -188,16 +165,6 @@ def _metadata(
 
 def _sums(known: Mapping[str, Any]) -> dict[str, Any]:
     return {key: known[key] for key in ("length", "reward") if key in known}
-
-
-def _encoder(note: VideoNote) -> dict[str, Any]:
-    encoder = dict(note.video.encoder)
-    is_same = (
-        Path(ffmpeg_executable()).stat().st_size == note.ffmpeg_size
-        and ffmpeg_version() == encoder["version"]
-    )
-    encoder["sha256"] = ffmpeg_sha256() if is_same else None
-    return encoder
 
 
 def finish_text(
