@@ -66,8 +66,8 @@ if TYPE_CHECKING:
     from .monitors.vector_monitor import VectorMonitor as VectorMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
+    from .rendering.recovery import Recovery as Recovery
     from .rendering.recovery import recover as recover
-    from .rendering.recovery_report import Recovery as Recovery
     from .rendering.render_frames import render as render
     from .rendering.render_frames import render_states as render_states
     from .rendering.render_videos import RenderedVideos as RenderedVideos
@@ -98,7 +98,7 @@ _LAZY = {
     "LocalEngine": "engines.local",
     "Monitor": "monitors",
     "RayEngine": "engines.ray",
-    "Recovery": "rendering.recovery_report",
+    "Recovery": "rendering.recovery",
     "RenderedVideos": "rendering.render_videos",
     "SlurmEngine": "engines.slurm",
     "StatsRecorder": "recorder.stats_recorder",
