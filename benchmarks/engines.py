@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from mjrec.engines.jobs import Job, Work
+from mjrec.engines.jobs import Job, Run, Work
 from mjrec.engines.local import LocalEngine
 
 from .children import call

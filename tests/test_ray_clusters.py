@@ -12,13 +12,13 @@ import ray
 from engine_runs import lines, outcomes, submit, values
 from ray.cluster_utils import Cluster
 from ray_clusters import SMALL_STORE, cluster_of, home_for_ray, is_gone
-from ray_runs import begun, run_python
 from waiting import wait_until
 
 import mjrec
 from mjrec.engines import ray as ray_engine
 from mjrec.engines.ray import RayEngine
 from mjrec.errors import Error
+from ray_runs import begun, run_python
 
 # Ray's own connections and pipes, of which it says so when they are collected.
 pytestmark = [

@@ -20,13 +20,13 @@ from ray_clusters import (
     is_gone,
     ray_processes,
 )
-from ray_runs import begun, run_python
 from waiting import wait_until
 
 import mjrec
 from mjrec.engines.ray import RayEngine
 from mjrec.engines.work import Engine, JobOutcome, Run, Work
 from mjrec.errors import ClosedError, Error, InvalidArgument, MissingDependency
+from ray_runs import begun, run_python
 
 # Ray's own connections and pipes, of which it says so when they are collected.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
