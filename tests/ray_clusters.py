@@ -41,7 +41,7 @@ def home_for_ray(home: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def own_ray(*, cpus: int) -> Iterator[None]:
+def own_ray(*, cpus: int) -> Iterator[Any]:
     """Have a Ray that this process has started for itself."""
     ray.init(
         address="local",
@@ -50,8 +50,10 @@ def own_ray(*, cpus: int) -> Iterator[None]:
         object_store_memory=SMALL_STORE,
         logging_level=logging.ERROR,
     )
-    yield
-    ray.shutdown()
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
 
 
 @contextlib.contextmanager

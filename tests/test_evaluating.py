@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 
@@ -199,19 +199,18 @@ class Wandering(Executor):
     def __init__(self, homes: Path) -> None:
         self.homes = homes
         self.worker: EvaluationWorker | None = None
-        self.thread = ThreadPoolExecutor(1)
 
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        return self.thread.submit(self._do, *json.loads(json.dumps(args)))
-
-    def _do(self, message: dict[str, Any]) -> dict[str, Any]:
+        [message] = json.loads(json.dumps(args))
         if self.worker is None:
             self.worker = EvaluationWorker(message["work"]["settings"], None)
+        future: Future[Any] = Future()
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_STATE_HOME", str(self.homes / message["key"]))
-            return {"value": self.worker(message["arguments"])}
+            future.set_result({"value": self.worker(message["arguments"])})
+        return future
 
 
 @pytest.mark.dm_control

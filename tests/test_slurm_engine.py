@@ -103,18 +103,20 @@ def test_a_slurm_job_at_its_time_limit_goes_on(tmp_path: Path) -> None:
         first = wait_for(tmp_path / "begun", run)
         (tmp_path / "begun").unlink()
         for job in submitted(tmp_path):
-            for pid in Path("/proc", job, "task", job, "children").read_text().split():
-                os.kill(int(pid), signal.SIGUSR2)
+            # Some have done all of theirs.
+            for path in Path("/proc").glob(f"{job}/task/{job}/children"):
+                for pid in path.read_text().split():
+                    os.kill(int(pid), signal.SIGUSR2)
         assert wait_for(tmp_path / "begun", run) != first
         assert run.unfinished >= 1
 
 
 def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path: Path) -> None:
-    """Three rounds are enough; the error has the end of the log."""
+    """Three rounds are enough."""
     made = engine(setup=["echo no such module >&2; exit 1"])
     with Run(made, odd_work(shared=tmp_path / "shared")) as run:
         submit(run, "a", do="echo")
-        with pytest.raises(Error, match=r"(?s)No worker can begin.*no such module"):
+        with pytest.raises(Error, match="No worker can begin.* was in the Slurm job"):
             outcomes(run)
 
 

@@ -20,7 +20,7 @@ import shutil
 import sys
 import time
 import weakref
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -147,7 +147,13 @@ class Run:
         self._any_is_done = False
         self._owner = os.getpid()
         self._leave = weakref.finalize(
-            self, _leave, self._place, self._owner, is_new=is_new
+            self,
+            _leave,
+            self._place,
+            self._owner,
+            is_new=is_new,
+            # Slurm's, whose jobs outlive their futures.
+            end_run=getattr(engine, "end_run", None),
         )
 
     @property
@@ -204,9 +210,6 @@ class Run:
         finally:
             # Also where Ctrl-C has cut the waiting short.
             end_idle_children(str(self._place))
-            if (end_run := getattr(self.engine, "end_run", None)) is not None:
-                # Slurm's, whose jobs are not futures.
-                end_run(str(self._place))
             self._leave()
 
     def __enter__(self) -> Self:
@@ -352,11 +355,15 @@ def _stop(place: Path) -> None:
         (place / STOP).touch()
 
 
-def _leave(place: Path, owner: int, *, is_new: bool) -> None:
+def _leave(
+    place: Path, owner: int, *, is_new: bool, end_run: Callable[[str], None] | None
+) -> None:
     # A forked child's copy; the run is its parent's.
     if os.getpid() != owner:
         return
     _stop(place)
+    if end_run is not None:
+        end_run(str(place))
     shutil.rmtree(place, ignore_errors=True)
     if place.parent.name == WORK_FOLDER:
         # What a run had to make goes with it, where nothing else is there.

@@ -30,7 +30,7 @@ _COMMANDS = ("sbatch", "squeue", "scancel", "srun")
 _LOG_LEVEL = "SUBMITIT_LOG_LEVEL"
 _SECONDS_FOR_COMMAND = 60.0
 _SECONDS_TO_DIE = 5.0
-_FINEST_LOOK = 0.05
+_SECONDS_BETWEEN_LOOKS = 0.2
 
 _NOT_OVER = frozenset(
     {"PENDING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", "SPECIAL_EXIT"}
@@ -163,11 +163,12 @@ class Cluster:
             (signal.SIGKILL, _SECONDS_TO_DIE),
         ):
             deadline = time.monotonic() + seconds
-            for job in running:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(int(job), signum)
             while running and time.monotonic() < deadline:
-                time.sleep(_FINEST_LOOK)
+                for job in running:
+                    # Again and again: one that has not begun yet passes it on to none.
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(int(job), signum)
+                time.sleep(_SECONDS_BETWEEN_LOOKS)
                 running = {job for job in running if self._runs(job)}
 
     def _runs(self, pid: str) -> bool:
