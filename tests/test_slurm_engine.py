@@ -116,7 +116,7 @@ def test_slurm_jobs_that_end_as_soon_as_they_begin(tmp_path: Path) -> None:
     made = engine(setup=["echo no such module >&2; exit 1"])
     with Run(made, odd_work(shared=tmp_path / "shared")) as run:
         submit(run, "a", do="echo")
-        with pytest.raises(Error, match="No worker can begin.* was in the Slurm job"):
+        with pytest.raises(Error, match=r"No worker can begin.* was in the Slurm job"):
             outcomes(run)
 
 

@@ -245,7 +245,9 @@ class Run:
             # The executor's own: a worker of it is gone.
             if isinstance(error, Error):
                 raise
-            said = {"died": f"is gone: {type(error).__name__}: {error}"}
+            why = f"{type(error).__name__}: {error}".splitlines()
+            said = {"died": f"is gone: {why[0]} {why[-1] if why[1:] else ''}"}
+            said["begun"] = False
         self._log(said.get("log", ()))
         if "error" in said:
             raise unpacked(said["error"])
