@@ -30,21 +30,7 @@ def test_pictures_stand_row_by_row_and_the_rest_is_black() -> None:
     assert (grid[2:, 3:] == 0).all()
 
 
-def test_one_picture_is_copied() -> None:
-    """The environment may draw the next one into the same array."""
-    frame = plain(7)
-    grid = grid_frame([frame])
-    frame[:] = 0
-    assert (grid == 7).all()
-
-
 def test_pictures_of_different_sizes_are_an_error_that_names_them() -> None:
     """Nothing is scaled or cut behind the user's back."""
     with pytest.raises(InvalidArgument, match="3x2, 4x5"):
         grid_frame([plain(1), plain(2, height=5, width=4)])
-
-
-def test_no_picture_is_an_error() -> None:
-    """There is no size to give it."""
-    with pytest.raises(InvalidArgument, match="none"):
-        grid_frame([])

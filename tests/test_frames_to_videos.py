@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mjrec
-from mjrec.errors import DirectoryNotWritable, InvalidArgument, UnknownName
+from mjrec.errors import InvalidArgument, UnknownName
 from mjrec.frames import Frame
 
 LEVELS = 6
@@ -55,40 +55,6 @@ def test_the_default_is_the_capped_cubic_schedule(tmp_path: Path, episode: int) 
         assert shown(path) == list(range(30))
 
 
-def test_the_episode_trigger_gets_the_episodes_number(tmp_path: Path) -> None:
-    """A trigger of one's own replaces the schedule; its truth counts."""
-    asked: list[int] = []
-    mjrec.save_video(
-        shades(3),
-        tmp_path / "new" / "folder",
-        lambda number: asked.append(number) or 1,
-        fps=30,
-        episode_index=7,
-        name_prefix="mine",
-    )
-    assert asked == [7]
-    assert shown(tmp_path / "new" / "folder" / "mine-episode-7.mp4") == [0, 1, 2]
-
-
-def test_step_videos_begin_at_their_step_and_leave_out_the_reset(
-    tmp_path: Path,
-) -> None:
-    """Frame 1 is that of step_starting_index; videos may overlap; no episode video."""
-    asked: list[int] = []
-
-    def trigger(step: int) -> bool:
-        asked.append(step)
-        return step in (100, 103)
-
-    mjrec.save_video(
-        shades(8), tmp_path, step_trigger=trigger, step_starting_index=100, fps=30
-    )
-    assert asked == [100, 101, 102, 103, 104, 105, 106]
-    assert names(tmp_path) == ["rl-video-step-100.mp4", "rl-video-step-103.mp4"]
-    assert shown(tmp_path / "rl-video-step-100.mp4") == [1, 2, 3, 4, 5, 6, 7]
-    assert shown(tmp_path / "rl-video-step-103.mp4") == [4, 5, 6, 7]
-
-
 def reused(count: int, made: list[int]) -> Iterator[Frame]:
     """Yield one buffer again and again, and note the frames that are made."""
     buffer = shade(0)
@@ -121,20 +87,6 @@ def test_a_generator_is_streamed_and_read_no_further_than_needed(
     assert made == shown(tmp_path / "rl-video-episode-0.mp4") == [*range(count)]
 
 
-def test_nothing_is_read_when_no_video_is_due(tmp_path: Path) -> None:
-    """A trigger that says no leaves a generator untouched."""
-    made: list[int] = []
-    mjrec.save_video(reused(3, made), tmp_path, never, fps=30)
-    assert made == names(tmp_path) == []
-
-
-def test_no_frames_no_file(tmp_path: Path) -> None:
-    """An empty episode, and one with the reset's frame only and a step trigger."""
-    mjrec.save_video([], tmp_path, always, always, fps=30)
-    mjrec.save_video(shades(1), tmp_path, step_trigger=always, fps=30)
-    assert names(tmp_path) == []
-
-
 def test_the_frames_before_an_error_are_kept(tmp_path: Path) -> None:
     """What the generator raises goes through, and the video holds what came before."""
 
@@ -145,13 +97,6 @@ def test_the_frames_before_an_error_are_kept(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError):
         mjrec.save_video(frames(), tmp_path, fps=30)
     assert shown(tmp_path / "rl-video-episode-0.mp4") == [0, 1, 2, 3]
-
-
-def test_further_options_are_the_writers(tmp_path: Path) -> None:
-    """The options frame_hashes, crf and the rest reach the writer."""
-    mjrec.save_video(shades(2), tmp_path, fps=30, frame_hashes=True, crf=30)
-    stem = "rl-video-episode-0"
-    assert names(tmp_path) == [f"{stem}.framehash", f"{stem}.mp4"]
 
 
 @pytest.mark.parametrize(
@@ -173,10 +118,3 @@ def test_options_are_checked_first(
     with pytest.raises(error, match=message):
         mjrec.save_video(shades(2), tmp_path / "videos", **options)
     assert names(tmp_path) == []
-
-
-def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
-    """A file is in the way."""
-    (tmp_path / "file").touch()
-    with pytest.raises(DirectoryNotWritable, match="file"):
-        mjrec.save_video(shades(2), tmp_path / "file", fps=30)

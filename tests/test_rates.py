@@ -86,9 +86,3 @@ def test_stride_is_the_smallest_that_fits(
 ) -> None:
     """Every step, every second, every third ..."""
     assert stride_for(rate, max_fps) == stride
-
-
-def test_error_names_the_option_that_was_wrong() -> None:
-    """`max_fps` is not `fps`."""
-    with pytest.raises(InvalidArgument, match=r"^max_fps must be"):
-        stride_for(Fraction(20), 0)

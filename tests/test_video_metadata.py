@@ -4,25 +4,14 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-from mjrec import VideoWriter
 from mjrec.formats.video_metadata import (
     StepRuns,
-    file_facts,
     playback_speed,
     timing_facts,
 )
-
-
-def test_steps_in_a_row_are_one_run() -> None:
-    """However many there are."""
-    runs = StepRuns(range(1000))
-    assert runs.ranges == [[0, 999]]
-    assert runs.total == 1000
 
 
 def test_steps_a_stride_apart_are_one_run() -> None:
@@ -47,11 +36,6 @@ def test_playback_speed(fps: int, steps_per_frame: Fraction, speed: float) -> No
     assert playback_speed(Fraction(fps), Fraction(1, 20), steps_per_frame) == speed
 
 
-def test_playback_speed_is_unknown_without_simulated_time() -> None:
-    """Nobody can say."""
-    assert playback_speed(Fraction(40), None, Fraction(1)) is None
-
-
 def test_timing_is_in_exact_fractions() -> None:
     """Rate and timestep are text, so that thirds stay thirds."""
     facts = timing_facts(
@@ -68,14 +52,3 @@ def test_timing_is_in_exact_fractions() -> None:
         "frame_count": 3,
         "frame_steps": [[0, 4]],
     }
-
-
-def test_file_facts_stay_true_when_the_directory_moves(tmp_path: Path) -> None:
-    """Sizes and hashes of the file, and a command line without directories."""
-    with VideoWriter(tmp_path / "v.mp4", fps=10) as video:
-        video.write(np.zeros((15, 20, 3), np.uint8))
-    assert video.result is not None
-    facts = file_facts(video.result)
-    assert (facts["height"], facts["padded_height"], facts["width"]) == (15, 16, 20)
-    assert facts["encoder_version"]["backend"] == "ffmpeg"
-    assert str(tmp_path) not in str(facts)
