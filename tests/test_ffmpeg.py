@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -82,17 +81,6 @@ def test_a_failure_has_command_status_and_the_end_of_stderr() -> None:
         run_ffmpeg(["-hide_banner", "-i", "missing.mp4", "-f", "null", "-"])
     assert caught.value.command[-1] == "-"
     assert caught.value.returncode not in (0, None)
-
-
-def test_a_process_that_dies_while_it_is_fed_is_one_error() -> None:
-    """Writing to a killed ffmpeg gives its signal, not a broken pipe."""
-    arguments = "-v error -f rawvideo -pixel_format gray -video_size 8x8 -i - -f null -"
-    process = FfmpegProcess(arguments.split(), what="It failed.", reads=True)
-    os.kill(process.pid, signal.SIGKILL)
-    with pytest.raises(EncoderError, match="It failed") as caught:
-        process.write(bytes(64 << 20))
-    process.release()
-    assert caught.value.returncode == -signal.SIGKILL
 
 
 def test_a_fork_does_not_keep_the_pipe_open() -> None:

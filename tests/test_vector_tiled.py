@@ -24,7 +24,7 @@ from vector_environments import (
 )
 
 import mjrec
-from mjrec import InvalidArgument, NoPictures
+from mjrec import InvalidArgument
 from mjrec.frames import grid_frame
 
 LENGTHS = (2, 3, 2)
@@ -145,20 +145,6 @@ def test_pixels_are_those_of_each_environment(tmp_path: Path) -> None:
     assert hashes_at(path)[1:] == expected
 
 
-# --- what cannot be ---------------------------------------------------------------
-
-
-def test_it_needs_pictures_of_all(tmp_path: Path) -> None:
-    """Deferred rendering needs none, and a tiled video does."""
-    vector = gymnasium.make_vec("Hopper-v5", 2, "sync")
-    originals = list(vector.envs)
-    with pytest.raises(NoPictures, match='render_mode="rgb_array"'):
-        mjrec.Monitor(vector, tmp_path / "run", tiled=True)
-    assert vector.envs == originals
-    assert not list(tmp_path.iterdir())
-    vector.close()
-
-
 def test_a_bad_picture_can_be_tolerated(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -174,17 +160,3 @@ def test_a_bad_picture_can_be_tolerated(
     assert "64x32, 64x48" in caplog.text
     assert not list(tmp_path.glob("*.tiled.mp4"))
     assert path_of(env.monitors[1], 0, "mp4").exists()
-
-
-KILLED = """
-import os, signal, sys
-
-import mjrec
-from vector_environments import VectorCorridor
-
-env = mjrec.Monitor(VectorCorridor((2, 3)), sys.argv[1], lambda _: True, tiled=True)
-env.reset()
-for _ in range(4):
-    env.step(env.action_space.sample())
-os.kill(os.getpid(), signal.SIGKILL)
-"""

@@ -112,7 +112,6 @@ class Encoding:
         self.temporary = temporary
         self._parts = {temporary: file.path}
         self._encoded = 0
-        self._input_ended = False
         self._hashes: TextIO | None = None
         with contextlib.ExitStack() as on_failure:
             try:
@@ -145,20 +144,17 @@ class Encoding:
                 self._encode,
                 capacity=min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes)),
                 name=f"encoder of {file.path.name}",
-                finish=self._end_input,
+                finish=self._process.end_input,
             )
             on_failure.pop_all()
 
-    def finish(self) -> VideoFile | None:
+    def finish(self) -> VideoFile:
         """Complete the file, check it and give it its name.
 
-        Each part can be done again, where Ctrl-C came in between. None on the encoder's
-        own thread, which cannot wait for itself.
+        Each part can be done again, where Ctrl-C came in between.
         """
         self.is_ending = True
         self.thread.close()
-        if not self._input_ended:
-            return None
         self._process.wait()
         if not self._file.file_sha256:
             self._file = self._checked()
@@ -200,10 +196,6 @@ class Encoding:
                 self._hashes.write(frame_hash_line(self._encoded, frame))
         self._process.write(pad_to_even(frame))
         self._encoded += 1
-
-    def _end_input(self) -> None:
-        self._process.end_input()
-        self._input_ended = True
 
     def _checked(self) -> VideoFile:
         """Return the finished file, which has its temporary name, with what it holds.

