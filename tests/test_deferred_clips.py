@@ -23,7 +23,8 @@ import mjrec
 from mjrec.commands import main
 from mjrec.formats.in_flight import add_facts, drop_recording
 from mjrec.rendering import finish as module
-from mjrec.rendering.recordings import key_of, look_at, recordings
+from mjrec.rendering.jobs import key_of
+from mjrec.rendering.recordings import look_at, recordings
 
 
 class Blinking(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -66,11 +66,11 @@ if TYPE_CHECKING:
     from .monitors.vector_monitor import VectorMonitor as VectorMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
+    from .rendering.jobs import RenderedVideos as RenderedVideos
     from .rendering.recovery import Recovery as Recovery
     from .rendering.recovery import recover as recover
     from .rendering.render_frames import render as render
     from .rendering.render_frames import render_states as render_states
-    from .rendering.render_videos import RenderedVideos as RenderedVideos
     from .rendering.render_videos import render_videos as render_videos
     from .reporting.film_strips import film_strip as film_strip
     from .reporting.report_folder import write_report as write_report
@@ -99,7 +99,7 @@ _LAZY = {
     "Monitor": "monitors",
     "RayEngine": "engines.ray",
     "Recovery": "rendering.recovery",
-    "RenderedVideos": "rendering.render_videos",
+    "RenderedVideos": "rendering.jobs",
     "SlurmEngine": "engines.slurm",
     "StatsRecorder": "recorder.stats_recorder",
     "Terminated": "signals",
