@@ -343,8 +343,7 @@ def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
     details = manifest_of(tmp_path)["mjrec"]
     assert "video" in {fault["what"] for fault in details["faults"]}
     [outcome] = finish(tmp_path)
-    assert (outcome.name, outcome.failure) == (details["pending"][0]["video"], None)
-    assert outcome.frame_count == 4
+    assert outcome.videos == {details["pending"][0]["video"]: 4}
     [about] = metadata_in(tmp_path)
     assert "states" in about["broken_reason"]
 
@@ -355,7 +354,7 @@ def test_a_missing_part_is_reported(tmp_path: Path) -> None:
     [second] = [p for p in in_flight(tmp_path) if p.name.endswith("part000001")]
     drop_recording(second)
     [outcome] = finish(tmp_path)
-    assert "part 1" in str(outcome.failure)
+    assert "part 1" in str(outcome.failures)
     assert len(parts(tmp_path)) == 2
     assert len(manifest_of(tmp_path)["mjrec"]["pending"]) == 1
     [path] = tmp_path.glob("*.failed.json")
@@ -389,7 +388,7 @@ def test_no_other_video_is_written_over(name: str, tmp_path: Path) -> None:
     add_facts(log, {"video": {"recording": "deferred", "name": named}})
     before = set(tmp_path.iterdir())
     [outcome] = finish(tmp_path)
-    assert "not that of its own" in str(outcome.failure)
+    assert "not that of its own" in str(outcome.failures)
     [new] = set(tmp_path.iterdir()) - before
     assert new.match("openaigym.clip.*.failed.json")
 
@@ -397,6 +396,6 @@ def test_no_other_video_is_written_over(name: str, tmp_path: Path) -> None:
 def test_a_clip_is_written_at_the_rate_that_was_asked_for(tmp_path: Path) -> None:
     """`fps` is that of the file, whichever frames `max_fps` leaves."""
     record(tmp_path, hopper(), 9, **CLIP, video_length=6, fps=12, max_fps=62.5)
-    assert not finish(tmp_path)[0].failure
+    assert not finish(tmp_path)[0].failures
     [about] = metadata_in(tmp_path)
     assert (about["frame_count"], about["fps"]) == (5, "12")

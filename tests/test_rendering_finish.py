@@ -210,7 +210,7 @@ def test_what_cannot_be_rendered_stops_nothing_else(
 
 
 def test_the_manifest_of_a_closed_monitor_gets_the_videos(tmp_path: Path) -> None:
-    """In the order of the episodes; what is not there yet stays pending."""
+    """In the order of the episodes; what nothing can be rendered of is none."""
     for episode_id in (0, 1):
         write_finished(tmp_path, episode_id)
     write_finished(tmp_path, 3, frames=False, broken_reason="a marker")
@@ -225,9 +225,9 @@ def test_the_manifest_of_a_closed_monitor_gets_the_videos(tmp_path: Path) -> Non
         [f"openaigym.video.0.7.video{k:06d}.{end}" for end in ("mp4", "meta.json")]
         for k in (0, 1)
     ]
-    assert [entry["episode_id"] for entry in manifest["mjrec"]["pending"]] == [2]
+    assert manifest["mjrec"]["pending"] == []
     assert manifest["mjrec"]["broken"] == ["openaigym.video.0.7.video000003.meta.json"]
-    assert manifest["mjrec"]["schedule"] == {"name": "cubic"}
+    assert manifest["mjrec"]["schedule"]["name"] == "cubic"
     assert manifest["env_info"] == {"gym_version": "mjrec-1", "env_id": "Grey-v0"}
     results = load_results(tmp_path)
     assert results is not None
@@ -249,13 +249,13 @@ def test_the_manifest_of_an_open_monitor_is_left_to_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../elsewhere/x.mp4", "/x.mp4", "", 7, None])
 def test_a_manifest_names_no_video_elsewhere(name: Any, tmp_path: Path) -> None:
-    """Such an entry stays as it is."""
+    """Such an entry is dropped."""
     path = write_pending_manifest(tmp_path, 0)
     content = json.loads(path.read_text())
     content["mjrec"]["pending"][0]["video"] = name
     path.write_text(json.dumps(content))
     write_manifest_and_stats(tmp_path, INFIX)
-    assert manifest_in(tmp_path) == content
+    assert manifest_in(tmp_path)["mjrec"]["pending"] == []
 
 
 def test_the_manifest_says_why_a_video_is_still_pending(tmp_path: Path) -> None:
