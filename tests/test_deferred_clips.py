@@ -317,7 +317,7 @@ def test_a_clip_ends_where_its_frames_would_lie(
         simulated.model = copy.copy(simulated.model)
         monitor.step(np.zeros(3))
         monitor.step(np.zeros(3))
-    assert "ends early" in caplog.text
+    assert "end early" in caplog.text
     [about] = [each for each in metadata_in(tmp_path) if "first_step" in each]
     assert about["broken"]
     assert "another model" in about["broken_reason"]

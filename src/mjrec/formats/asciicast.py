@@ -105,6 +105,12 @@ class AsciicastWriter:
             self._body.close()
             self._body_path.unlink(missing_ok=True)
 
+    def leave(self) -> None:
+        """Let go of the unfinished file, which others finish."""
+        self._closed = True
+        if self._body is not None:
+            self._body.close()
+
     def _opened(self) -> IO[str]:
         try:
             return self._body_path.open("w", encoding="utf-8")
