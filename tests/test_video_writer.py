@@ -38,7 +38,8 @@ from mjrec.formats.ffmpeg import (
     ffmpeg_executable,
     run_ffmpeg,
 )
-from mjrec.formats.video_writer import VideoFile, VideoWriter
+from mjrec.formats.video_file import VideoFile
+from mjrec.formats.video_writer import VideoWriter
 from mjrec.frames import Frame
 
 BITS = 8

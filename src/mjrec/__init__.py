@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from .evidence.verification import Verification as Verification
     from .evidence.verifying import verify as verify
     from .formats.archive import write_archive as write_archive
-    from .formats.frames_to_videos import save_video as save_video
     from .formats.video_writer import VideoWriter as VideoWriter
+    from .formats.video_writer import save_video as save_video
     from .gl import use_gl as use_gl
     from .monitors import Monitor as Monitor
     from .monitors.dm_env_monitor import DmEnvMonitor as DmEnvMonitor
@@ -66,8 +66,8 @@ if TYPE_CHECKING:
     from .monitors.vector_monitor import VectorMonitor as VectorMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
+    from .rendering.recovery import Recovery as Recovery
     from .rendering.recovery import recover as recover
-    from .rendering.recovery_report import Recovery as Recovery
     from .rendering.render_frames import render as render
     from .rendering.render_frames import render_states as render_states
     from .rendering.render_videos import RenderedVideos as RenderedVideos
@@ -98,7 +98,7 @@ _LAZY = {
     "LocalEngine": "engines.local",
     "Monitor": "monitors",
     "RayEngine": "engines.ray",
-    "Recovery": "rendering.recovery_report",
+    "Recovery": "rendering.recovery",
     "RenderedVideos": "rendering.render_videos",
     "SlurmEngine": "engines.slurm",
     "StatsRecorder": "recorder.stats_recorder",
@@ -126,7 +126,7 @@ _LAZY = {
     "render": "rendering.render_frames",
     "render_states": "rendering.render_frames",
     "render_videos": "rendering.render_videos",
-    "save_video": "formats.frames_to_videos",
+    "save_video": "formats.video_writer",
     "use_gl": "gl",
     "verify": "evidence.verifying",
     "write_archive": "formats.archive",
