@@ -47,7 +47,7 @@ PLACES = {
         ("_journal_end", "recorder"),
         ("finish", "video_sink"),
         ("close", "worker_thread"),
-        ("check", "unfinished_video"),
+        ("count_frames", "video_file"),
         ("describe", "video_sink"),
         ("write_metadata", "video_metadata"),
         ("_write_last_results", "recorder"),
