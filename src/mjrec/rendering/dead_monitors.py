@@ -27,7 +27,6 @@ from ..formats.journal import (
     JournalReader,
     JournalWriter,
     entry_of,
-    run_facts,
 )
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
@@ -41,13 +40,12 @@ from ..formats.trajectory_file import (
     open_trajectory,
 )
 from ..formats.video_metadata import is_done
-from ..results.journal_or_stats import MonitorResults
+from ..results.journal_or_stats import MonitorResults, locked_run
 from ..results.manifest_and_stats import (
     Written,
     manifest_lock,
     write_manifest_and_stats,
 )
-from ..results.recorded_environment import locked_run
 from .cut_videos import finish_text, finish_video
 from .leftovers import Leftovers, leftovers_of
 from .recorded_facts import open_for_rendering, video_path
@@ -283,8 +281,7 @@ class _DeadMonitor:
 
     def _missing_episodes(self, now: Leftovers) -> Iterator[_Line]:
         """Yield what the journal lacks of episodes with a trajectory or a video."""
-        journal = now.files.journal
-        is_choosing = bool(journal and (run_facts(journal) or {}).get("keep"))
+        is_choosing = bool(MonitorResults(now.files).run.facts.get("keep"))
         filmed = {*now.files.videos, *now.files.metadata}
         for number in sorted(self._numbers - self._journaled):
             facts = self._facts(number)

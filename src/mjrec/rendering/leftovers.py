@@ -137,7 +137,7 @@ class Leftovers:
                 found[path] = "video"
             elif is_note or (video is not None and self._is_held(video)):
                 continue
-            elif _TEXT.fullmatch(final) and _begins_with_frame(path):
+            elif _TEXT.fullmatch(final):
                 found[path] = "text"
             elif video is None or not self._has_note(video):
                 found[path] = "remove"
@@ -233,9 +233,3 @@ def model_leftovers(directory: Path) -> list[Path]:
 def _infix_of(name: str) -> Infix | None:
     part = _PART.fullmatch(name)
     return Infix.parse(infix_of(part["final"] if part else name) or "")
-
-
-def _begins_with_frame(part: Path) -> bool:
-    """Tell whether a file is the frames of a text recording, not the whole of one."""
-    with part.open("rb") as file:
-        return file.read(1) == b"["

@@ -291,7 +291,7 @@ class WorkerPool:
             try:
                 self._take_in(worker)
             except EOFError:
-                self._lose(worker, "died", worker.child.last_words())
+                self._lose(worker, "died", f"it {worker.child.last_words()}")
             except BaseException:
                 # Ctrl-C, in the midst of a message: what follows makes no sense.
                 worker.end()
