@@ -85,7 +85,7 @@ class WorkerPool:
 
     Attributes:
         limit: how many of them draw the next job, up to `count`. The others stay.
-        gl_facts: who draws, as `gl_info.current_gl_facts`; empty before the first
+        gl_facts: who draws, as `gl_context.current_gl_facts`; empty before the first
             frame.
     """
 
