@@ -23,7 +23,7 @@ from waiting import wait_until
 
 import mjrec
 from mjrec import FileNotWritten, Monitor, ResetNeeded
-from mjrec.formats.in_flight import recordings_in_flight
+from mjrec.formats.spans import recordings_in_flight
 
 CHEETAH, HOPPER, PENDULUM = "HalfCheetah-v5", "Hopper-v5", "InvertedPendulum-v5"
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION

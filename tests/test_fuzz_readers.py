@@ -372,7 +372,7 @@ def test_any_log_that_is_read_is_finished(tmp_path: Path, sound_log: Files) -> N
             continue
         with open_trajectory(finish_trajectory(path)) as reader:
             after = content_of(reader)
-        assert dumps(after.header.facts) == dumps(before.header.facts)
+        assert dumps(after.facts) == dumps(before.facts)
         assert np.array_equal(after.snapshots, before.snapshots)
 
 

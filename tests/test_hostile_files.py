@@ -38,7 +38,7 @@ from trajectories_by_hand import add_row, new_logs, write_log
 from mjrec import UnreadableFile, load_trajectory
 from mjrec.formats.manifest import read_manifest
 from mjrec.formats.monitor_directory import Infix, episode_of, infix_of
-from mjrec.formats.trajectory import ModelChange, TrajectoryHeader
+from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.json_text import dumps, loads
 from mjrec.results.manifest_and_stats import update_manifests
@@ -477,10 +477,10 @@ def test_what_a_trajectory_says_of_its_model_is_checked(
 
 def test_a_model_change_that_fits_nothing_names_the_file(directory: Path) -> None:
     """And not the field alone."""
-    header = TrajectoryHeader(facts={"model": {**stored(directory)}})
+    facts = {"model": {**stored(directory)}}
     logs = new_logs(directory)
-    span = logs.begin(NAME, header)
-    span.add_change(ModelChange(step=0, fields={"geom_rgba": np.ones(3)}))
+    span = logs.begin(NAME, facts, row_dtype())
+    span.log.add_change(ModelChange(step=0, fields={"geom_rgba": np.ones(3)}))
     add_row(span, 0)
     path = logs.path_of(NAME)
     with pytest.raises(UnreadableFile, match="belongs to another model") as error:

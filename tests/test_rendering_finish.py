@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import time
@@ -24,7 +23,6 @@ from trajectories_by_hand import (
 )
 
 from mjrec import UnreadableFile, load_results
-from mjrec.formats.in_flight import add_facts, is_in_flight
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import (
     Infix,
@@ -32,6 +30,7 @@ from mjrec.formats.monitor_directory import (
     trajectory_prefix,
     video_lock_name,
 )
+from mjrec.formats.spans import add_facts, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
 from mjrec.rendering.finish import Finisher, note_failure
@@ -355,11 +354,10 @@ def write_saying(directory: Path, **facts: Any) -> Path:
     """Write a log of two frames that says these facts, of any kind."""
     usual = write_finished(directory, 1)
     with open_trajectory(usual) as reader:
-        header = reader.header
+        known, dtype = {**reader.facts, **facts}, reader.dtype
     usual.unlink()
-    header = dataclasses.replace(header, facts={**header.facts, **facts})
     logs = new_logs(directory)
-    span = logs.begin(trajectory_prefix(INFIX, 1), header)
+    span = logs.begin(trajectory_prefix(INFIX, 1), known, dtype)
     for step in range(2):
         add_row(span, step, snapshot=grey(step))
     logs.close()

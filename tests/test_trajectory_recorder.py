@@ -13,14 +13,10 @@ from trajectories_by_hand import INFIX, new_logs
 from trajectory_contents import TrajectoryContent, content_of
 
 from mjrec.errors import FileNotWritten, PicturesDiffer
-from mjrec.formats.in_flight import recordings_in_flight
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.span_writer import SpanWriter
-from mjrec.formats.trajectory import (
-    Array,
-    RowLayout,
-    StateComponent,
-)
+from mjrec.formats.spans import recordings_in_flight
+from mjrec.formats.trajectory import packed
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.trajectory_recorder import Pace, TrajectoryRecorder
 from mjrec.simulation.capture import EpisodeStart
@@ -37,8 +33,8 @@ class Counter:
         self.hidden_from = self.gone_from = 10**6
 
     start = EpisodeStart(
-        state=(StateComponent("time", 0, 1), StateComponent("qpos", 1, 2)),
-        snapshot=RowLayout.packed([("geom_xpos", Array("<f8", (1, 3)))]),
+        state=packed([("time", ("<f8", (1,))), ("qpos", ("<f8", (2,)))]),
+        snapshot=packed([("geom_xpos", ("<f8", (1, 3)))]),
         model={"sha256": "ab"},
         scene={"height": 48},
         model_fields={"geom_rgba": np.ones((1, 4), np.float32)},
@@ -136,9 +132,9 @@ def test_a_row_a_step_and_a_frame_a_step(tmp_path: Path) -> None:
     assert read.terminated.tolist() == [False, False, True]
     assert not read.truncated.any()
     assert read.frame_steps.tolist() == [0, 1, 2, 3]
-    positions = read.header.snapshot.unpack(read.snapshots)["geom_xpos"]
+    positions = read.snapshots["geom_xpos"]
     assert positions[:, 0, 0].tolist() == [0, 1, 2, 3]
-    facts = read.header.facts
+    facts = read.facts
     assert (facts["rate"], facts["timestep"], facts["stride"]) == ("50", "1/50", 1)
     assert facts["complete"] is True
     assert trajectory.frame_count == 4
@@ -180,8 +176,8 @@ def test_reset_alone_leaves_nothing_until_the_end(tmp_path: Path) -> None:
         0,
         [0],
     )
-    assert read.header.facts["rate"] == "30"
-    assert read.header.facts["complete"] is False
+    assert read.facts["rate"] == "30"
+    assert read.facts["complete"] is False
 
 
 def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> None:
@@ -196,7 +192,7 @@ def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> N
     assert read.actions is not None
     assert (read.actions.tolist(), read.rewards.tolist()) == ([1], [1.0])
     assert read.frame_steps.size == 0
-    assert read.header.facts["timestep"] is None
+    assert read.facts["timestep"] is None
 
 
 def test_dictionaries_say_what_they_were_made_from(tmp_path: Path) -> None:
@@ -209,7 +205,7 @@ def test_dictionaries_say_what_they_were_made_from(tmp_path: Path) -> None:
     read = content(path)
     assert read.observations is not None
     assert read.observations.tolist() == [[0, 0, 1], [1, 1, 2]]
-    parts = read.header.facts["observation_parts"]
+    parts = read.facts["observation_parts"]
     assert parts == [["goal", [2]], ["speed", []]]
 
 
@@ -242,7 +238,7 @@ def test_frames_stop_where_they_would_differ(tmp_path: Path) -> None:
     assert (len(read.rewards), read.frame_steps.tolist()) == (3, [0, 1])
     changes = [(c.step, list(c.fields)) for c in read.model_changes]
     assert changes == [(0, ["geom_rgba"]), (3, ["site_rgba"])]
-    assert read.header.facts["broken_reason"] == "a marker is in the way"
+    assert read.facts["broken_reason"] == "a marker is in the way"
 
 
 def test_step_without_a_state_is_a_step_all_the_same(tmp_path: Path) -> None:
@@ -263,7 +259,7 @@ def test_step_without_a_state_is_a_step_all_the_same(tmp_path: Path) -> None:
     assert read.actions[-1].tolist() == [3, 3]
 
 
-@pytest.mark.parametrize("place", ["add_change", "make_room", "commit"])
+@pytest.mark.parametrize("place", ["make_room", "commit"])
 def test_an_interrupted_beginning_is_begun_anew(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -298,7 +294,7 @@ def test_what_is_said_first_of_the_end_counts(tmp_path: Path) -> None:
         trajectory.end({"complete": True})
     (tmp_path / "elsewhere").rename(directory)
     trajectory.end({"complete": False, "reason": "reset"})
-    facts = content(path).header.facts
+    facts = content(path).facts
     assert facts["complete"] is True
     assert "reason" not in facts
 
@@ -314,4 +310,4 @@ def test_nothing_is_recorded_after_a_stop(tmp_path: Path) -> None:
     trajectory.end({"complete": False})
     read = content(path)
     assert (len(read.rewards), read.frame_steps.tolist()) == (1, [0, 1])
-    assert read.header.facts["broken_reason"] == "the disk is full"
+    assert read.facts["broken_reason"] == "the disk is full"

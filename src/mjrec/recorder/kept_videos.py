@@ -18,9 +18,9 @@ from .. import json_text
 from ..atomic_files import write_text
 from ..errors import DirectoryNotWritable, Error, InvalidArgument
 from ..formats.frame_hashes import frame_hash_path
-from ..formats.in_flight import add_facts, drop_recording
 from ..formats.json_fields import read_object, unreadable
 from ..formats.second_names import give_second_names
+from ..formats.spans import add_facts, drop_recording
 from .deferred_video import DeferredVideo
 from .keep_rules import Selection, Standing
 from .monitored_run import MonitoredRun

@@ -67,7 +67,7 @@ class KnownEpisodes:
                 contextlib.suppress(UnreadableFile),
                 open_for_rendering(path) as reader,
             ):
-                facts = reader.header.facts
+                facts = reader.facts
         if path is None or path.is_file():
             # Of a log that gets its final form more is known afterwards.
             self._facts[number] = facts

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import UnreadableFile
-from ..formats.in_flight import read_list
 from ..formats.locks import is_locked
 from ..formats.manifest import read_manifest
 from ..formats.monitor_directory import (
@@ -27,7 +26,7 @@ from ..formats.monitor_directory import (
     names_in,
     video_prefix,
 )
-from ..formats.spans import SPANS
+from ..formats.spans import SPANS, read_list
 from ..formats.unfinished_video import note_path
 from ..formats.video_metadata import is_broken, metadata_path
 from ..results.journal_or_stats import MonitorResults

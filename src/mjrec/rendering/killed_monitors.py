@@ -19,11 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Error, FileNotWritten, UnreadableFile
-from ..formats.in_flight import drop_recording, remove_list
 from ..formats.journal import KILLED, JournalWriter, entry_of, run_facts
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import Infix, episode_of, journal_name, manifest_name
-from ..formats.spans import FORMAT
+from ..formats.spans import FORMAT, drop_recording, remove_list
 from ..formats.trajectory import FORMAT_VERSION
 from ..formats.trajectory_file import finish_trajectory, open_trajectory
 from ..formats.video_metadata import is_done
@@ -309,7 +308,7 @@ def _missing_live_clips(
 
 def _facts_of(path: Path) -> Mapping[str, Any]:
     with open_for_rendering(path) as reader:
-        return reader.header.facts
+        return reader.facts
 
 
 def _run_facts(remains: Remains) -> Mapping[str, Any]:
@@ -346,7 +345,7 @@ def _finish_log(path: Path, known: KnownEpisodes) -> RecoveredFile | None:
     if path.exists():
         return None
     with open_trajectory(path) as reader:
-        facts, steps = dict(reader.header.facts), reader.step_count
+        facts, steps = dict(reader.facts), reader.step_count
     if not facts.get("kept", True) and is_done(video_path(path, facts)):
         # Its renderer died between the two.
         drop_recording(path)

@@ -67,7 +67,7 @@ def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryRead
     reader = open_trajectory(path) if is_vetted else open_vetted_trajectory(path)
     try:
         with unreadable(path):
-            _check_all(reader.header.facts, _FACTS)
+            _check_all(reader.facts, _FACTS)
     except BaseException:
         reader.close()
         raise

@@ -14,8 +14,8 @@ from typing import Any, Self
 from ..annotation import check_annotation
 from ..engines.work import Engine
 from ..errors import InvalidArgument, UnreadableFile
-from ..formats.in_flight import is_in_flight, list_paths, read_list
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
+from ..formats.spans import is_in_flight, list_paths, read_list
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine, given_engine

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
-from ..formats.in_flight import find_recording
 from ..formats.journal import MOST_EPISODES, JournalEntry, read_journal
+from ..formats.spans import find_recording
 from ..formats.stats_file import StatsFile
 from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles, monitors_of

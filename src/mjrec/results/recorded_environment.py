@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
-from ..formats.in_flight import find_recording
 from ..formats.journal import run_facts
 from ..formats.json_fields import json_object, read_object
 from ..formats.manifest import Manifest
+from ..formats.spans import find_recording
 from .monitor_files import MonitorFiles
 
 # What stands for gym's version in what this package writes.

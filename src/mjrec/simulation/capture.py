@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ClosedError, PicturesDiffer
-from ..formats.trajectory import RowLayout, StateComponent
 from .authored_model import AuthoredModel
 from .cameras import is_tracking, raw_data, raw_model
 from .captured_arrays import (
     STATE_SPEC,
     needs_constraints,
-    snapshot_layout,
-    state_components,
+    snapshot_dtype,
+    state_dtype,
     state_words,
 )
 from .change_detection import Looks
@@ -37,7 +36,7 @@ T = TypeVar("T")
 
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
-# Fields of a model that `snapshot_layout` looks at, which environments leave alone.
+# Fields of a model that `snapshot_dtype` looks at, which environments leave alone.
 _SETTLING_THE_LAYOUT = (
     *("tendon_limited", "tendon_matid", "tendon_plasticadr"),
     "sensor_",
@@ -49,9 +48,9 @@ class EpisodeStart:
     """What is known of a simulation when an episode begins.
 
     Attributes:
-        state: the components of a state.
-        snapshot: of what frames are drawn from; without fields where `refusal` says
-            why there are none.
+        state: what a state consists of.
+        snapshot: what frames are drawn from; None where `refusal` says why there are
+            none.
         model: where the model is stored, for the facts of a trajectory.
         scene: how it is shown, likewise; None where there are no snapshots.
         model_fields: what is other than in the stored model.
@@ -64,8 +63,8 @@ class EpisodeStart:
             environment is called again. It keeps the words alive.
     """
 
-    state: tuple[StateComponent, ...]
-    snapshot: RowLayout
+    state: np.dtype[Any]
+    snapshot: np.dtype[Any] | None
     model: Mapping[str, Any]
     scene: Mapping[str, Any] | None
     model_fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -148,8 +147,8 @@ class Capture:
             self._quick = _QuickLook(self._is_unmoved, stored.looks, frames)
         quick = self._quick
         return EpisodeStart(
-            state=stored.components,
-            snapshot=frames.layout if refusal is None else RowLayout(),
+            state=stored.state,
+            snapshot=frames.kind if refusal is None else None,
             model=stored.facts,
             scene=frames.facts() if refusal is None else None,
             model_fields=fields,
@@ -168,12 +167,12 @@ class Capture:
         mujoco.mj_getState(stored.model, frames.data, out, STATE_SPEC)
 
     def capture_snapshot(
-        self, out: NDArray[np.uint8]
+        self, out: NDArray[np.uint64]
     ) -> Mapping[str, NDArray[Any]] | None:
         """Write what a frame of this moment is drawn from into `out`.
 
         Args:
-            out: `(snapshot.size,)`, contiguous, at a multiple of 8 bytes.
+            out: all of its words.
 
         Returns:
             Model and view fields that are other than at the capture before, or at the
@@ -282,12 +281,13 @@ class Capture:
         return results[-1]
 
     def _captured(
-        self, frames: _Frames, out: NDArray[np.uint8]
+        self, frames: _Frames, out: NDArray[np.uint64]
     ) -> dict[str, NDArray[Any]] | None:
         frames.source.take(out)
         changed = self._changed()
         if changed is not None:
-            reason = frames.objection_after(changed, out)
+            row = out.view(frames.kind)[0]
+            reason = frames.objection_after(changed, row)
             if reason is not None:
                 raise _differs(reason)
         return frames.drawn(changed)
@@ -343,7 +343,7 @@ class _StoredModel:
         self.model = model
         self.facts = facts
         self.looks = Looks(model)
-        self.components = state_components(model)
+        self.state = state_dtype(model)
         self.scene: mujoco.MjvScene | None = None
         self.options: set[bytes] = set()
         self.fields: set[str] = set()
@@ -364,7 +364,7 @@ class _Frames:
         key: what it depends on.
 
     Attributes:
-        layout: of the snapshots.
+        kind: of the snapshots.
         source: of the snapshots themselves.
         words: of a row, where it can be gathered.
         scene: has the cameras; None where no frame has an influence on the next.
@@ -375,8 +375,8 @@ class _Frames:
     ) -> None:
         model = stored.model
         self.data, self.view, self.key = data, view, key
-        self.layout = snapshot_layout(model, data, view.option)
-        self.source = SnapshotSource(model, data, self.layout)
+        self.kind = snapshot_dtype(model, data, view.option)
+        self.source = SnapshotSource(model, data, self.kind)
         state = state_words(model, data)
         self.words: NDArray[np.intp] | None = None
         if state is not None and self.source.words is not None:
@@ -412,9 +412,7 @@ class _Frames:
         is_known = stored.looks.option_bytes() in stored.options
         return is_known and stored.fields.issuperset(fields)
 
-    def objection(
-        self, fields: Collection[str], row: NDArray[np.uint8] | None = None
-    ) -> str | None:
+    def objection(self, fields: Collection[str], row: Any = None) -> str | None:
         """Say why frames of this moment cannot be drawn from snapshots.
 
         Args:
@@ -426,18 +424,15 @@ class _Frames:
         if reason is not None or self.is_sound(fields):
             return reason
         if row is None:
-            row = np.empty(self.layout.size, np.uint8)
-            self.source.take(row)
-        found = scene_difference(stored.model, self.data, self.layout, row, view)
+            row = self.source.taken()
+        found = scene_difference(stored.model, self.data, row, view)
         if found is not None:
             return f"drawn from its snapshot the scene is another one: {found}"
         stored.options.add(stored.looks.option_bytes())
         stored.fields.update(fields)
         return None
 
-    def objection_after(
-        self, changed: Iterable[str], row: NDArray[np.uint8]
-    ) -> str | None:
+    def objection_after(self, changed: Iterable[str], row: Any) -> str | None:
         """Say why snapshots do not suffice any longer, after something has changed.
 
         Args:
@@ -447,8 +442,8 @@ class _Frames:
         fields = [name for name in changed if not name.startswith("camera.")]
         if self.is_sound(fields):
             return None
-        now = snapshot_layout(self._stored.model, self.data, self.view.option)
-        missing = _names(now) - _names(self.layout)
+        now = snapshot_dtype(self._stored.model, self.data, self.view.option)
+        missing = {*(now.names or ())} - {*(self.kind.names or ())}
         reason = needs_constraints(self._stored.model, self.view.option)
         if reason is None and missing:
             return (
@@ -504,10 +499,6 @@ class _QuickLook:
 def _has_infinite_plane(model: mujoco.MjModel) -> bool:
     planes = model.geom_size[model.geom_type == _PLANE]
     return bool((planes[:, :2] <= 0).any())
-
-
-def _names(layout: RowLayout) -> set[str]:
-    return {field.name for field in layout.fields}
 
 
 def _differs(reason: str) -> PicturesDiffer:
