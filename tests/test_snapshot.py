@@ -420,9 +420,9 @@ def test_only_limited_spatial_tendons_without_material_have_other_colours() -> N
         (THINGS, "", ""),
         (THINGS, "geom_xpos", "pos of geom"),
         (THINGS, "light_xpos", "pos of light"),
-        (THINGS, "cam_xpos", "camera"),
+        (THINGS, "cam_xpos", "pos of light 0"),
         (FLEX, "flexvert_xpos", "pos of geom"),
-        (TENDONS, "wrap_xpos", "size of geom"),
+        (TENDONS, "wrap_xpos", "geoms instead of"),
     ],
 )
 def test_a_field_that_is_forgotten_is_noticed(xml: str, field: str, words: str) -> None:
