@@ -51,19 +51,14 @@ _FORMAT = b"mjrec trajectory"
 # cannot open.
 _LIBVER = ("v110", "v110")
 
-# Facts that are attributes of their own too, for whoever looks around in a viewer.
-_PLAIN_FACTS = (
-    *("env_id", "episode_id", "type", "seed", "start_time", "end_time"),
-    *("rate", "timestep", "stride"),
-    *("complete", "terminated", "truncated", "length", "reward"),
-)
-
 _COLUMNS = {
     "rewards": "<f8",
     "terminated": "|b1",
     "truncated": "|b1",
     "frame_steps": "<i8",
 }
+
+_NO_STATE = np.dtype(("<f8", (0,)))
 
 _CHUNK_BYTES = 1 << 18
 # Of snapshots, so that a frame's can be had without most of the others.
@@ -313,64 +308,40 @@ def _attribute(attributes: Any, name: str, kinds: str) -> Any:
 
 
 def _write(file: h5py.File, reader: TrajectoryReader) -> None:
-    _write_attributes(file, reader)
-    _write_rows(file, reader)
-    changes = file.create_group("model_changes")
-    for index, change in enumerate(reader.iter_model_changes()):
-        _write_change(changes.create_group(str(index)), change)
-
-
-def _write_attributes(file: h5py.File, reader: TrajectoryReader) -> None:
-    # Of fixed length: see _attribute. Those that only strangers read need not be.
+    facts = dumps(dict(reader.facts)).encode()
+    # Texts of fixed length: see _attribute.
     file.attrs["format"] = np.bytes_(_FORMAT)
     file.attrs["format_version"] = np.int64(FORMAT_VERSION)
-    facts = dumps(dict(reader.facts)).encode()
     file.attrs["facts"] = np.bytes_(facts)
     # HDF5 has checksums of its own for what it thinks of as its structure, and the
     # deflate filter for what it compressed; long texts have neither.
     file.attrs["crc32"] = np.int64(zlib.crc32(facts))
     file.attrs["dropped"] = np.int64(reader.dropped)
-    for name, value in _plain_facts(reader.facts):
-        file.attrs[name] = value
-
-
-def _plain_facts(facts: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    model = facts.get("model")
-    version = model.get("mujoco") if isinstance(model, Mapping) else None
-    named = [(name, facts.get(name)) for name in _PLAIN_FACTS]
-    for name, value in (*named, ("mujoco_version", version)):
-        match value:
-            case bool() | float():
-                yield name, value
-            case int() if -(2**63) <= value < 2**63:
-                yield name, np.int64(value)
-            case str() if value.isprintable():
-                yield name, value
-
-
-def _write_rows(file: h5py.File, reader: TrajectoryReader) -> None:
-    for name in _COLUMNS:
+    for name, dtype in _COLUMNS.items():
         values = getattr(reader, name)
-        _store(file, name, values.dtype, len(values), functools.partial(_slice, values))
+        _store(
+            file, name, np.dtype(dtype), len(values), functools.partial(_cut, values)
+        )
     counts = {"action": reader.step_count, "snapshot": reader.frame_count}
     for part in PARTS:
-        name, kind = f"{part}s", reader.kind(part)
+        kind = reader.kind(part)
+        if kind is None and part == "state":
+            # There was no simulation; their number is needed all the same.
+            kind = _NO_STATE
         if kind is not None:
             count = counts.get(part, reader.row_count)
-            _store(file, name, kind, count, functools.partial(reader.read, part))
-        elif part == "state":
-            file.create_dataset(name, (reader.row_count, 0), "<f8")
+            _store(file, f"{part}s", kind, count, functools.partial(reader.read, part))
+    changes = file.create_group("model_changes")
+    for index, change in enumerate(reader.iter_model_changes()):
+        group = changes.create_group(str(index))
+        group.attrs["step"] = np.int64(change.step)
+        for name, values in change.fields.items():
+            packing = _PACKING if values.ndim and values.size else {}
+            group.create_dataset(name, data=values, **packing)
 
 
-def _slice(values: NDArray[Any], start: int, stop: int) -> NDArray[Any]:
+def _cut(values: NDArray[Any], start: int, stop: int) -> NDArray[Any]:
     return values[start:stop]
-
-
-def _write_change(group: h5py.Group, change: ModelChange) -> None:
-    group.attrs["step"] = np.int64(change.step)
-    for name, values in change.fields.items():
-        packing = _PACKING if values.ndim and values.size else {}
-        group.create_dataset(name, data=values, **packing)
 
 
 def _store(
