@@ -102,11 +102,11 @@ def draw_as_worker(trajectory: str, height: int, width: int) -> dict[str, float]
     """Draw the same with what a worker draws with, in this process."""
     # As above.
     from mjrec.rendering.drawing import open_drawing
-    from mjrec.simulation.canvas import KeptCanvas
+    from mjrec.simulation.renderer import Canvas
 
     start = time.perf_counter()
     view = View(height=height, width=width).as_json()
-    drawing = open_drawing({"trajectory": trajectory, "view": view}, KeptCanvas())
+    drawing = open_drawing({"trajectory": trajectory, "view": view}, Canvas())
     out = np.empty((height, width, 3), np.uint8)
     count = _frame_count(trajectory)
     return _timed((drawing.draw(index, out=out) for index in range(count)), start)

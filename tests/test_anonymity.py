@@ -379,14 +379,6 @@ def test_single_cards_are_not_named(tmp_path: Path) -> None:
     }
 
 
-def test_what_nobody_can_read_is_removed(tmp_path: Path) -> None:
-    """A log that is damaged may say anything."""
-    log = tmp_path / "openaigym.trajectory.0.7.episode000000.log.damaged"
-    log.write_bytes(b"?")
-    make_anonymous(tmp_path, identity=Identity())
-    assert not log.exists()
-
-
 def test_films_are_searched_across_the_pieces_that_are_read(tmp_path: Path) -> None:
     """They are too large to be read at once, and a name may lie where one ends."""
     begin = b"\0\0\0\x18ftyp"

@@ -147,11 +147,11 @@ def test_episodes_of_several_monitors_are_in_the_order_of_time(tmp_path: Path) -
 
 def test_what_the_environment_says_of_success_is_known(tmp_path: Path) -> None:
     """Unknown stays unknown."""
-    successes = [True, False, None, "unknown"]
+    successes = [True, False, None]
     entries = [entry(i, success=said) for i, said in enumerate(successes)]
     write_journal(tmp_path, "0.a", "X-v0", entries)
     [task] = gather(tmp_path).tasks
-    assert list(task.episodes.success) == [1, 0, -1, -1]
+    assert list(task.episodes.success) == [1, 0, -1]
     assert (task.summary.success_known, task.summary.success_rate) == (2, 0.5)
 
 

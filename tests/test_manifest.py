@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manifest is gym's with one key more, and cannot point outside its directory."""
+"""Manifest and statistics file are gym's, and safe to read from anybody."""
 
 from __future__ import annotations
 
 import json
+import math
+import os
 from pathlib import Path
 
 import pytest
 
 from mjrec.errors import UnreadableFile
 from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
+from mjrec.formats.stats_file import StatsFile, read_stats_file, write_stats_file
 
 MANIFEST = Manifest(
     stats="s.stats.json",
@@ -17,23 +20,30 @@ MANIFEST = Manifest(
     env_info={"gym_version": "mjrec-1", "env_id": "Hopper-v5"},
     mjrec={"format": 1, "pending": []},
 )
+STATS = StatsFile(
+    initial_reset_timestamp=10.5,
+    timestamps=(11.0, 12.0),
+    episode_lengths=(3, 4),
+    episode_rewards=(1.5, -2.0),
+    episode_types=("t", "e"),
+)
+STATS_TEXT = (
+    '{"initial_reset_timestamp": 10.5, "timestamps": [11.0, 12.0], '
+    '"episode_lengths": [3, 4], "episode_rewards": [1.5, -2.0], '
+    '"episode_types": ["t", "e"]}'
+)
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    return tmp_path / "openaigym.manifest.0.1.manifest.json"
+    return tmp_path / "openaigym.some.0.1.json"
 
 
-def test_keys_are_in_gyms_order_with_ours_last(path: Path) -> None:
+def test_keys_of_a_manifest_are_in_gyms_order_with_ours_last(path: Path) -> None:
     """What is read is what was written; nothing stands for a missing key of ours."""
     write_manifest(path, MANIFEST)
     assert read_manifest(path) == MANIFEST
-    assert list(json.loads(path.read_text())) == [
-        "stats",
-        "videos",
-        "env_info",
-        "mjrec",
-    ]
+    assert [*json.loads(path.read_text())] == ["stats", "videos", "env_info", "mjrec"]
     write_manifest(path, Manifest("s", (("a", "b"),), {"gym_version": "0.21.0"}, None))
     assert path.read_text() == (
         '{"stats": "s", "videos": [["a", "b"]], "env_info": {"gym_version": "0.21.0"}}'
@@ -41,36 +51,84 @@ def test_keys_are_in_gyms_order_with_ours_last(path: Path) -> None:
     assert read_manifest(path).mjrec is None
 
 
+def test_the_text_of_statistics_is_what_gym_wrote(path: Path) -> None:
+    """Same keys, order and spacing; gyms before 0.4.7 wrote no types."""
+    write_stats_file(path, STATS)
+    assert path.read_text() == STATS_TEXT
+    assert read_stats_file(path) == STATS
+    untyped = StatsFile(1.0, (2.0,), (1,), (1.0,), None)
+    with path.open() as old:
+        write_stats_file(path, untyped)
+        # A reader that has the old file open keeps it whole.
+        assert old.read() == STATS_TEXT
+    assert list(path.parent.iterdir()) == [path]
+    assert "episode_types" not in path.read_text()
+    assert read_stats_file(path) == untyped
+
+
+def test_nan_and_infinity_come_back(path: Path) -> None:
+    """From a file that is JSON, and from gym's own tokens."""
+    rewards = (math.nan, math.inf, -math.inf)
+    write_stats_file(path, StatsFile(None, (1.0, 2.0, 3.0), (1, 1, 1), rewards, None))
+    json.loads(path.read_text(), parse_constant=pytest.fail)
+    assert repr(read_stats_file(path).episode_rewards) == "(nan, inf, -inf)"
+    path.write_text(STATS_TEXT.replace("1.5, -2.0", "NaN, -Infinity"))
+    assert repr(read_stats_file(path).episode_rewards) == "(nan, -inf)"
+
+
 @pytest.mark.parametrize(
     "name", ["../s", "a/b", "/etc/passwd", "..", ".", "", "a\\b", "a\0b"]
 )
 def test_a_name_outside_the_directory_is_refused(path: Path, name: str) -> None:
-    """As statistics, video or metadata, when reading and when writing."""
+    """As statistics, video or metadata."""
     for stats, videos in ((name, []), ("s", [[name, "m"]]), ("s", [["v", name]])):
         path.write_text(json.dumps({"stats": stats, "videos": videos, "env_info": {}}))
         with pytest.raises(UnreadableFile, match="not the name of a file"):
             read_manifest(path)
-    path.unlink()
-    with pytest.raises(ValueError, match="not the name of a file"):
-        write_manifest(path, Manifest(name, (), {}, None))
-    assert not path.exists()
 
 
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
         ('{"stats": "s", "videos": []', "not whole JSON"),
+        ('{"stats": "s", "stats": "t"}', "the key 'stats' is there twice"),
         ("null", "an object belongs there, not null"),
         ('{"videos": [], "env_info": {}}', "it has no 'stats'"),
         ('{"stats": 1, "videos": [], "env_info": {}}', "a text belongs there"),
         ('{"stats": "s", "videos": [["a"]], "env_info": {}}', "not 1 names"),
-        ('{"stats": "s", "videos": [], "env_info": [], "x": 1}', "an object belongs"),
+        ('{"stats": "s", "videos": [], "env_info": []}', "an object belongs"),
         ('{"stats": "s", "videos": [], "env_info": {}, "mjrec": 1}', "'mjrec'"),
     ],
 )
-def test_damage_is_named_with_the_reason(path: Path, content: str, reason: str) -> None:
+def test_damage_of_a_manifest_is_named(path: Path, content: str, reason: str) -> None:
     """Each kind is one clear error."""
     path.write_text(content)
     with pytest.raises(UnreadableFile, match=reason) as caught:
         read_manifest(path)
     assert caught.value.path == path
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("[" * 100_000, "nested too deeply"),
+        ('{"timestamps": "\udcff"}', "UTF-8"),
+        (STATS_TEXT.replace("[3, 4]", '"34"'), "a list belongs there"),
+        (STATS_TEXT.replace("[3, 4]", "[3, true]"), "not true or false"),
+        (STATS_TEXT.replace("[3, 4]", "[3, 4.5]"), "'episode_lengths' is wrong"),
+        (STATS_TEXT.replace("[3, 4]", "[3]"), "1 episode_lengths"),
+        (STATS_TEXT.replace('["t", "e"]', '["t"]'), "1 episode_types for 2"),
+        (STATS_TEXT.replace("1.5", "9" * 400), "larger than a float"),
+    ],
+)
+def test_damage_of_statistics_is_named(path: Path, content: str, reason: str) -> None:
+    """Each kind is one clear error; a pipe in the file's place is not waited for."""
+    with pytest.raises(UnreadableFile, match=f"{path.name}: No such file"):
+        read_stats_file(path)
+    path.write_bytes(os.fsencode(content))
+    with pytest.raises(UnreadableFile, match=reason):
+        read_stats_file(path)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(UnreadableFile, match="not a regular file"):
+        read_stats_file(path)

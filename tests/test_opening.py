@@ -156,7 +156,7 @@ def test_a_torn_line_keeps_its_number(
     assert "line left out: line 3 (episode 1)" in caplog.text
 
 
-@pytest.mark.parametrize("number", [None, True, -1, 1.5, "7", 10**4000, {}])
+@pytest.mark.parametrize("number", [True, -1, 1.5, "7", 10**4000, {}])
 def test_an_impossible_next_number_is_an_error(tmp_path: Path, number: object) -> None:
     """A manifest may come from anybody; numbers go into names of files."""
     path = write_saved(tmp_path, "0.7", details={"next_episode_id": number})

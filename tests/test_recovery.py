@@ -204,7 +204,7 @@ def test_hashes_of_frames_that_never_reached_the_encoder_are_left_out(
 ) -> None:
     """The process was killed between the two. Without any frame no video is broken."""
     directory = killed(
-        "import mjrec.formats.video_writer as v\n"
+        "import mjrec.formats.video_file as v\n"
         "write, count = v.FfmpegProcess.write, iter(range(9))\n"
         "def some(process, data):\n"
         "    is_frame = not isinstance(data, bytes)\n"
@@ -436,8 +436,8 @@ def test_a_log_whose_episode_is_in_the_journal_is_complete(tmp_path: Path) -> No
     assert "reason" not in facts
 
 
-def test_lists_that_hold_nothing_do_not_come_back(tmp_path: Path) -> None:
-    """An empty one is removed; an unreadable one is set aside, and its rows stay."""
+def test_an_unreadable_list_stays_and_is_reported(tmp_path: Path) -> None:
+    """With its rows; an empty one is removed."""
     write_log(tmp_path, 0)
     [headless] = tmp_path.glob("*.spans")
     headless.write_bytes(b"")
@@ -447,11 +447,9 @@ def test_lists_that_hold_nothing_do_not_come_back(tmp_path: Path) -> None:
     recovery = mjrec.recover(tmp_path)
     assert f"{empty.name}: nothing in flight, removed" in str(recovery)
     assert not empty.exists()
-    for each in (headless, garbage):
-        assert f"{each.name}.damaged" in str(recovery)
+    assert [file.name for file in recovery.failures] == [headless.name, garbage.name]
     assert headless.with_suffix(".log").stat().st_size
-    assert garbage.with_name(f"{garbage.name}.damaged").stat().st_size == 222
-    assert not mjrec.recover(tmp_path)
+    assert garbage.stat().st_size == 222
     mjrec.clear_monitor_files(tmp_path)
     assert not list(tmp_path.iterdir())
 

@@ -21,8 +21,7 @@ from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.drawing import Drawing, trajectory_drawing
 from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.views import View
-from mjrec.simulation.canvas import KeptCanvas
-from mjrec.simulation.renderer import SceneRenderer
+from mjrec.simulation.renderer import Canvas, SceneRenderer
 
 
 @pytest.fixture(scope="module")
@@ -127,10 +126,10 @@ def test_the_first_picture_comes_after_those_of_episodes_before(
 def test_the_context_is_kept_from_drawing_to_drawing(ride: Ride) -> None:
     """The first has changed its terrain, a texture and a plane; the next sees none."""
     other = View(height=30, quality="draft")
-    with contextlib.closing(KeptCanvas()) as kept:
+    with contextlib.closing(Canvas()) as canvas:
         canvases = set()
         for view in (View(), other, View()):
-            drawing = trajectory_drawing(ride.path, view, kept=kept)
+            drawing = trajectory_drawing(ride.path, view, canvas=canvas)
             drawn = [drawing.draw(number) for number in range(FRAMES)]
             canvases.add(id(drawing._cameras[0].renderer._canvas))
             drawing.close()

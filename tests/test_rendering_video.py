@@ -39,7 +39,7 @@ from mjrec.formats.frame_hashes import frame_hash_path
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.formats.unfinished_video import VideoFile
+from mjrec.formats.video_file import VideoFile
 from mjrec.formats.video_metadata import is_done, metadata_path
 from mjrec.rendering.finish import Finisher, bring_up_to_date, finish
 from mjrec.rendering.jobs import Variant, VideoJob

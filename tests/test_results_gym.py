@@ -104,7 +104,7 @@ def write_ours(directory: Path) -> None:
             ),
             videos=[(f"{video}.mp4", f"{video}.meta.json")],
             env_info=ENV_INFO,
-            details={"format": 1, "schedule": ["cubic", [True, True]]},
+            details={"format": 1, "keys": ["cubic", [True, True]]},
         )
 
 

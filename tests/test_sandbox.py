@@ -38,7 +38,7 @@ def test_what_is_found_is_said_and_the_process_ends(tmp_path: Path) -> None:
     request = {"path": str(sources(tmp_path)), "limit": 1 << 20}
     with Sandbox(_COMPILER, request, place=tmp_path) as sandbox:
         assert list(sandbox.said(60)) == [{"compiled": True}]
-        assert sandbox.what_became_of_it().startswith("ended with status 0")
+        assert sandbox.last_words().startswith("ended with status 0")
     assert (tmp_path / "model.mjb").exists()
     assert children() == before
 
@@ -47,7 +47,7 @@ def test_a_death_is_told_with_its_last_words(tmp_path: Path) -> None:
     """Of a request that it does not understand, it dies."""
     with Sandbox(_COMPILER, {}, place=tmp_path) as sandbox:
         assert list(sandbox.said(60)) == []
-        said = sandbox.what_became_of_it()
+        said = sandbox.last_words()
     assert said.startswith("ended with status 1")
     assert "KeyError: 'path'" in said
 
@@ -59,7 +59,7 @@ def test_a_limit_of_cpu_time_ends_it(tmp_path: Path) -> None:
     limits = {"RLIMIT_CPU": 2, "RLIMIT_CORE": 0}
     with Sandbox(_COMPILER, request, place=tmp_path, limits=limits) as sandbox:
         assert list(sandbox.said(60)) == []
-        assert "was killed by SIG" in sandbox.what_became_of_it()
+        assert "was killed by SIG" in sandbox.last_words()
 
 
 # Takes more than five seconds: until MuJoCo is at it for certain.

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -287,22 +286,6 @@ def test_rule_that_chose_after_the_end_is_asked_again(
     edit_manifest(tmp_path, choose_others)
     subjects = [subject for subject, _ in failures(tmp_path)]
     assert any(subject.startswith("recording") for subject in subjects)
-
-
-@pytest.mark.thorough
-def test_failures_of_older_journals_are_not_checkable(tmp_path: Path) -> None:
-    """They do not say what the environment said of success."""
-    record_pendulum(tmp_path, 4, longest=30, keep="failures:1", mode="evaluation")
-    journal = the(tmp_path, "*.jsonl")
-    journal.write_text(re.sub(r', "success": \w+', "", journal.read_text()))
-    edit_manifest(
-        tmp_path,
-        lambda details: [
-            part.update({"chosen": [3]} if "chosen" in part else {"recorded": [3]})
-            for part in (details["keep"], details["schedule"])
-        ],
-    )
-    assert any("success" in reason for reason in unknown(tmp_path))
 
 
 def test_videos_counted_in_steps_pass(tmp_path: Path) -> None:

@@ -79,15 +79,16 @@ def test_metadata_that_has_no_room_can_be_written_later(tmp_path: Path) -> None:
 
 def test_a_note_says_what_an_unfinished_video_is(tmp_path: Path) -> None:
     """It is there before the video is, and goes when the metadata is there."""
-    timing = {"timestep": Fraction(1, 20), "stride": 1, "frames_per_step": 1}
+    timing = {"fps": "20", "timestep": "1/20", "stride": 1, "frames_per_step": 1}
     path = tmp_path / "v.mp4"
     sink = VideoSink(path, fps=Fraction(20), note=lambda: ({"seed": 3}, timing))
     assert names(tmp_path) == []
     sink.write(moving(0))
-    note = read_note(note_path(path))
-    assert (note.metadata, note.timing) == ({"seed": 3}, timing)
-    assert (note.video.path, note.video.height) == (path, 48)
-    assert note.video.temporary.exists()
+    video = read_note(note_path(path))
+    assert video.path == path
+    assert video.metadata == {"seed": 3}
+    assert (video.facts["height"], video.facts["timestep"]) == (48, "1/20")
+    assert video.temporary.exists()
     sink.finish()
     sink.describe({})
     assert names(tmp_path) == ["v.framehash", "v.meta.json", "v.mp4"]

@@ -11,38 +11,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from . import errors
-from .errors import ArchiveError as ArchiveError
-from .errors import ArchiveTooLarge as ArchiveTooLarge
-from .errors import BlankVideo as BlankVideo
-from .errors import ClosedError as ClosedError
-from .errors import DifferentEnvironment as DifferentEnvironment
-from .errors import DifferentEvaluation as DifferentEvaluation
-from .errors import DirectoryInUse as DirectoryInUse
-from .errors import DirectoryNotWritable as DirectoryNotWritable
-from .errors import EncoderError as EncoderError
-from .errors import EnvironmentNotMade as EnvironmentNotMade
-from .errors import Error as Error
-from .errors import ExistingRecordings as ExistingRecordings
-from .errors import FileNotWritten as FileNotWritten
-from .errors import FrameCountError as FrameCountError
-from .errors import GLError as GLError
-from .errors import IdentityLeft as IdentityLeft
-from .errors import InvalidArgument as InvalidArgument
-from .errors import InvalidFrame as InvalidFrame
-from .errors import MissingDependency as MissingDependency
-from .errors import NoPictures as NoPictures
-from .errors import NotPicklable as NotPicklable
-from .errors import PackError as PackError
-from .errors import PicturesDiffer as PicturesDiffer
-from .errors import PolicyError as PolicyError
-from .errors import RenderError as RenderError
-from .errors import ResetNeeded as ResetNeeded
-from .errors import ResetNotAllowed as ResetNotAllowed
-from .errors import UnfinishedRecordings as UnfinishedRecordings
-from .errors import UnknownName as UnknownName
-from .errors import UnreadableArchive as UnreadableArchive
-from .errors import UnreadableFile as UnreadableFile
-from .errors import UntrustedModel as UntrustedModel
+
+# All its errors are public.
+from .errors import *  # noqa: F403
+from .errors import MissingDependency
 
 if TYPE_CHECKING:
     from .engines.local import LocalEngine as LocalEngine
@@ -57,8 +29,8 @@ if TYPE_CHECKING:
     from .evidence.verification import Verification as Verification
     from .evidence.verifying import verify as verify
     from .formats.archive import write_archive as write_archive
-    from .formats.frames_to_videos import save_video as save_video
     from .formats.video_writer import VideoWriter as VideoWriter
+    from .formats.video_writer import save_video as save_video
     from .gl import use_gl as use_gl
     from .monitors import Monitor as Monitor
     from .monitors.dm_env_monitor import DmEnvMonitor as DmEnvMonitor
@@ -66,8 +38,8 @@ if TYPE_CHECKING:
     from .monitors.vector_monitor import VectorMonitor as VectorMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
+    from .rendering.recovery import Recovery as Recovery
     from .rendering.recovery import recover as recover
-    from .rendering.recovery_report import Recovery as Recovery
     from .rendering.render_frames import render as render
     from .rendering.render_frames import render_states as render_states
     from .rendering.render_videos import RenderedVideos as RenderedVideos
@@ -88,50 +60,40 @@ if TYPE_CHECKING:
     from .simulation.trajectories import Trajectory as Trajectory
     from .simulation.trajectories import load_trajectory as load_trajectory
 
-_LAZY = {
-    "Check": "evidence.verification",
-    "Comparison": "evaluation.comparing",
-    "DmEnvMonitor": "monitors.dm_env_monitor",
-    "Episode": "results",
-    "Evaluation": "evaluation.evaluation",
-    "GymnasiumMonitor": "monitors.gymnasium_monitor",
-    "LocalEngine": "engines.local",
-    "Monitor": "monitors",
-    "RayEngine": "engines.ray",
-    "Recovery": "rendering.recovery_report",
-    "RenderedVideos": "rendering.render_videos",
-    "SlurmEngine": "engines.slurm",
-    "StatsRecorder": "recorder.stats_recorder",
-    "Terminated": "signals",
-    "Trajectory": "simulation.trajectories",
-    "VectorMonitor": "monitors.vector_monitor",
-    "Verification": "evidence.verification",
-    "VideoRecorder": "recorder.video_recorder",
-    "VideoWriter": "formats.video_writer",
-    "capped_cubic_video_schedule": "schedules",
-    "clear_monitor_files": "results",
-    "compare": "evaluation.comparing",
-    "detect_monitor_files": "results",
-    "detect_training_manifests": "results",
-    "disable_videos": "schedules",
-    "evaluate": "evaluation.evaluating",
-    "exit_on_signals": "signals",
-    "film_strip": "reporting.film_strips",
-    "iter_episodes": "results",
-    "load_results": "results",
-    "load_trajectory": "simulation.trajectories",
-    "merge_stats_files": "results",
-    "pack": "evidence.packing",
-    "recover": "rendering.recovery",
-    "render": "rendering.render_frames",
-    "render_states": "rendering.render_frames",
-    "render_videos": "rendering.render_videos",
-    "save_video": "formats.frames_to_videos",
-    "use_gl": "gl",
-    "verify": "evidence.verifying",
-    "write_archive": "formats.archive",
-    "write_report": "reporting.report_folder",
+# Where each name is, which is imported when it is first used.
+_NAMES = {
+    "engines.local": "LocalEngine",
+    "engines.ray": "RayEngine",
+    "engines.slurm": "SlurmEngine",
+    "evaluation.comparing": "Comparison compare",
+    "evaluation.evaluating": "evaluate",
+    "evaluation.evaluation": "Evaluation",
+    "evidence.packing": "pack",
+    "evidence.verification": "Check Verification",
+    "evidence.verifying": "verify",
+    "formats.archive": "write_archive",
+    "formats.video_writer": "VideoWriter save_video",
+    "gl": "use_gl",
+    "monitors": "Monitor",
+    "monitors.dm_env_monitor": "DmEnvMonitor",
+    "monitors.gymnasium_monitor": "GymnasiumMonitor",
+    "monitors.vector_monitor": "VectorMonitor",
+    "recorder.stats_recorder": "StatsRecorder",
+    "recorder.video_recorder": "VideoRecorder",
+    "rendering.recovery": "Recovery recover",
+    "rendering.render_frames": "render render_states",
+    "rendering.render_videos": "RenderedVideos render_videos",
+    "reporting.film_strips": "film_strip",
+    "reporting.report_folder": "write_report",
+    "results": (
+        "Episode clear_monitor_files detect_monitor_files detect_training_manifests "
+        "iter_episodes load_results merge_stats_files"
+    ),
+    "schedules": "capped_cubic_video_schedule disable_videos",
+    "signals": "Terminated exit_on_signals",
+    "simulation.trajectories": "Trajectory load_trajectory",
 }
+_LAZY = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 # What can be had without any extra, so that `from mjrec import *` works there too;
 # `DmEnvMonitor` needs dm_env.

@@ -28,12 +28,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from .errors import KINDS, Error
+from .errors import KINDS, Error, rebuilt
 
 logger = logging.getLogger(__name__)
 
 _STACKS = signal.SIGUSR1
-_MOST_OF_STACKS = 20_000
+_MOST_WORDS_READ = 20_000
 _LOOKS_FOR_STACKS = 20
 _SECONDS_BETWEEN_LOOKS = 0.1
 _MOST_WORDS = 1 << 20
@@ -101,7 +101,18 @@ class Child:
 
     def stacks(self) -> str:
         """Return what the threads of one that hangs are at, for the log."""
-        return stacks_said_in(self._words, self.pid)
+        before = after = self._size_of_words()
+        with contextlib.suppress(ProcessLookupError):
+            # One that has not begun yet dies of it. It may only have been stopped.
+            os.kill(self.pid, _STACKS)
+            os.kill(self.pid, signal.SIGCONT)
+        for _ in range(_LOOKS_FOR_STACKS):
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
+            size = self._size_of_words()
+            if size == after > before:
+                break
+            after = size
+        return self._words_from(before) or "(it does not say)"
 
     def last_words(self) -> str:
         """Return what became of it, and the end of what it printed."""
@@ -109,22 +120,21 @@ class Child:
             self._process.wait(_SECONDS_TO_END)
         status = self._process.returncode
         how = "lives, and is silent" if status is None else how_it_ended(status)
-        begin = max(0, os.fstat(self._words.fileno()).st_size - _END_OF_WORDS)
-        # Not by seeking: the position is the child's too.
-        said = os.pread(self._words.fileno(), _END_OF_WORDS, begin)
-        words = said.decode(errors="replace").strip() or "(nothing)"
-        return f"it {how}. The end of what it said: {words}"
+        said = self._words_from(max(0, self._size_of_words() - _MOST_WORDS_READ))
+        # What Python says of a crash ends with the names of dozens of modules.
+        words = said.partition("\nExtension modules:")[0].strip()
+        return (
+            f"{how}. The end of what it said: {words[-_END_OF_WORDS:] or '(nothing)'}"
+        )
 
     def forget_words(self) -> None:
         """Drop what it has printed, if that is much."""
-        if os.fstat(self._words.fileno()).st_size > _MOST_WORDS:
+        if self._size_of_words() > _MOST_WORDS:
             os.ftruncate(self._words.fileno(), 0)
 
     def kill(self) -> None:
         """Kill it and its children, which may hang as well; `end` does the rest."""
         if self._process.poll() is None:
-            # Stopped, it starts no other and waits for none: their numbers stay theirs.
-            self._process.send_signal(signal.SIGSTOP)
             for pid in [*_pids_of_children(self.pid), self.pid]:
                 with contextlib.suppress(ProcessLookupError, PermissionError):
                     os.kill(pid, signal.SIGKILL)
@@ -133,6 +143,14 @@ class Child:
         """End it, by force where it does not end by itself. Idempotent."""
         _children.discard(self)
         self._end()
+
+    def _size_of_words(self) -> int:
+        return os.fstat(self._words.fileno()).st_size
+
+    def _words_from(self, begin: int) -> str:
+        # Not by seeking: the position is the child's too.
+        said = os.pread(self._words.fileno(), _MOST_WORDS_READ, begin)
+        return said.decode(errors="replace").strip()
 
 
 class LineWriter:
@@ -248,37 +266,11 @@ def take_standard_output() -> int:
 def say_stacks_when_asked() -> None:
     """Let this process write what its threads are at to the standard error.
 
-    At `stacks_said_in`, whatever it hangs in, and when it dies of a signal such as
+    At `Child.stacks`, whatever it hangs in, and when it dies of a signal such as
     SIGSEGV.
     """
     faulthandler.enable()
     faulthandler.register(_STACKS)
-
-
-def stacks_said_in(words: IO[bytes], pid: int) -> str:
-    """Return where a child hangs, for the log.
-
-    Args:
-        words: the file that its standard error is. It is read beside its position,
-            which is the child's too.
-        pid: the child's number.
-    """
-    descriptor = words.fileno()
-    before = os.fstat(descriptor).st_size
-    with contextlib.suppress(ProcessLookupError):
-        # One that has not begun yet dies of it.
-        os.kill(pid, _STACKS)
-        # Should it only have been stopped.
-        os.kill(pid, signal.SIGCONT)
-    after = before
-    for _ in range(_LOOKS_FOR_STACKS):
-        time.sleep(_SECONDS_BETWEEN_LOOKS)
-        size = os.fstat(descriptor).st_size
-        if size == after > before:
-            break
-        after = size
-    said = os.pread(descriptor, _MOST_OF_STACKS, before)
-    return said.decode(errors="replace").strip() or "(it does not say)"
 
 
 def how_it_ended(status: int) -> str:
@@ -333,12 +325,11 @@ def unpacked(plain: Mapping[str, Any]) -> Error:
     It has the class, the message and, of the attributes, numbers, texts, lists of them
     and paths.
     """
-    kind = KINDS.get(plain["type"], Error)
-    error = kind.__new__(kind)
-    error.args = (plain["message"],)
-    for key, value in plain.get("facts", {}).items():
-        setattr(error, key, Path(value["path"]) if isinstance(value, dict) else value)
-    return error
+    facts = {
+        key: Path(value["path"]) if isinstance(value, dict) else value
+        for key, value in plain.get("facts", {}).items()
+    }
+    return rebuilt(KINDS.get(plain["type"], Error), plain["message"], facts)
 
 
 def _is_plain(value: object) -> bool:

@@ -54,14 +54,18 @@ class Error(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         # The subclasses take facts and make the message of them; pickle (an error
         # that comes home from a worker process) would call them with the message.
-        return _rebuilt, (type(self), self.args, self.__dict__)
+        return rebuilt, (type(self), str(self), vars(self))
 
 
-def _rebuilt(kind: type[Error], args: tuple[Any, ...], facts: dict[str, Any]) -> Error:
+def rebuilt(kind: type[Error], message: str, facts: Mapping[str, Any]) -> Error:
+    """Return an error that was carried from another process."""
     error = kind.__new__(kind)
-    error.args = args
-    error.__dict__.update(facts)
+    error.args = (message,)
+    vars(error).update(facts)
     return error
+
+
+_MOST_NAMES = 20
 
 
 def _first_of(names: Sequence[str], count: int, *, between: str = ", ") -> str:
@@ -84,26 +88,22 @@ class UnknownName(InvalidArgument):
         available: the names there are.
     """
 
-    _SHOWN = 20
-
     def __init__(
         self, kind: str, name: object, available: Iterable[str], *, hint: str = ""
     ) -> None:
         self.kind = kind
         self.name = name
         self.available = list(available)
-        super().__init__(" ".join(filter(None, [self._what_is_there(), hint])))
-
-    def _what_is_there(self) -> str:
-        near = difflib.get_close_matches(str(self.name), self.available, self._SHOWN)
-        shown = self.available if len(self.available) <= self._SHOWN else near
-        text = f"There is no {self.kind} {self.name!r}."
+        shown, label = self.available, "There are"
+        if len(shown) > _MOST_NAMES:
+            shown = difflib.get_close_matches(str(name), self.available, _MOST_NAMES)
+            label = "Names like it"
+        listed = f"{label}: {', '.join(shown)}."
         if not self.available:
-            return f"{text} There are none."
-        if not shown:
-            return f"{text} There are {len(self.available)}, none with a like name."
-        label = "There are" if shown is self.available else "Names like it"
-        return f"{text} {label}: {', '.join(shown)}."
+            listed = "There are none."
+        elif not shown:
+            listed = f"There are {len(self.available)}, none with a like name."
+        super().__init__(f"There is no {kind} {name!r}. {listed} {hint}".rstrip())
 
 
 class InvalidFrame(InvalidArgument):
@@ -237,12 +237,10 @@ class RenderError(Error):
     def __init__(self, directory: Path, failures: Mapping[str, str]) -> None:
         self.directory = directory
         self.failures = dict(failures)
-        by_reason: dict[str, list[str]] = {}
+        names = dict.fromkeys(self.failures.values(), "")
         for name, why in self.failures.items():
-            by_reason.setdefault(why, []).append(name)
-        reasons = "; ".join(
-            f"{', '.join(names)}: {why}" for why, names in by_reason.items()
-        )
+            names[why] += f", {name}" if names[why] else name
+        reasons = "; ".join(f"{listed}: {why}" for why, listed in names.items())
         super().__init__(
             f"{len(self.failures)} of the videos in {directory} could not be rendered: "
             f"{reasons} Their states are kept; to try again: mjrec render {directory}"
@@ -391,32 +389,28 @@ class UnreadableFile(Error):
         reason: what is wrong with it.
     """
 
+    _message = "Cannot read {path}: {reason}."
+    _advice = (
+        " The other files of its directory are as good as before; to read them, move "
+        "this one away."
+    )
+
     def __init__(self, path: Path, reason: object) -> None:
         self.path = path
         self.reason = str(reason)
         # Nothing can be moved away that is not there.
-        advice = (
-            " The other files of its directory are as good as before; to read them, "
-            "move this one away."
-            if os.path.lexists(path)
-            else ""
-        )
-        super().__init__(f"Cannot read {path}: {reason}.{advice}")
+        advice = self._advice if os.path.lexists(path) else ""
+        super().__init__(self._message.format(path=path, reason=reason) + advice)
 
 
 class UnreadableArchive(UnreadableFile):
     """What was given to be verified is no packed run, or is damaged."""
 
-    def __init__(self, path: Path, reason: object) -> None:
-        super().__init__(path, reason)
-        # It stands alone: there are no other files of its directory.
-        advice = (
-            " It may not have come whole, or was packed anew by another program: ask "
-            "for the file that `mjrec pack` made again."
-            if path.is_file() and os.access(path, os.R_OK)
-            else ""
-        )
-        self.args = (f"Cannot verify {path}: {self.reason}.{advice}",)
+    _message = "Cannot verify {path}: {reason}."
+    _advice = (
+        " It may not have come whole, or was packed anew by another program: ask for "
+        "the file that `mjrec pack` made again."
+    )
 
 
 class UntrustedModel(UnreadableFile):
@@ -427,10 +421,8 @@ class UntrustedModel(UnreadableFile):
         reason: why nothing else can be used instead, and how to say that it is trusted.
     """
 
-    def __init__(self, path: Path, reason: object) -> None:
-        super().__init__(path, reason)
-        # It is no worse there than elsewhere: the base's advice is of no use.
-        self.args = (f"The model {path} is not loaded: {self.reason}.",)
+    _message = "The model {path} is not loaded: {reason}."
+    _advice = ""
 
 
 class MissingDependency(Error, ImportError):
@@ -448,3 +440,5 @@ KINDS: Mapping[str, type[Error]] = {
     for name, kind in list(globals().items())
     if isinstance(kind, type) and issubclass(kind, Error)
 }
+# For the package, whose public names all of these are.
+__all__ = [*KINDS]

@@ -16,22 +16,17 @@ import os
 import resource
 import select
 import signal
-import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, Self
 
 from . import json_text
 from .child_python import (
-    environment_of_child,
-    how_it_ended,
-    python_command,
+    Child,
     said_in,
     say_stacks_when_asked,
-    stacks_said_in,
     take_standard_output,
 )
 from .errors import Error
@@ -59,13 +54,10 @@ _INSIDE_VARIABLE = "MJREC_SANDBOX"
 
 _NOTHING: Mapping[str, str] = {}
 _STANDARD_INPUT = 0
-_SECONDS_TO_DIE = 5.0
 _LONGEST_LINE = 1 << 24
-_MOST_OF_STDERR = 20_000
-_END_OF_STDERR = 500
 
 
-class Sandbox:
+class Sandbox(Child):
     """The process, seen from its parent. Leaving `with` ends it and its group.
 
     Args:
@@ -91,85 +83,40 @@ class Sandbox:
     ) -> None:
         environ = {k: v for k, v in os.environ.items() if k != _TRUST_VARIABLE}
         environ |= {**more_environ, "TMPDIR": str(place), _INSIDE_VARIABLE: "1"}
-        self._stderr = (place / "words.txt").open("w+b")
         try:
-            self._process = subprocess.Popen(
-                python_command(module),
-                env=environment_of_child(environ),
-                # MuJoCo's own log appears where it runs.
-                cwd=place,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._stderr,
-                start_new_session=True,
-            )
+            # MuJoCo's own log appears where it runs.
+            super().__init__(module, environ=environ, cwd=str(place))
         except OSError as error:
-            self._stderr.close()
             raise Error(
                 f"No process with limits could be started: {sys.executable!r}: {error}."
             ) from error
-        try:
-            assert self._process.stdin is not None
-            line = json_text.dumps({"request": request, "limits": limits}).encode()
-            with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.write(line + b"\n")
-                self._process.stdin.flush()
-        except BaseException:
-            self.close()
-            raise
+        line = json_text.dumps({"request": request, "limits": limits}).encode()
+        with contextlib.suppress(BrokenPipeError):
+            self.orders.write(line + b"\n")
 
     def said(self, patience_s: float) -> Iterator[Mapping[str, Any] | None]:
         """Yield what it says until it ends; None once it was silent for so long."""
-        assert self._process.stdout is not None
-        descriptor = self._process.stdout.fileno()
         rest = b""
         while len(rest) <= _LONGEST_LINE:
-            deadline = time.monotonic() + patience_s
-            ready, _, _ = select.select([descriptor], [], [], patience_s)
-            if not ready and time.monotonic() >= deadline:
-                stacks = stacks_said_in(self._stderr, self._process.pid)
-                logger.warning("A process with limits hangs: %s", stacks)
+            ready, _, _ = select.select([self.answers], [], [], patience_s)
+            if not ready:
+                logger.warning("A process with limits hangs: %s", self.stacks())
                 yield None
                 return
-            data = os.read(descriptor, 1 << 16)
+            data = os.read(self.answers.fileno(), 1 << 16)
             *lines, rest = (rest + data).split(b"\n")
             yield from map(said_in, lines)
             if not data:
                 return
 
-    def what_became_of_it(self) -> str:
-        """Return how it ended, and its last words, after it has said all."""
-        try:
-            how = how_it_ended(self._process.wait(_SECONDS_TO_DIE))
-        except subprocess.TimeoutExpired:
-            return "lives and has closed its pipe"
-        return f"{how}. The end of what it said: {self._last_words()}"
-
-    def close(self) -> None:
-        """End it and what it has started; idempotent."""
-        # Those with a session of their own (who draw, ffmpeg) end with the pipes to it.
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_SECONDS_TO_DIE)
-        for pipe in (self._process.stdin, self._process.stdout, self._stderr):
-            assert pipe is not None
-            with contextlib.suppress(OSError):
-                pipe.close()
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def _last_words(self) -> str:
-        descriptor = self._stderr.fileno()
-        begin = max(0, os.fstat(descriptor).st_size - _MOST_OF_STDERR)
-        said = os.pread(descriptor, _MOST_OF_STDERR, begin).decode(errors="replace")
-        # What Python says of a crash ends with the names of dozens of modules.
-        words = " ".join(said.partition("\nExtension modules:")[0].split())
-        return words[-_END_OF_STDERR:] or "(nothing)"
+        # Those with a session of their own (who draw, ffmpeg) end with the pipes to it.
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)
+        self.end()
 
 
 def is_inside() -> bool:

@@ -4,15 +4,12 @@
 from __future__ import annotations
 
 import collections
-import logging
 import os
 import threading
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from .errors import ClosedError
-
-logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -25,15 +22,15 @@ class WorkerThread(Generic[T]):
     The thread is a daemon, so that it never keeps the interpreter from ending; only
     `close` promises that every item was consumed.
 
-    Where no thread can be started (at interpreter exit, from Python 3.12 on, or beyond
-    the system's limit) `put` consumes each item itself, on the caller's thread.
-
     Args:
         consume: called with each item, always on the same thread.
         capacity: how many items may wait.
         name: what the thread is for. Its name is this behind `mjrec-`.
         finish: called on the thread after the last item; not after an error or
             `abort`.
+
+    Raises:
+        RuntimeError: no thread can be started (beyond the system's limit).
     """
 
     def __init__(
@@ -62,14 +59,10 @@ class WorkerThread(Generic[T]):
         # Waited for before the thread is: Python 3.11 and 3.12 take a thread for ended
         # when Ctrl-C interrupts `Thread.join`.
         self._has_ended = threading.Event()
-        self._thread: threading.Thread | None = threading.Thread(
+        self._thread = threading.Thread(
             target=self._work, name=f"mjrec-{name}", daemon=True
         )
-        try:
-            self._thread.start()
-        except RuntimeError as error:
-            logger.info("%s works without a thread: %s.", name, error)
-            self._thread = None
+        self._thread.start()
 
     @property
     def failed(self) -> bool:
@@ -96,9 +89,6 @@ class WorkerThread(Generic[T]):
                 raise ClosedError(f"{self._name} is closed.")
             self._waiting.append(item)
             self._changed.notify_all()
-        if self._thread is None:
-            self._work()
-            self._raise_error()
 
     def close(self) -> None:
         """Wait until every item is consumed and the thread has ended.
@@ -120,8 +110,6 @@ class WorkerThread(Generic[T]):
         with self._lock:
             self._closing = True
             self._changed.notify_all()
-        if self._thread is None:
-            self._work()
 
     def abort(self) -> None:
         """Drop what waits, wait for the item in hand, end the thread; raise nothing.
@@ -137,10 +125,8 @@ class WorkerThread(Generic[T]):
 
     def _wait_for_end(self) -> None:
         # Neither waits for itself; and a forked child has no such thread.
-        if (
-            self._thread not in (None, threading.current_thread())
-            and os.getpid() == self._process_id
-        ):
+        is_own = self._thread is threading.current_thread()
+        if not is_own and os.getpid() == self._process_id:
             self._has_ended.wait()
             self._thread.join()
 
@@ -153,14 +139,11 @@ class WorkerThread(Generic[T]):
             raise self._error
 
     def _work(self) -> None:
-        """Consume what is put, or, where there is no thread, what waits now."""
         try:
-            while self._wait_for_item():
-                self._consume(self._take())
-            finish = self._finish
-            if self._closing and finish and not (self._aborted or self.failed):
-                self._finish = None
-                finish()
+            while (item := self._next()) is not None:
+                self._consume(item[0])
+            if self._finish is not None and not self._aborted:
+                self._finish()
         # Whatever it is, it belongs to the caller; nobody looks at this thread.
         except BaseException as error:
             with self._lock:
@@ -170,14 +153,12 @@ class WorkerThread(Generic[T]):
         finally:
             self._has_ended.set()
 
-    def _wait_for_item(self) -> bool:
+    def _next(self) -> tuple[T] | None:
+        """Wait for the next item; None once there will be none."""
         with self._lock:
-            if self._thread is not None:
-                self._changed.wait_for(lambda: self._closing or bool(self._waiting))
-            return bool(self._waiting)
-
-    def _take(self) -> T:
-        with self._lock:
+            self._changed.wait_for(lambda: self._closing or bool(self._waiting))
+            if not self._waiting:
+                return None
             item = self._waiting.popleft()
             self._changed.notify_all()
-            return item
+            return (item,)

@@ -11,8 +11,8 @@ import rich.console
 import tyro
 
 from .. import json_text
+from ..rendering.recovery import RecoveredFile, Recovery
 from ..rendering.recovery import recover as recover_directory
-from ..rendering.recovery_report import RecoveredFile, Recovery
 from .help_text import flowing_help
 
 _FAILED = 1

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..frames import check_size
 from ..simulation.cameras import camera_label, raw_model, resolve_camera
-from ..simulation.gl_info import current_gl_facts
+from ..simulation.gl_context import current_gl_facts
 from .no_pictures import NoPictureSource
 
 _NOT_BY_PHYSICS = (

@@ -98,7 +98,7 @@ class EnvironmentPictures:
         viewer = getattr(_renderer(self._env), "viewer", None)
         if simulated is not None and viewer is not None:
             from ..simulation.cameras import camera_label
-            from ..simulation.gl_info import current_gl_facts
+            from ..simulation.gl_context import current_gl_facts
 
             facts["camera"] = camera_label(simulated.model, viewer.cam)
             with _own_context(self._env):
@@ -149,9 +149,9 @@ def _own_context(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
 @contextlib.contextmanager
 def _current(viewer: Any) -> Iterator[None]:
     """Make a viewer's context current, if there is a viewer; then what was before."""
-    from ..simulation.gl_info import current_context_kept
+    from ..simulation.gl_context import context_kept
 
-    with current_context_kept():
+    with context_kept():
         if viewer is not None:
             viewer.make_context_current()
         yield

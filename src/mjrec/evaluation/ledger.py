@@ -330,7 +330,7 @@ def _of_journal(
         length=entry.length,
         terminated=entry.terminated,
         truncated=entry.truncated,
-        success=entry.success if isinstance(entry.success, bool) else None,
+        success=entry.success,
         monitor=str(infix),
         episode_id=entry.episode_id,
         start_time=entry.start_time,

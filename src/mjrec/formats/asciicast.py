@@ -8,20 +8,24 @@ object with `version`, `width`, `height`, `duration`, `command`, `title`, `env` 
 
 from __future__ import annotations
 
+import contextlib
 import io
+import itertools
 import json
 import re
-import shutil
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import IO
 
-from .. import atomic_files
-from ..errors import ClosedError, DirectoryNotWritable, InvalidFrame
+from ..atomic_files import temporary_path
+from ..errors import FileNotWritten, InvalidFrame
 from ..json_text import loads
 from ..rates import rate_from_timestep
 from .json_fields import unreadable
 
+# Frames come first in the file, a line each, and then what all of them decide.
+_BEGIN = '{"stdout": [\n'
 _CLEAR_AND_HOME = "\x1b[2J\x1b[1;1H"
 # Control sequences (colours, cursor) take no room on the screen. ECMA-48, 5.4.
 _CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
@@ -45,7 +49,8 @@ def text_of_frame(frame: object) -> str:
 class AsciicastWriter:
     """Writes text frames, each shown for the same time, into one file.
 
-    Frames go to the disk as they come; the file gets its name in `close`.
+    Frames go to the disk as they come, into the hidden file that gets the recording's
+    name in `close`.
 
     Args:
         path: the finished file.
@@ -55,64 +60,39 @@ class AsciicastWriter:
     def __init__(self, path: Path, *, rate: Fraction) -> None:
         self.path = path
         self.frame_count = 0
-        self._delay = float(1 / rate)
         self._rate = rate
-        self._width = 0
-        self._height = 0
-        self._body_path = atomic_files.temporary_path(path)
-        self._body: IO[str] | None = None
-        self._closed = False
+        self._width = self._height = 0
+        self._part = temporary_path(path)
+        self._file: IO[str] | None = None
 
     def write(self, text: str) -> None:
         """Append a frame.
 
         Raises:
-            ClosedError: the writer is closed.
-            DirectoryNotWritable: no file can be made beside `path`.
+            FileNotWritten: the disk is full, or the directory is gone.
         """
-        if self._closed:
-            raise ClosedError(f"The text recording {self.path} is closed.")
-        if self._body is None:
-            self._body = self._opened()
         lines = text.replace("\r\n", "\n").split("\n")
         self._width = max(self._width, *(_columns(line) for line in lines))
         self._height = max(self._height, len(lines))
-        event = [self._delay, _CLEAR_AND_HOME + "\r\n".join(lines)]
-        separator = ",\n" if self.frame_count else ""
-        self._body.write(separator + json.dumps(event))
-        # A killed process leaves what is with the operating system.
-        self._body.flush()
+        event = [float(1 / self._rate), _CLEAR_AND_HOME + "\r\n".join(lines)]
+        with self._naming_the_file():
+            if self._file is None:
+                self._file = self._part.open("w", encoding="utf-8")
+            begin = ",\n" if self.frame_count else _BEGIN
+            self._file.write(begin + json.dumps(event))
+            # A killed process leaves what is with the operating system.
+            self._file.flush()
         self.frame_count += 1
 
     def close(self) -> None:
         """Finish the file; without a frame there is none. Idempotent.
 
-        What raised or was interrupted can be tried again.
+        Raises:
+            FileNotWritten: as `write`.
         """
-        if self._closed:
+        if self._file is None:
             return
-        if self._body is not None:
-            self._body.close()
-            with atomic_files.replacing(self.path) as temporary:
-                self._assemble(temporary)
-            self._body_path.unlink(missing_ok=True)
-        self._closed = True
-
-    def abort(self) -> None:
-        """End without a file."""
-        self._closed = True
-        if self._body is not None:
-            self._body.close()
-            self._body_path.unlink(missing_ok=True)
-
-    def _opened(self) -> IO[str]:
-        try:
-            return self._body_path.open("w", encoding="utf-8")
-        except OSError as error:
-            raise DirectoryNotWritable(self.path.parent, error.strerror) from error
-
-    def _assemble(self, target: Path) -> None:
-        header = {
+        facts = {
             "version": 1,
             "width": self._width + 2,
             "height": self._height,
@@ -121,13 +101,26 @@ class AsciicastWriter:
             "title": "mjrec recording",
             "env": {},
         }
-        with (
-            target.open("w", encoding="utf-8") as whole,
-            self._body_path.open(encoding="utf-8") as body,
-        ):
-            whole.write(json.dumps(header)[:-1] + ', "stdout": [')
-            shutil.copyfileobj(body, whole)
-            whole.write("]}\n")
+        with self._naming_the_file():
+            if not self._file.closed:
+                self._file.write("\n], " + json.dumps(facts)[1:] + "\n")
+                self._file.close()
+            if self._part.exists():
+                self._part.replace(self.path)
+
+    def abort(self) -> None:
+        """End without a file."""
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._part.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _naming_the_file(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise FileNotWritten(self.path, error.strerror) from error
 
 
 def unfinished_recording(path: Path) -> tuple[Fraction, list[str]]:
@@ -146,19 +139,16 @@ def unfinished_recording(path: Path) -> tuple[Fraction, list[str]]:
         frames: list[str] = []
         delay = 0.0
         with path.open(encoding="utf-8", errors="replace") as body:
-            for line in body:
+            for line in itertools.islice(body, 1, None):
                 try:
                     delay, text = loads(line.rstrip().removesuffix(","))
-                    frames.append(_frame_of(text))
+                    text = text.removeprefix(_CLEAR_AND_HOME)
+                    frames.append(text.replace("\r\n", "\n"))
                 except (AttributeError, TypeError, RecursionError, ValueError):
                     break
         if not frames or not isinstance(delay, float | int) or not 0 < delay < 1e6:
             raise ValueError("it holds no text frame")
         return rate_from_timestep(delay), frames
-
-
-def _frame_of(printed: str) -> str:
-    return printed.removeprefix(_CLEAR_AND_HOME).replace("\r\n", "\n")
 
 
 def _columns(line: str) -> int:

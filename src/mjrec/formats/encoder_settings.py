@@ -24,7 +24,6 @@ from .ffmpeg import (
 )
 
 _DEFAULT_CODEC = "libx264"
-_DEFAULT_CRF = 18.0
 _WORST_CRF = 51.0
 # x264's output depends on the number of its threads, so that the number is a constant
 # and not the machine's.
@@ -47,7 +46,7 @@ _LOSSLESS_CODECS = frozenset(
 )
 # Where ffmpeg's own default is poor, or not what the codec is taken for.
 _QUALITY = {
-    _DEFAULT_CODEC: ("-crf", f"{_DEFAULT_CRF:g}"),
+    _DEFAULT_CODEC: ("-crf", "18"),
     "libx264rgb": ("-crf", "0"),
     "mpeg4": ("-q:v", "2"),
 }
@@ -121,9 +120,20 @@ def encoder_settings(
         InvalidArgument: one of them cannot be.
         UnknownName: ffmpeg has no such encoder.
     """
-    codec = _check_codec(codec)
-    crf = _check_crf(crf)
+    codec = _DEFAULT_CODEC if codec is None else codec
+    if not isinstance(codec, str):
+        raise InvalidArgument(
+            f"codec must be ffmpeg's name of an encoder, got {codec!r}."
+        )
+    if isinstance(encoder_arguments, str) or not all(
+        isinstance(each, str) for each in encoder_arguments
+    ):
+        raise InvalidArgument(
+            "encoder_arguments must be a sequence of strings, got "
+            f"{encoder_arguments!r}."
+        )
     help_text = _encoder_help(ffmpeg_executable(), codec)
+    quality = _quality_arguments(codec, crf, help_text)
     pixel_format = _pixel_format(codec, help_text)
     yuv = pixel_format == "yuv420p"
     encoding = (
@@ -131,12 +141,12 @@ def encoder_settings(
         *(("-vf", _TO_BT709) if yuv else ("-pix_fmt", pixel_format)),
         *every_frame_arguments(),
         *("-c:v", codec),
-        *_codec_arguments(codec, crf),
-        *_quality_arguments(codec, crf, help_text),
+        *_x264_arguments(codec, crf),
+        *quality,
         *("-threads", str(_ENCODER_THREADS)),
         *("-fflags", "+bitexact", "-flags:v", "+bitexact"),
         *(_BT709_TAGS if yuv else ()),
-        *_check_arguments(encoder_arguments),
+        *encoder_arguments,
     )
     return EncoderSettings(codec, pixel_format, muxer, encoding)
 
@@ -159,42 +169,11 @@ def try_encoding(executable: str, settings: EncoderSettings, fps: Fraction) -> N
     )
 
 
-def _check_crf(crf: float | None) -> float | None:
-    if crf is None:
-        return None
-    is_number = isinstance(crf, numbers.Real) and not isinstance(crf, bool)
-    if not is_number or not 0 <= crf <= _WORST_CRF:
-        raise InvalidArgument(
-            f"crf must be a number from 0 (largest) to {_WORST_CRF:g} (worst), got "
-            f"{crf!r}."
-        )
-    return float(crf)
-
-
-def _check_codec(codec: str | None) -> str:
-    if codec is None:
-        return _DEFAULT_CODEC
-    if not isinstance(codec, str):
-        raise InvalidArgument(
-            f"codec must be ffmpeg's name of an encoder, got {codec!r}."
-        )
-    return codec
-
-
-def _check_arguments(arguments: Sequence[str]) -> tuple[str, ...]:
-    if isinstance(arguments, str) or not all(isinstance(a, str) for a in arguments):
-        raise InvalidArgument(
-            f"encoder_arguments must be a sequence of strings, got {arguments!r}."
-        )
-    return tuple(arguments)
-
-
-def _codec_arguments(codec: str, crf: float | None) -> tuple[str, ...]:
+def _x264_arguments(codec: str, crf: float | None) -> tuple[str, ...]:
     if codec not in ("libx264", "libx264rgb"):
         return ()
     # x264 calls lossless what truncates to 0, and no profile High has it.
-    lossless = crf is not None and int(crf) == 0
-    high = codec == "libx264" and not lossless
+    high = codec == "libx264" and (crf is None or crf >= 1)
     return (
         *("-preset", "veryfast"),
         *(("-profile:v", "high") if high else ()),
@@ -207,6 +186,12 @@ def _quality_arguments(
 ) -> tuple[str, ...]:
     if crf is None:
         return _QUALITY.get(codec, ())
+    is_number = isinstance(crf, numbers.Real) and not isinstance(crf, bool)
+    if not is_number or not 0 <= crf <= _WORST_CRF:
+        raise InvalidArgument(
+            f"crf must be a number from 0 (largest) to {_WORST_CRF:g} (worst), got "
+            f"{crf!r}."
+        )
     if " -crf " not in help_text:
         raise InvalidArgument(
             f"The encoder {codec} knows no crf, got crf={crf:g}: leave it out, or use "

@@ -54,10 +54,10 @@ def ffmpeg_executable() -> str:
     try:
         name: str = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
-        raise _no_program("ffmpeg") from error
+        raise _unusable("ffmpeg", "there is none") from error
     path = shutil.which(name)
     if path is None:
-        raise _unusable(name, "there is no program of that name")
+        raise _unusable(f"ffmpeg ({name})", "there is no program of that name")
     return path
 
 
@@ -156,38 +156,37 @@ class FfmpegProcess:
         self.command = [ffmpeg_executable(), *arguments]
         self._what = what
         self._patience = Patience()
-        with contextlib.ExitStack() as on_failure:
-            try:
-                # A file, not a pipe: nobody has to empty it while the process runs.
-                self._stderr: IO[bytes] = on_failure.enter_context(
-                    tempfile.TemporaryFile()
-                )
+        try:
+            with contextlib.ExitStack() as on_failure:
+                # A file, not a pipe: it need not be emptied while the process runs.
+                stderr = on_failure.enter_context(tempfile.TemporaryFile())
                 self._process = subprocess.Popen(
                     self.command,
                     stdin=subprocess.PIPE if reads else subprocess.DEVNULL,
                     stdout=subprocess.PIPE if writes else subprocess.DEVNULL,
-                    stderr=self._stderr,
+                    stderr=stderr,
                     bufsize=0,
                     start_new_session=True,
                     # A file that would grow beyond a limit is an error that ffmpeg
-                    # tells, not the end of it: Python ignores SIGXFSZ, and so does
+                    # reports, not the end of it: Python ignores SIGXFSZ, and so does
                     # ffmpeg then.
                     restore_signals=False,
                     pass_fds=() if keeps is None else (keeps,),
                 )
-            except OSError as error:
-                raise _not_started(self.command[0], error) from error
-            on_failure.callback(self.release)
-            on_failure.callback(self.kill)
-            for pipe in self._pipes():
-                # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More
-                # is a favour that the kernel may refuse.
-                with contextlib.suppress(OSError):
-                    fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
-            if self._process.stdin is not None:
-                os.set_blocking(self._process.stdin.fileno(), False)
-            _running.add(self)
-            on_failure.pop_all()
+                on_failure.pop_all()
+        except OSError as error:
+            raise _not_started(self.command[0], error) from error
+        self._stderr: IO[bytes] = stderr
+        pipes = (self._process.stdin, self._process.stdout)
+        self._pipes = [pipe for pipe in pipes if pipe is not None]
+        for pipe in self._pipes:
+            # Linux's default is 64 KiB, eleven switches for a 480x480 frame. More is
+            # a favour that the kernel may refuse.
+            with contextlib.suppress(OSError):
+                fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_SIZE)
+        if self._process.stdin is not None:
+            os.set_blocking(self._process.stdin.fileno(), False)
+        _running.add(self)
 
     @property
     def pid(self) -> int:
@@ -214,8 +213,7 @@ class FfmpegProcess:
         except (OSError, ValueError) as error:
             # ValueError: the pipe was closed before. One that has closed its input ends
             # by itself; a wrapper script may not.
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(_SECONDS_TO_DIE)
+            self._has_ended(_SECONDS_TO_DIE)
             self.kill()
             raise self._error() from error
 
@@ -255,10 +253,8 @@ class FfmpegProcess:
             # It leads a group of its own. Not more than the process may have ended.
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.pid, signal.SIGKILL)
-            self._process.kill()
         # One whose disk does not answer cannot die.
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_SECONDS_TO_DIE)
+        self._has_ended(_SECONDS_TO_DIE)
 
     def release(self) -> None:
         """Close the pipes of a process that has ended, once no thread uses them."""
@@ -272,7 +268,7 @@ class FfmpegProcess:
         While any process holds the writing end, ffmpeg does not see the end of its
         input, and the parent's `wait` would last as long as the child lives.
         """
-        for pipe in self._pipes():
+        for pipe in self._pipes:
             pipe.close()
 
     def __enter__(self) -> Self:
@@ -286,9 +282,6 @@ class FfmpegProcess:
     ) -> None:
         self.kill()
         self.release()
-
-    def _pipes(self) -> list[IO[bytes]]:
-        return [pipe for pipe in (self._process.stdin, self._process.stdout) if pipe]
 
     def _wait_for(self, pipe: IO[bytes], event: int) -> None:
         """Wait until a pipe is ready, or closed at the other end."""
@@ -319,19 +312,6 @@ class FfmpegProcess:
                 raise self._error()
 
     def _has_ended(self, seconds: float) -> bool:
-        """Wait for the end, so long at most, and return whether it has come."""
-        try:
-            # `Popen.wait` would look again and again, with pauses that add up.
-            descriptor = os.pidfd_open(self.pid)
-        except OSError:
-            # It was waited for before, or the system knows no such thing.
-            pass
-        else:
-            try:
-                select.select([descriptor], [], [], seconds)
-            finally:
-                os.close(descriptor)
-            seconds = 0
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(seconds)
         return self._process.returncode is not None
@@ -358,7 +338,7 @@ class FfmpegProcess:
             what,
             command=self.command,
             returncode=self._process.returncode,
-            stderr=_text(self._stderr.read()),
+            stderr=self._stderr.read().decode(errors="replace"),
         )
 
 
@@ -382,7 +362,7 @@ def _identity() -> tuple[str, int, int]:
 
 @functools.lru_cache
 def _version(executable: str, size: int, modified: int) -> str:
-    return _text(run_ffmpeg(["-version"]))
+    return run_ffmpeg(["-version"]).decode(errors="replace")
 
 
 @functools.lru_cache
@@ -395,27 +375,20 @@ def _not_started(executable: str, error: OSError) -> Error:
     # memory, processes or open files.
     if error.filename != executable:
         return Error(f"ffmpeg ({executable}) could not be started: {error}.")
-    return _unusable(executable, error.strerror)
+    reason = str(error.strerror)
+    return _unusable(f"an ffmpeg other than {executable} ({reason})", reason)
 
 
-def _unusable(executable: str, reason: object) -> Error:
+def _unusable(package: str, reason: str) -> Error:
     named = os.environ.get(_ENVIRONMENT_VARIABLE)
     if named:
         return InvalidArgument(
             f"{_ENVIRONMENT_VARIABLE} is {named!r}, which cannot be started: {reason}. "
             "Unset it, or set it to the path of an ffmpeg."
         )
-    return _no_program(f"an ffmpeg other than {executable} ({reason})")
-
-
-def _no_program(what: str) -> MissingDependency:
     return MissingDependency(
-        what,
+        package,
         purpose="Writing a video",
         install="pip install --force-reinstall imageio-ffmpeg, or set "
         f"{_ENVIRONMENT_VARIABLE} to the path of an ffmpeg",
     )
-
-
-def _text(data: bytes) -> str:
-    return data.decode("utf-8", errors="replace")

@@ -23,21 +23,14 @@ green, blue.
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import hashlib
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
 from ..atomic_files import replacing
-from ..errors import DirectoryNotWritable, FileNotWritten
 from ..frames import Frame
-
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def frame_hash_header(*, height: int, width: int, fps: Fraction) -> str:
@@ -59,66 +52,6 @@ def frame_hash_line(number: int, frame: Frame) -> str:
     """Return the line of the frame with this number, counted from 0."""
     digest = hashlib.sha256(np.ascontiguousarray(frame).data).hexdigest()
     return f"0, {number:10d}, {number:10d}, {1:8d}, {frame.nbytes:8d}, {digest}\n"
-
-
-class FrameHashFile:
-    """A `.framehash` file in the making, under a temporary name.
-
-    A line is with the operating system before the next one: what of it a killed process
-    leaves is true of the frames that its encoder had been given.
-
-    Args:
-        path: the temporary name.
-        final: the name that it will have, for errors.
-        size: `(height, width)` of the frames.
-        fps: frames per second.
-
-    Every method raises `FileNotWritten` when the disk is full, or a quota or a limit on
-    files' sizes is reached, and `DirectoryNotWritable` when the file cannot be written
-    for another reason.
-    """
-
-    def __init__(
-        self, path: Path, *, final: Path, size: tuple[int, int], fps: Fraction
-    ) -> None:
-        self._path = path
-        self._final = final
-        self._frame_count = 0
-        height, width = size
-        with self._naming_the_file():
-            self._file: TextIO = path.open("w", encoding="ascii", buffering=1)
-            try:
-                self._file.write(frame_hash_header(height=height, width=width, fps=fps))
-            except BaseException:
-                self.abort()
-                raise
-
-    def add(self, frame: Frame) -> None:
-        """Write the next frame's line."""
-        with self._naming_the_file():
-            self._file.write(frame_hash_line(self._frame_count, frame))
-        self._frame_count += 1
-
-    def close(self) -> None:
-        """Close the file, which keeps its temporary name. May be called again."""
-        with self._naming_the_file():
-            self._file.close()
-
-    def abort(self) -> None:
-        """Leave nothing."""
-        # What cannot be written any more need not be.
-        with contextlib.suppress(OSError):
-            self._file.close()
-        self._path.unlink(missing_ok=True)
-
-    @contextlib.contextmanager
-    def _naming_the_file(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            if error.errno in _NO_ROOM:
-                raise FileNotWritten(self._final, error.strerror) from error
-            raise DirectoryNotWritable(self._final.parent, error) from error
 
 
 def cut_frame_hashes(path: Path, count: int) -> None:

@@ -24,13 +24,14 @@ from __future__ import annotations
 
 import errno
 import io
+import itertools
 import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from ..errors import ClosedError
 from ..json_text import dumps
@@ -39,7 +40,6 @@ from .json_fields import (
     field,
     integer,
     json_object,
-    mapping,
     number,
     optional,
     text,
@@ -53,7 +53,7 @@ logger = logging.getLogger(__name__)
 # far beyond what any run writes.
 _LONGEST_LINE = 1 << 24
 _MOST_DAMAGED_LINES = 1000
-_MOST_DAMAGED_BYTES = 1 << 26
+_BLOCK = 4096
 MOST_EPISODES = 10**15
 
 # In their order: what the run is; its machine, packages and code; an episode that is
@@ -65,15 +65,12 @@ EVENTS = (
     *("fault", "keep", "closed", "recovered"),
 )
 
-UNKNOWN = "unknown"
-
 # The reason of an episode that ended with its process.
 KILLED = "killed"
 
 # The seed and the options are for people to read; more of them is cut off.
 _LONGEST_REPR = 1000
 
-_BEGINNING = b'{"episode_id": '
 _BEGIN = re.compile(rb'\{"episode_id": (\d{1,15}),')
 
 
@@ -92,8 +89,7 @@ class JournalEntry:
         options: as given to `reset`.
         terminated: the task ended the episode.
         truncated: a limit from outside the task ended it.
-        success: what the environment said of it; None where it said nothing, `UNKNOWN`
-            in journals of before it was written down.
+        success: what the environment said of it; None where it said nothing.
         chosen: the schedule chose it.
         recording: `"live"` or `"deferred"`; None where it has no video of its own.
     """
@@ -108,7 +104,7 @@ class JournalEntry:
     options: Any
     terminated: bool
     truncated: bool
-    success: bool | str | None = UNKNOWN
+    success: bool | None = None
     chosen: bool = False
     recording: str | None = None
 
@@ -144,13 +140,14 @@ class JournalWriter:
                 was before. Or it was removed.
         """
         # Not `asdict`, which would copy the options deeply; they may not allow it.
-        values = {**vars(entry)}
-        if entry.success == UNKNOWN:
-            del values["success"]
-        for key in ("chosen", "recording"):
-            if not values[key]:
-                del values[key]
-        self._append(_line(values))
+        left_out = [key for key in ("chosen", "recording") if not vars(entry)[key]]
+        values = {k: v for k, v in vars(entry).items() if k not in left_out}
+        line = dumps(values)
+        if len(line) >= _LONGEST_LINE:
+            for key in ("seed", "options"):
+                values[key] = {"repr": repr(values[key])[:_LONGEST_REPR]}
+            line = dumps(values)
+        self._append(f"{line}\n".encode())
 
     def note(self, kind: str, facts: Any) -> None:
         """Write down another event.
@@ -204,15 +201,6 @@ class JournalWriter:
         self._size += len(line)
 
 
-def _line(values: dict[str, Any]) -> bytes:
-    line = f"{dumps(values)}\n".encode()
-    if len(line) < _LONGEST_LINE:
-        return line
-    for key in ("seed", "options"):
-        values[key] = {"repr": repr(values[key])[:_LONGEST_REPR]}
-    return f"{dumps(values)}\n".encode()
-
-
 class JournalReader:
     """Reads the entries of a journal, one at a time, in the order written.
 
@@ -225,7 +213,6 @@ class JournalReader:
         on_event: called with the kind and the facts of every other event.
 
     Attributes:
-        count: how many entries there were so far.
         last_episode_id: the highest number so far, also of damaged lines that still
             show theirs; -1 before.
         dropped: how many lines were left out so far.
@@ -236,12 +223,11 @@ class JournalReader:
     ) -> None:
         self._path = path
         self._on_event = on_event
-        self._numbers = _Numbers()
-        self._damaged_lines = 0
-        self._damaged_bytes = 0
+        # The numbers so far, a bit each: they are dense.
+        self._seen: dict[int, int] = {}
+        self._damaged = 0
         self._first_reason = ""
         self._gave_up = False
-        self.count = 0
         self.last_episode_id = -1
         self.dropped = 0
 
@@ -251,8 +237,15 @@ class JournalReader:
         Raises:
             UnreadableFile: there is no such file, or it cannot be read.
         """
-        with _opened(self._path) as file:
-            for index, line in enumerate(_lines(self._path, file), start=1):
+        with unreadable(self._path):
+            file = open_regular(self._path)
+        with file:
+            for index in itertools.count(1):
+                # Disks fail while they are read, too.
+                with unreadable(self._path):
+                    line = file.readline(_LONGEST_LINE)
+                if not line:
+                    return
                 entry = self._entry(index, line)
                 if entry is not None:
                     yield entry
@@ -288,18 +281,19 @@ class JournalReader:
         except ValueError as error:
             torn = not line.endswith(b"\n") and not self._gave_up
             # Its writer was killed in the middle of it, or is at it now.
-            self._note(index, line, "it was cut off" if torn else str(error))
-            self._count_damage(line)
+            self._leave_out(index, line, "it was cut off" if torn else str(error))
+            self._damaged += 1
+            self._gave_up |= self._damaged >= _MOST_DAMAGED_LINES
             return None
-        if not self._numbers.add(entry.episode_id):
-            self._note(index, line, "its episode was there before")
+        block, bit = divmod(entry.episode_id, _BLOCK)
+        if self._seen.get(block, 0) >> bit & 1:
+            self._leave_out(index, line, "its episode was there before")
             return None
-        self.count += 1
+        self._seen[block] = self._seen.get(block, 0) | 1 << bit
         self.last_episode_id = max(self.last_episode_id, entry.episode_id)
         return entry
 
-    def _note(self, index: int, line: bytes, reason: str) -> None:
-        """Note a line that is left out."""
+    def _leave_out(self, index: int, line: bytes, reason: str) -> None:
         begin = _BEGIN.match(line)
         if begin is not None:
             self.last_episode_id = max(self.last_episode_id, int(begin[1]))
@@ -307,30 +301,6 @@ class JournalReader:
             episode = f" (episode {int(begin[1])})" if begin else ""
             self._first_reason = f"line {index}{episode}: {reason}"
         self.dropped += 1
-
-    def _count_damage(self, line: bytes) -> None:
-        self._damaged_lines += 1
-        self._damaged_bytes += len(line)
-        self._gave_up = self._gave_up or (
-            self._damaged_lines >= _MOST_DAMAGED_LINES
-            or self._damaged_bytes >= _MOST_DAMAGED_BYTES
-        )
-
-
-class _Numbers:
-    """A set of episode numbers that takes little memory where they are dense."""
-
-    _BLOCK = 4096
-
-    def __init__(self) -> None:
-        self._blocks: dict[int, int] = {}
-
-    def add(self, number: int) -> bool:
-        """Add `number`; False where it was there before."""
-        block, bit = divmod(number, self._BLOCK)
-        old = self._blocks.get(block, 0)
-        self._blocks[block] = old | 1 << bit
-        return not old >> bit & 1
 
 
 def read_journal(path: Path) -> Iterator[JournalEntry]:
@@ -346,52 +316,6 @@ def read_journal(path: Path) -> Iterator[JournalEntry]:
         yield from reader
     finally:
         reader.report()
-
-
-def run_facts(path: Path) -> Mapping[str, Any] | None:
-    """Return what the first line of a journal says of its run; None where nothing.
-
-    Raises:
-        UnreadableFile: there is no such file, or it cannot be read.
-    """
-    with _opened(path) as file:
-        line = next(_lines(path, file), b"")
-    try:
-        return field(json_object(line), "run", optional(mapping), default=None)
-    except ValueError:
-        return None
-
-
-def count_lines(path: Path) -> int:
-    """Return how many lines of a journal begin as an episode's: at least all of those.
-
-    It takes a fraction of the time of reading them.
-
-    Raises:
-        UnreadableFile: there is no such file, or it cannot be read.
-    """
-    with _opened(path) as file:
-        count = 0
-        for line in _lines(path, file):
-            count += line.startswith(_BEGINNING)
-            if len(line) >= _LONGEST_LINE:
-                break
-        return count
-
-
-def _opened(path: Path) -> BinaryIO:
-    with unreadable(path):
-        return open_regular(path)
-
-
-def _lines(path: Path, file: BinaryIO) -> Iterator[bytes]:
-    while True:
-        # Disks fail while they are read, too.
-        with unreadable(path):
-            line = file.readline(_LONGEST_LINE)
-        if not line:
-            return
-        yield line
 
 
 def entry_of(values: Mapping[str, Any]) -> JournalEntry:
@@ -411,16 +335,10 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
         options=values.get("options"),
         terminated=field(values, "terminated", boolean),
         truncated=field(values, "truncated", boolean),
-        success=_success(values),
+        success=field(values, "success", optional(boolean), default=None),
         chosen=field(values, "chosen", boolean, default=False),
         recording=field(values, "recording", optional(text), default=None),
     )
-
-
-def _success(values: Mapping[str, Any]) -> bool | str | None:
-    if "success" not in values:
-        return UNKNOWN
-    return field(values, "success", optional(boolean))
 
 
 def _count(value: Any) -> int:

@@ -26,6 +26,9 @@ from .json_fields import (
     unreadable,
 )
 
+# What stands for gym's version in what this package writes.
+GYM_VERSION = "mjrec-1"
+
 
 @dataclass(frozen=True)
 class Manifest:
@@ -53,28 +56,17 @@ def read_manifest(path: Path) -> Manifest:
     """
     with unreadable(path):
         values = read_object(path)
-        mjrec = field(values, "mjrec", optional(_details), default=None)
         return Manifest(
             stats=field(values, "stats", base_name),
             videos=field(values, "videos", list_of(_pair)),
             env_info=field(values, "env_info", mapping),
-            mjrec=mjrec,
+            mjrec=field(values, "mjrec", optional(_details), default=None),
         )
 
 
 def write_manifest(path: Path, manifest: Manifest) -> None:
-    """Write the manifest, whole or not at all.
-
-    Raises:
-        ValueError: a name in it is not a base name.
-    """
-    content = {
-        "stats": base_name(manifest.stats),
-        "videos": [[base_name(v), base_name(m)] for v, m in manifest.videos],
-        "env_info": dict(manifest.env_info),
-    }
-    if manifest.mjrec is not None:
-        content["mjrec"] = dict(manifest.mjrec)
+    """Write the manifest, whole or not at all."""
+    content = {key: value for key, value in vars(manifest).items() if value is not None}
     write_text(path, dumps(content))
 
 
@@ -90,14 +82,13 @@ def _pair(value: Any) -> tuple[str, str]:
 def _details(value: Any) -> Mapping[str, Any]:
     """Return what gym did not write, with what others rely on as it should be."""
     details = mapping(value)
-    field(details, "next_episode_id", optional(_count), default=None)
+    next_id = field(details, "next_episode_id", optional(integer), default=None)
+    if next_id is not None and next_id < 0:
+        raise ValueError(f"its 'next_episode_id' is wrong: {next_id} is negative")
+    schedule = field(details, "schedule", optional(mapping), default=None)
+    field(schedule or {}, "recorded", optional(list_of(integer)), default=None)
+    field(details, "keep", optional(mapping), default=None)
+    field(details, "faults", optional(list_of(mapping)), default=None)
     field(details, "pending", optional(list_of(mapping)), default=None)
     field(details, "broken", optional(list_of(base_name)), default=None)
     return details
-
-
-def _count(value: Any) -> int:
-    number = integer(value)
-    if number < 0 or not isinstance(value, int):
-        raise ValueError(f"{number} is no number of episodes")
-    return number

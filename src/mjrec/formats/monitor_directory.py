@@ -18,7 +18,6 @@
     ├── openaigym.states.<infix>.000000.log             ... their rows
     ├── openaigym.states.<infix>.000000.tail            ... the last of these
     ├── openaigym.states.<infix>.000000.looks           ... changes of the model
-    ├── openaigym.states.<infix>.000000.spans.damaged   that nobody can read
     ├── openaigym.trajectory.<infix>.episode000027.h5   a recorded episode, finished
     ├── openaigym.model.<16 hex digits>.mjb.gz          its compiled model ...
     ├── openaigym.model.<16 hex digits>.zip             ... and what that was made from
@@ -87,7 +86,7 @@ _VISIBLE = {
     "video": re.compile(rf"{_VIDEO}\.[^/\n\0]*(mp4|avi|json|framehash)"),
     "clip": re.compile(rf"{_CLIP}\.failed\.json"),
     "trajectory": re.compile(rf"{_TRAJECTORY}\.h5"),
-    "states": re.compile(rf"{_STATES}\.(spans|log|tail|looks|spans\.damaged)"),
+    "states": re.compile(rf"{_STATES}\.(spans|log|tail|looks)"),
     "model": re.compile(r"openaigym\.model\.[0-9a-f]{16}\.(zip|mjb\.gz)"),
     "results": re.compile(rf"openaigym\.results\.{_INFIX_PART}\.monitor\.csv"),
 }

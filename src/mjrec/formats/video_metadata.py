@@ -17,7 +17,7 @@ from typing import Any
 from .. import json_text
 from ..atomic_files import write_text
 from .json_fields import read_object
-from .unfinished_video import VideoFile
+from .video_file import VideoFile
 
 # Of a file's name, as `video_names` makes them.
 _PART = re.compile(r"[A-Za-z0-9_%-]{1,200}", re.ASCII)

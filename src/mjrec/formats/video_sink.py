@@ -16,11 +16,13 @@ from ..annotation import Caption, annotated, pillow_version
 from ..blank_frames import BlankFrames
 from ..frames import Frame
 from .asciicast import AsciicastWriter
-from .ffmpeg import ffmpeg_executable
 from .frame_hashes import frame_hash_path
-from .unfinished_video import VideoFile, VideoNote, note_path, write_note
+from .unfinished_video import UnfinishedVideo, note_path, write_note
+from .video_file import VideoFile
 from .video_metadata import file_facts, metadata_path, write_metadata
 from .video_writer import VideoWriter
+
+_Note = Callable[[], tuple[Mapping[str, Any], Mapping[str, Any]]]
 
 
 class VideoSink:
@@ -30,9 +32,9 @@ class VideoSink:
         path: the video: `.mp4` for images, `.json` for text.
         fps: frames per second.
         frame_hashes: whether to write the `.framehash` of images.
-        note: returns the metadata so far and the timing for the note beside the
-            unfinished mp4, by which it is finished when this process is killed. None
-            where there is to be none, because it can be rendered again.
+        note: returns the metadata so far, and what is known of the timing, for the
+            note beside the unfinished mp4, by which it is finished when this process is
+            killed. None where there is to be none, because it can be rendered again.
 
     Raises:
         Error: as `VideoWriter`.
@@ -48,7 +50,7 @@ class VideoSink:
         *,
         fps: Fraction,
         frame_hashes: bool = True,
-        note: Callable[[], tuple[Mapping[str, Any], Mapping[str, Any]]] | None = None,
+        note: _Note | None = None,
     ) -> None:
         self.path = path
         self.blank = BlankFrames()
@@ -82,7 +84,7 @@ class VideoSink:
         assert not isinstance(frame, str)
         if self._note is not None and not self._writer.frame_count:
             # The note is there before the file that it is about.
-            self._write_note(self._writer, *frame.shape[:2])
+            self._write_note(self._note, *frame.shape[:2])
         self._writer.write(frame if caption is None else annotated(frame, caption))
         self._is_annotated |= caption is not None
         # Without the caption: whatever is written on it, it may show nothing.
@@ -140,15 +142,17 @@ class VideoSink:
             facts["annotated"] = {"pillow": pillow_version()}
         return facts
 
-    def _write_note(self, writer: VideoWriter, height: int, width: int) -> None:
-        assert self._note is not None
-        metadata, timing = self._note()
+    def _write_note(self, note: _Note, height: int, width: int) -> None:
+        assert isinstance(self._writer, VideoWriter)
+        file = self._writer.file_of(height, width)
+        metadata, timing = note()
         write_note(
-            VideoNote(
-                video=writer.unfinished(height, width),
+            UnfinishedVideo(
+                path=self.path,
+                temporary=self._writer.temporary,
+                hashes=self._writer.temporary_hashes,
                 metadata=metadata,
-                timing=timing,
-                ffmpeg_size=Path(ffmpeg_executable()).stat().st_size,
+                facts={**timing, **file_facts(file)},
             )
         )
 

@@ -8,17 +8,17 @@ is complete and its frames have been counted again.
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
+import inspect
+import itertools
 import numbers
 import os
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -26,29 +26,20 @@ from ..atomic_files import temporary_path
 from ..errors import (
     ClosedError,
     DirectoryNotWritable,
-    FrameCountError,
     InvalidArgument,
+    UnknownName,
 )
-from ..frames import Frame, check_frame, check_size, pad_to_even
+from ..frames import Frame, check_frame, check_size
 from ..rates import to_rate
-from ..worker_thread import WorkerThread
+from ..schedules import capped_cubic_video_schedule
 from .encoder_settings import MUXERS, encoder_settings, try_encoding
-from .ffmpeg import (
-    FfmpegProcess,
-    as_file,
-    ffmpeg_executable,
-    ffmpeg_sha256,
-    ffmpeg_version,
-)
-from .frame_hashes import FrameHashFile, frame_hash_path
-from .locks import Lock
-from .unfinished_video import UnfinishedVideo, VideoFile
+from .ffmpeg import ffmpeg_executable, ffmpeg_version
+from .frame_hashes import frame_hash_path
+from .video_file import Encoding, VideoFile
 
 # ffmpeg takes no larger number, above or below, for a rate as a fraction: given one, it
 # silently takes the nearest fraction that fits.
 _MAX_RATE_TERM = 10**6
-_QUEUED_BYTES = 32 << 20
-_MAX_QUEUED_FRAMES = 64
 
 
 class VideoWriter:
@@ -88,6 +79,8 @@ class VideoWriter:
         frame_count: how many frames were written so far.
         closed: whether the file is finished or given up.
         result: what was written, once closed; None without frames.
+        temporary: the name of the file until it is complete.
+        temporary_hashes: likewise of the `.framehash`, if there is to be one.
 
     Raises:
         InvalidArgument: an argument cannot be.
@@ -111,7 +104,7 @@ class VideoWriter:
         self.result: VideoFile | None = None
         self.frame_count = 0
         # From the first frame on.
-        self._encoding: _Encoding | None = None
+        self._encoding: Encoding | None = None
         self.path = _check_path(path)
         self.fps = _check_fps(fps)
         self._settings = encoder_settings(
@@ -120,9 +113,9 @@ class VideoWriter:
             muxer=MUXERS[self.path.suffix.lower()],
             encoder_arguments=encoder_arguments,
         )
-        self._temporary = temporary_path(self.path)
+        self.temporary = temporary_path(self.path)
         hashes = temporary_path(frame_hash_path(self.path))
-        self._temporary_hashes = hashes if frame_hashes else None
+        self.temporary_hashes = hashes if frame_hashes else None
         try_encoding(ffmpeg_executable(), self._settings, self.fps)
         self._process_id = os.getpid()
         self.closed = False
@@ -150,11 +143,12 @@ class VideoWriter:
                 "which this one was forked: write it there, or another one here."
             )
         checked = check_frame(frame, size=None if encoding is None else encoding.size)
-        check_size(*checked.shape[:2])
+        height, width = check_size(*checked.shape[:2])
         try:
             if encoding is None:
-                encoding = _Encoding(self.unfinished(*checked.shape[:2]))
-                self._encoding = encoding
+                encoding = self._encoding = Encoding(
+                    self.file_of(height, width), self.temporary, self.temporary_hashes
+                )
             # A plain copy in rows from top to bottom, whatever the view was.
             encoding.thread.put(np.array(checked, order="C", copy=True, subok=False))
         except Exception:
@@ -162,17 +156,16 @@ class VideoWriter:
             raise
         self.frame_count += 1
 
-    def unfinished(self, height: int, width: int) -> UnfinishedVideo:
-        """Return what the file is until it is finished.
+    def file_of(self, height: int, width: int) -> VideoFile:
+        """Return what is known of the file before it is finished.
 
         Args:
             height: of a frame, in pixels.
-            width: of a frame, in pixels.
+            width: likewise.
         """
-        return UnfinishedVideo(
+        has_hashes = self.temporary_hashes is not None
+        return VideoFile(
             path=self.path,
-            temporary=self._temporary,
-            hashes=self._temporary_hashes,
             height=height,
             width=width,
             fps=self.fps,
@@ -190,6 +183,7 @@ class VideoWriter:
                     output=self.path.name,
                 ),
             },
+            frame_hash_path=frame_hash_path(self.path) if has_hashes else None,
         )
 
     def close(self) -> None:
@@ -233,13 +227,12 @@ class VideoWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if error is None:
-            self.close()
-            return
-        # The reason for leaving matters more than what happens to the video.
         try:
             self.close()
         except Exception as failure:
+            if error is None:
+                raise
+            # The reason for leaving matters more than what happens to the video.
             error.add_note(f"The video {self.path} could not be finished: {failure}")
 
     def __del__(self) -> None:
@@ -250,7 +243,7 @@ class VideoWriter:
         self._encoding.leave()
         warnings.warn(
             f"The VideoWriter of {self.path} was never closed; its frames are in "
-            f"{self._temporary}. Use it in a with statement.",
+            f"{self.temporary}. Use it in a with statement.",
             ResourceWarning,
             source=self,
             stacklevel=2,
@@ -268,112 +261,96 @@ class VideoWriter:
         return os.getpid() != self._process_id
 
 
-class _Encoding:
-    """A video in the making: ffmpeg, the thread that feeds it, temporary files."""
+def save_video(
+    frames: Iterable[Frame],
+    video_folder: str | os.PathLike[str],
+    episode_trigger: Callable[[int], Any] | None = None,
+    step_trigger: Callable[[int], Any] | None = None,
+    video_length: int | None = None,
+    name_prefix: str = "rl-video",
+    episode_index: int = 0,
+    step_starting_index: int = 0,
+    **kwargs: Any,
+) -> None:
+    """Write videos of one episode's frames, as Gymnasium's function of that name does.
 
-    def __init__(self, video: UnfinishedVideo) -> None:
-        self.size = (video.height, video.width)
-        self.temporary = video.temporary
-        self.is_ending = False
-        self._video = video
-        self._encoded = 0
-        self._input_ended = False
-        self._hashes: FrameHashFile | None = None
-        with contextlib.ExitStack() as on_failure:
-            try:
-                # First of all: what is not locked may be swept up. With the mode that a
-                # new file gets from every program.
-                self._lock = Lock(video.temporary, "", mode=0o666)
-            except OSError as error:
-                raise DirectoryNotWritable(video.path.parent, error) from error
-            on_failure.callback(self._lock.release)
-            if video.hashes is not None:
-                self._hashes = FrameHashFile(
-                    video.hashes,
-                    final=frame_hash_path(video.path),
-                    size=self.size,
-                    fps=video.fps,
-                )
-                on_failure.callback(self._hashes.abort)
-            self._process = FfmpegProcess(
-                [*video.encoder["arguments"][:-1], as_file(video.temporary)],
-                what=f"The video {video.path} could not be encoded.",
-                reads=True,
-                # It shares the lock, which it holds to its own end when we die.
-                keeps=self._lock.fileno(),
-            )
-            on_failure.callback(self._end_process)
-            frame_bytes = 3 * video.height * video.width
-            self.thread = WorkerThread[Frame](
-                self._encode,
-                capacity=min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes)),
-                name=f"encoder of {video.path.name}",
-                finish=self._end_input,
-            )
-            on_failure.pop_all()
+    `<prefix>-episode-<episode_index>.mp4` holds the episode, if `episode_trigger` says
+    yes; `<prefix>-step-<n>.mp4` begins with the frame of step n, for each n for which
+    `step_trigger` says yes. The first frame is the reset's and belongs to no step; the
+    second is that of step `step_starting_index`. Every frame is in the file.
 
-    def finish(self) -> VideoFile | None:
-        """Complete the file, check it and give it its name.
+    `frames` may be any iterable. Where only the episode trigger is used it is streamed,
+    read no further than `video_length`, and not at all when no video is due; with a
+    step trigger, whose videos may overlap, all frames are held in memory. An existing
+    video is replaced when the new one is complete. No frames, no file. If `frames`
+    raises, the frames before that are kept.
 
-        Each part can be done again, where Ctrl-C came in between. None on the encoder's
-        own thread, which cannot wait for itself.
-        """
-        self.is_ending = True
-        self.thread.close()
-        if not self._input_ended:
-            return None
-        self._process.wait()
-        file = self._video.check()
-        if file.frame_count != self._encoded:
-            raise FrameCountError(
-                f"{file.path} was to hold {self._encoded} frames, and decoding gives "
-                f"{file.frame_count}. It was not kept.",
-                command=self._process.command,
-                returncode=0,
-                stderr="",
-            )
-        encoder = {**file.encoder, "sha256": ffmpeg_sha256()}
-        file = dataclasses.replace(file, encoder=encoder)
-        if self._hashes is not None:
-            self._hashes.close()
-        self._video.rename(file)
-        self._process.release()
-        self._lock.release()
-        return file
+    Args:
+        frames: `(height, width, 3) uint8` arrays.
+        video_folder: the directory; made if need be.
+        episode_trigger: from an episode's number to whether it gets a video. If both
+            triggers are None: the cubes 0, 1, 8, 27 ... 729 and every 1000th.
+        step_trigger: from a step's number to whether a video begins there.
+        video_length: the most frames of a video; all that follow if None.
+        name_prefix: begins the files' names.
+        episode_index: the episode's number.
+        step_starting_index: the number of the episode's first step.
+        **kwargs: `fps`, which is required, and the other options of `VideoWriter`.
 
-    def abort(self) -> None:
-        """End everything and remove the temporary files."""
-        # First the process: the thread may be waiting for it to read.
-        self._process.kill()
-        self.thread.abort()
-        self._end_process()
-        if self._hashes is not None:
-            self._hashes.abort()
+    Raises:
+        InvalidArgument: `fps` is missing, an option is unknown, or a value cannot be.
+        DirectoryNotWritable: `video_folder` cannot be made or written to.
+        InvalidFrame: what is no picture.
+        EncoderError: as `VideoWriter.write` and `close`.
+    """
+    _check_options(kwargs, video_length)
+    if episode_trigger is None and step_trigger is None:
+        episode_trigger = capped_cubic_video_schedule
+    folder = Path(video_folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DirectoryNotWritable(folder, error) from error
+    if step_trigger is not None:
+        # Copies: a generator may fill the same array again and again.
+        is_held = isinstance(frames, Sequence | np.ndarray)
+        frames = held = list(frames if is_held else map(np.array, frames))
+    if episode_trigger is not None and episode_trigger(episode_index):
+        path = folder / f"{name_prefix}-episode-{episode_index}.mp4"
+        _write_video(itertools.islice(frames, video_length), path, kwargs)
+    if step_trigger is not None:
+        # The first frame is the reset's.
+        for step, first in enumerate(range(1, len(held)), start=step_starting_index):
+            if step_trigger(step):
+                last = None if video_length is None else first + video_length
+                path = folder / f"{name_prefix}-step-{step}.mp4"
+                _write_video(held[first:last], path, kwargs)
 
-    def leave(self) -> None:
-        """Let the encoder go on to the end of what it was given, by itself."""
-        self.thread.leave()
-        self._lock.let_go()
 
-    def _encode(self, frame: Frame) -> None:
-        if not self._encoded:
-            # It is remembered, and the next frames are still being drawn.
-            ffmpeg_sha256()
-        if self._hashes is not None:
-            self._hashes.add(frame)
-        self._process.write(pad_to_even(frame))
-        self._encoded += 1
+def _write_video(frames: Iterable[Frame], path: Path, options: dict[str, Any]) -> None:
+    with VideoWriter(path, **options) as video:
+        for frame in frames:
+            video.write(frame)
 
-    def _end_input(self) -> None:
-        self._process.end_input()
-        self._input_ended = True
 
-    def _end_process(self) -> None:
-        self._process.kill()
-        self._process.release()
-        # ffmpeg may have put another file in the place of the one that is locked.
-        self.temporary.unlink(missing_ok=True)
-        self._lock.release()
+def _check_options(options: dict[str, Any], video_length: object) -> None:
+    parameters = inspect.signature(VideoWriter).parameters.values()
+    known = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
+    for name in options:
+        if name not in known:
+            raise UnknownName("option of save_video", name, known)
+    if "fps" not in options:
+        raise InvalidArgument(
+            "save_video needs fps, the frames per second of the video: "
+            "fps=env.metadata['render_fps'], for example."
+        )
+    to_rate(options["fps"])
+    is_number = isinstance(video_length, int) and not isinstance(video_length, bool)
+    if video_length is not None and (not is_number or video_length <= 0):  # type: ignore[operator]  # is_number
+        raise InvalidArgument(
+            "video_length must be a positive number of frames, or None for all, got "
+            f"{video_length!r}."
+        )
 
 
 def _check_path(path: str | os.PathLike[str]) -> Path:
@@ -389,16 +366,14 @@ def _check_path(path: str | os.PathLike[str]) -> Path:
         )
     if checked.is_dir():
         raise InvalidArgument(f"{checked} is a directory; path must be a file's name.")
-    parent = checked.absolute().parent
-    if not parent.is_dir():
-        raise DirectoryNotWritable(parent, "it does not exist")
+    # Absolute, so that a change of the working directory moves nothing.
+    checked = checked.absolute()
     try:
         # The permissions alone do not tell: root may all, and a disk may be read-only.
-        tempfile.TemporaryFile(dir=parent).close()
+        tempfile.TemporaryFile(dir=checked.parent).close()
     except OSError as error:
-        raise DirectoryNotWritable(parent, error) from error
-    # Absolute, so that a change of the working directory moves nothing.
-    return checked.absolute()
+        raise DirectoryNotWritable(checked.parent, error.strerror) from error
+    return checked
 
 
 def _check_fps(fps: float | Fraction) -> Fraction:

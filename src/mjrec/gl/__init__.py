@@ -14,6 +14,6 @@ from .devices import render_on_given_gpu as render_on_given_gpu
 from .devices import visible_gpus as visible_gpus
 from .diagnosis import Diagnosis as Diagnosis
 from .diagnosis import diagnose as diagnose
-from .probing import EglDevice as EglDevice
+from .egl import EglDevice as EglDevice
 from .probing import Probe as Probe
 from .probing import probe as probe

@@ -23,7 +23,8 @@ from pathlib import Path
 from ..errors import GLError, InvalidArgument
 from .backends import backend_in_environment, rendering_is_off
 from .choice import conflict_with, set_backend
-from .probing import EglDevice, Probe, probe
+from .egl import EglDevice
+from .probing import Probe, probe
 
 _LOG = logging.getLogger(__name__)
 

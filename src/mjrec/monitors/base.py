@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex, TypeVar
+from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex
 
 from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
@@ -30,51 +31,99 @@ from ..recorder.subject import Subject
 from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..rendering.background import Background
 from ..simulation.find_simulation import simulation_time
-from .cameras import CameraPictures
 from .progress import render_progress
 
 logger = logging.getLogger(__name__)
 
-T = TypeVar("T")
-
-_NO_SIMULATION = "it has no MuJoCo model and data that can be seen"
+NO_SIMULATION = "it has no MuJoCo model and data that can be seen"
 
 
-class Closable:
-    """A context manager that waits for its videos unless it is left by an exception."""
+class MonitorBase:
+    """Gym's names, and one way to close: of one environment or of several.
+
+    A context manager that waits for its videos unless it is left by an exception.
+
+    Attributes:
+        allows_early_reset: whether the framework's contract allows a reset in
+            mid-episode.
+    """
+
+    allows_early_reset: ClassVar[bool]
 
     _options: RecorderOptions
+    # One for each environment, all in one directory.
+    _recorders: Sequence[Recorder]
+    _guard: ExitGuard
     _reported_failures = False
 
     @property
     def directory(self) -> Path:
         """The monitor directory, absolute."""
-        raise NotImplementedError
+        return self._recorders[0].directory
 
-    def close(self, *, wait: bool = True) -> None:
-        """Finish the recordings, then close the environment; `wait` for all videos."""
-        raise NotImplementedError
-
-    def _note_error(self, error: BaseException) -> None:
-        """Note that the environment, or its user, has raised."""
-        raise NotImplementedError
-
-    def _raise_failures(self, failures: Mapping[str, str]) -> None:
-        """Say once why videos could not be rendered.
+    def set_monitor_mode(self, mode: str | None) -> None:
+        """Set the type of the episodes from the next resets on.
 
         Args:
-            failures: the reasons, by the names of the videos.
+            mode: "training", "evaluation", or None for training.
 
         Raises:
-            RenderError: there are some, and `on_error` is "raise".
+            InvalidArgument: it is something else.
         """
-        if not failures or self._reported_failures:
+        for recorder in self._recorders:
+            recorder.set_mode(mode)
+
+    def get_total_steps(self) -> int:
+        """Return the number of all steps, those of unfinished episodes too."""
+        return sum(each.stats_recorder.total_steps for each in self._recorders)
+
+    def close(self, *, wait: bool = True) -> None:
+        """Finish the recordings, then close the environment. Idempotent.
+
+        Args:
+            wait: whether to wait, with a progress bar on a terminal, until all videos
+                are rendered; else what is not rendered yet is left pending, and
+                `mjrec render DIR` makes it. Ctrl-C while it waits is the same.
+
+        Raises:
+            EncoderError: a running video could not be finished; all else is.
+            RenderError: videos could not be rendered; all else is done, and their
+                trajectories are kept.
+            FileNotWritten: the disk is full; the next call tries again.
+        """
+        try:
+            if wait:
+                with render_progress(title="rendering ") as on_progress:
+                    self._finish(on_progress)
+        finally:
+            self._guard.close()
+        failures: dict[str, str] = {}
+        for recorder in self._recorders:
+            failures.update(recorder.failures())
+        if not wait or not failures or self._reported_failures:
             return
         self._reported_failures = True
         error = RenderError(self.directory, failures)
         if self._options.on_error != WARN:
             raise error
         logger.warning("%s", error)
+
+    def _finish(self, on_progress: Callable[[Any], None]) -> None:
+        """End all episodes, then wait until all videos are rendered."""
+        call_all(functools.partial(r.finish, on_progress) for r in self._recorders)
+
+    def _note_error(self, error: BaseException) -> None:
+        """Note that the environment, or its user, has raised."""
+        for recorder in self._recorders:
+            recorder.note_error(error)
+
+    def _guard_by(self, closings: Iterable[Callable[[], object]]) -> None:
+        """Call all of `closings` once, whatever comes first: `close` or the end."""
+        self._guard = ExitGuard(
+            self,
+            functools.partial(call_all, list(closings)),
+            at_exit=functools.partial(_note_last_error, self._recorders),
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -84,7 +133,7 @@ class Closable:
         if first is not None:
             self._note_error(first)
         try:
-            # Whoever leaves by an exception does not wait for videos.
+            # Leaving by an exception waits for no videos.
             self.close(wait=first is None)
         except Exception as second:
             if first is None:
@@ -102,25 +151,10 @@ class Closable:
         )
 
 
-class MonitorBase(Closable):
-    """The part of a monitor that does not depend on the framework.
-
-    Attributes:
-        allows_early_reset: whether the framework's contract allows a reset in
-            mid-episode.
-    """
-
-    allows_early_reset: ClassVar[bool]
-    # Why there are no states, where there are none.
-    _no_simulation: ClassVar[str] = _NO_SIMULATION
+class EnvironmentMonitor(MonitorBase):
+    """The part of one environment's monitor that does not depend on the framework."""
 
     _recorder: Recorder
-    _guard: ExitGuard
-
-    @property
-    def directory(self) -> Path:
-        """The monitor directory, absolute."""
-        return self._recorder.directory
 
     @property
     def infix(self) -> str:
@@ -141,21 +175,6 @@ class MonitorBase(Closable):
     def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
         """Records the running episode (or not); None before the first reset."""
         return self._recorder.video_recorder
-
-    def set_monitor_mode(self, mode: str | None) -> None:
-        """Set the type of the episodes from the next reset on.
-
-        Args:
-            mode: "training", "evaluation", or None for training.
-
-        Raises:
-            InvalidArgument: it is something else.
-        """
-        self._recorder.set_mode(mode)
-
-    def get_total_steps(self) -> int:
-        """Return the number of all steps, those of unfinished episodes too."""
-        return self._recorder.stats_recorder.total_steps
 
     def get_episode_rewards(self) -> list[float]:
         """Return the sum of rewards of each complete episode."""
@@ -185,41 +204,14 @@ class MonitorBase(Closable):
         """
         self._recorder.forget_pictures()
 
-    def close(self, *, wait: bool = True) -> None:
-        """Finish the recordings, then close the environment. Idempotent.
-
-        Args:
-            wait: whether to wait, with a progress bar on a terminal, until all videos
-                are rendered; else what is not rendered yet is left pending, and
-                `mjrec render DIR` makes it. Ctrl-C while it waits is the same.
-
-        Raises:
-            EncoderError: the running video could not be finished; all else is.
-            RenderError: videos could not be rendered; all else is done, and their
-                trajectories are kept.
-            FileNotWritten: the disk is full; the next call tries again.
-        """
+    @contextlib.contextmanager
+    def _resetting(self) -> Iterator[None]:
+        """Put this around the environment's reset, which is noted where it raises."""
         try:
-            if wait:
-                with render_progress(title="rendering ") as on_progress:
-                    self._recorder.finish(on_progress)
-        finally:
-            self._guard.close()
-        if wait:
-            self._raise_failures(self._recorder.failures())
-
-    def _note_error(self, error: BaseException) -> None:
-        self._recorder.note_error(error)
-
-    def _reset_by(self, reset: Callable[[], T]) -> T:
-        """Return what the environment's reset returns; note it where it raises."""
-        recorder = self._recorder
-        recorder.before_reset()
-        try:
-            with recorder.resetting():
-                return reset()
+            with self._recorder.resetting():
+                yield
         except BaseException as error:
-            recorder.note_error(error)
+            self._recorder.note_error(error)
             raise
 
     def _open(
@@ -228,22 +220,29 @@ class MonitorBase(Closable):
         directory: str | os.PathLike[str],
         options: RecorderOptions,
         *,
-        env_id: str,
-        view: CameraPictures,
         scenes: Callable[[], Scenes],
         close_environment: Callable[[Any], None],
-        env_index: int | None = None,
+        no_simulation: str = NO_SIMULATION,
         rendering: Callable[[Path], Finisher] | None = None,
+        **subject: Any,
     ) -> None:
         """Open the directory; from here on the environment is this monitor's.
 
-        What renders is made by `rendering`, or is a service of this monitor's own.
+        Args:
+            env: the environment.
+            directory: where the recordings go.
+            options: what was asked for.
+            scenes: returns how states are recorded, for one reader.
+            close_environment: closes `env`.
+            no_simulation: why there are no states, where there are none.
+            rendering: makes what renders; a service of this monitor's own if None.
+            **subject: `env_id` and others of `Subject`.
         """
         known = scenes()
         # Clips run beside episodes, and a source of states has one reader only.
         clip_states = scenes().states if options.has_clips else None
         choice = rendering_choice(
-            options.render, known, env_id, no_simulation=self._no_simulation
+            options.render, known, subject["env_id"], no_simulation=no_simulation
         )
         if choice.mode != DEFERRED or options.workers == 0:
             rendering = None
@@ -255,11 +254,6 @@ class MonitorBase(Closable):
         self._recorder = Recorder(
             directory,
             subject=Subject(
-                env_id=env_id,
-                env_index=env_index,
-                pictures=view.pictures,
-                further_pictures=view.further,
-                cameras=view.cameras,
                 clock=functools.partial(simulation_time, env),
                 declared=functools.partial(declared_rate, env),
                 rendering=choice,
@@ -267,17 +261,19 @@ class MonitorBase(Closable):
                 clip_states=clip_states,
                 environment=known.environment,
                 random_state=known.random_state,
+                **subject,
             ),
             options=options,
             finisher=rendering,
         )
-        closings = [self._recorder.close]
-        closings += [each.close for each in (known.states, clip_states) if each]
-        closings.append(functools.partial(close_environment, env))
-        self._guard = ExitGuard(
-            self,
-            functools.partial(call_all, closings),
-            at_exit=functools.partial(_note_last_error, self._recorder),
+        self._recorders = [self._recorder]
+        states = [each for each in (known.states, clip_states) if each is not None]
+        self._guard_by(
+            [
+                self._recorder.close,
+                *(each.close for each in states),
+                functools.partial(close_environment, env),
+            ]
         )
 
     def _begin(
@@ -296,7 +292,7 @@ def rendering_choice(
     scenes: Scenes,
     env_id: str,
     *,
-    no_simulation: str = _NO_SIMULATION,
+    no_simulation: str = NO_SIMULATION,
 ) -> RenderingChoice:
     """Return when the pictures of an environment are drawn.
 
@@ -338,7 +334,8 @@ def call_all(calls: Iterable[Callable[[], object]]) -> None:
         raise first
 
 
-def _note_last_error(recorder: Recorder) -> None:
+def _note_last_error(recorders: Sequence[Recorder]) -> None:
     error = last_error()
     if error is not None:
-        recorder.note_error(error)
+        for recorder in recorders:
+            recorder.note_error(error)

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..errors import InvalidArgument
@@ -17,27 +16,9 @@ from ..rendering.views import plain_camera
 _RGB_ARRAY = "rgb_array"
 
 
-@dataclass(frozen=True, kw_only=True)
-class CameraPictures:
-    """What is drawn, and from where.
-
-    Attributes:
-        camera: the only one, or the first: the one that scenes are recorded with.
-        pictures: what the first video of an episode shows.
-        further: what the others show, by a part of their names.
-        cameras: all, for JSON, where there are several. None is what the environment
-            itself shows.
-    """
-
-    camera: Any
-    pictures: EpisodePictures
-    further: Mapping[str, EpisodePictures] = field(default_factory=dict)
-    cameras: tuple[Any, ...] = ()
-
-
 def camera_pictures(
     camera: Any, pictures_from: Callable[[Any], EpisodePictures], *, tiled: bool
-) -> CameraPictures:
+) -> tuple[Any, dict[str, Any]]:
     """Return the pictures from a camera, or from each of several.
 
     Args:
@@ -45,6 +26,10 @@ def camera_pictures(
             itself shows, or a list of these.
         pictures_from: makes the pictures from one camera.
         tiled: those of several cameras side by side, in one video.
+
+    Returns:
+        The only camera, or the first, the one that scenes are recorded with; and what
+        `Subject` is told: `pictures`, `further_pictures` and `cameras`.
 
     Raises:
         InvalidArgument: the list is empty, or has one camera twice, or None in another
@@ -62,26 +47,20 @@ def camera_pictures(
                 "sub-environments of a vector environment, side by side, and here is "
                 f"one of each: got the camera {camera!r}. Give several."
             )
-        return CameraPictures(camera=cameras[0], pictures=pictures_from(cameras[0]))
-    plain = [None if each is None else plain_camera(each) for each in cameras]
+        return cameras[0], {"pictures": pictures_from(cameras[0])}
+    plain = tuple(None if each is None else plain_camera(each) for each in cameras)
     sources = [pictures_from(each) for each in cameras]
+    said: dict[str, Any] = {"pictures": sources[0], "cameras": plain}
     without = [source for source in sources if not can_give_pictures(source)]
     if without:
         # All are drawn by workers, or none is.
-        return CameraPictures(
-            camera=cameras[0], pictures=without[0], cameras=tuple(plain)
-        )
-    if tiled:
-        return CameraPictures(
-            camera=cameras[0], pictures=_CameraTiles(sources), cameras=tuple(plain)
-        )
-    parts = further_parts(plain)
-    return CameraPictures(
-        camera=cameras[0],
-        pictures=sources[0],
-        further=dict(zip(parts, sources[1:], strict=True)),
-        cameras=tuple(plain),
-    )
+        said["pictures"] = without[0]
+    elif tiled:
+        said["pictures"] = _CameraTiles(sources)
+    else:
+        further = zip(further_parts(plain), sources[1:], strict=True)
+        said["further_pictures"] = dict(further)
+    return cameras[0], said
 
 
 def _check(cameras: list[Any]) -> None:

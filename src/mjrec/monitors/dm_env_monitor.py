@@ -15,7 +15,7 @@ from ..environments.no_pictures import NoPictureSource
 from ..environments.scenes import Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
-from .base import MonitorBase
+from .base import EnvironmentMonitor
 from .cameras import camera_pictures
 
 logger = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ _NO_PHYSICS = (
 )
 
 
-class DmEnvMonitor(MonitorBase, dm_env.Environment):  # type: ignore[misc]  # untyped
+class DmEnvMonitor(EnvironmentMonitor, dm_env.Environment):  # type: ignore[misc]  # untyped
     """Records a dm_env environment; `mjrec.Monitor` makes one and says how.
 
     It keeps dm_env's contract: `reset` at any time; `step` before the first reset, or
@@ -63,20 +63,19 @@ class DmEnvMonitor(MonitorBase, dm_env.Environment):  # type: ignore[misc]  # un
                 "steps have none. The journal has every episode's return and length."
             )
         size = {"height": height, "width": width}
-        view = camera_pictures(
+        first, pictures = camera_pictures(
             camera,
             lambda each: _pictures(env, camera=each, **size),
             tiled=options.tiled,
         )
-
         self._open(
             env,
             directory,
             options,
-            env_id=env_id or _env_id(env),
-            view=view,
-            scenes=lambda: _scenes(env, env_id=env_id, camera=view.camera, **size),
+            scenes=lambda: _scenes(env, env_id=env_id, camera=first, **size),
             close_environment=operator.methodcaller("close"),
+            env_id=env_id or _env_id(env),
+            **pictures,
         )
 
     def reset(self) -> dm_env.TimeStep:
@@ -87,7 +86,9 @@ class DmEnvMonitor(MonitorBase, dm_env.Environment):  # type: ignore[misc]  # un
         """
         if self._recorder.closed:
             return self._env.reset()
-        timestep = self._reset_by(self._env.reset)
+        self._recorder.before_reset()
+        with self._resetting():
+            timestep = self._env.reset()
         self._begin(seed=self.seed, observation=timestep.observation)
         return timestep
 

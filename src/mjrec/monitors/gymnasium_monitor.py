@@ -18,7 +18,7 @@ from ..environments.gymnasium_pictures import close_environment, gymnasium_pictu
 from ..environments.gymnasium_scenes import gymnasium_scenes
 from ..recorder.finishing_process import Finisher
 from ..recorder.options import RecorderOptions
-from .base import MonitorBase
+from .base import NO_SIMULATION, EnvironmentMonitor
 from .cameras import camera_pictures
 
 logger = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 _Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
 
-class GymnasiumMonitor(MonitorBase, gymnasium.Wrapper[Any, Any, Any, Any]):
+class GymnasiumMonitor(EnvironmentMonitor, gymnasium.Wrapper[Any, Any, Any, Any]):
     """Records a Gymnasium environment; `mjrec.Monitor` makes one and says how.
 
     An episode is over when it is terminated or truncated. A reset in mid-episode is
@@ -54,13 +54,14 @@ class GymnasiumMonitor(MonitorBase, gymnasium.Wrapper[Any, Any, Any, Any]):
         env_index: int | None = None,
         rendering: Callable[[Path], Finisher] | None = None,
         close_environment: Callable[[Any], None] = close_environment,
+        no_simulation: str = NO_SIMULATION,
     ) -> None:
         super().__init__(env)
         # gym's own convention: the step that ends an episode begins the next.
         self._same_step_autoreset = bool(env.metadata.get("semantics.autoreset"))
         self._next_step_autoreset = _has_autoreset(env)
         size = {"height": height, "width": width}
-        view = camera_pictures(
+        first, pictures = camera_pictures(
             camera,
             lambda each: gymnasium_pictures(env, camera=each, **size),
             tiled=options.tiled,
@@ -69,12 +70,13 @@ class GymnasiumMonitor(MonitorBase, gymnasium.Wrapper[Any, Any, Any, Any]):
             env,
             directory,
             options,
+            scenes=lambda: gymnasium_scenes(env, camera=first, **size),
+            close_environment=close_environment,
+            no_simulation=no_simulation,
+            rendering=rendering,
             env_id=env_id or env_id_of(env),
             env_index=env_index,
-            view=view,
-            scenes=lambda: gymnasium_scenes(env, camera=view.camera, **size),
-            rendering=rendering,
-            close_environment=close_environment,
+            **pictures,
         )
 
     # Gymnasium's own wrappers override the attribute by a property too.
@@ -93,7 +95,9 @@ class GymnasiumMonitor(MonitorBase, gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         if self._recorder.closed:
             return self.env.reset(seed=seed, options=options)
-        result = self._reset_by(lambda: self.env.reset(seed=seed, options=options))
+        self._recorder.before_reset()
+        with self._resetting():
+            result = self.env.reset(seed=seed, options=options)
         self._begin(seed=seed, options=options, observation=result[0])
         return result
 
@@ -108,11 +112,11 @@ class GymnasiumMonitor(MonitorBase, gymnasium.Wrapper[Any, Any, Any, Any]):
         if fast is None or not fast.before_step(action):
             if recorder.closed:
                 return self.env.step(action)
-            if self._next_step_autoreset and recorder.done:
-                result = self._reset_by(lambda: self.env.step(action))
+            if self._before_step(action):
+                with self._resetting():
+                    result = self.env.step(action)
                 self._begin(observation=result[0])
                 return result
-            recorder.before_step(action)
         try:
             result = self.env.step(action)
         except BaseException as error:
@@ -125,6 +129,14 @@ class GymnasiumMonitor(MonitorBase, gymnasium.Wrapper[Any, Any, Any, Any]):
         if fast is None or terminated or truncated or not fast.step(reward):
             self._record(*result)
         return result
+
+    def _before_step(self, action: Any) -> bool:
+        """Note an action; return whether the coming step is a reset instead."""
+        if self._next_step_autoreset and self._recorder.done:
+            self._recorder.before_reset()
+            return True
+        self._recorder.before_step(action)
+        return False
 
     def _begin(
         self, *, seed: Any = None, options: Any = None, observation: Any = None
@@ -210,6 +222,9 @@ def success_in(info: Mapping[str, Any]) -> bool | None:
 
 
 def _has_autoreset(env: gymnasium.Env[Any, Any]) -> bool:
+    # A sub-environment that is seen from outside says so itself.
+    if getattr(env, "resets_in_next_step", False):
+        return True
     while isinstance(env, gymnasium.Wrapper):
         if isinstance(env, gymnasium.wrappers.Autoreset):
             return True

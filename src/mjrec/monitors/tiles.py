@@ -17,7 +17,7 @@ from ..recorder.options import OFF, WARN, RecorderOptions
 from ..recorder.video_recorder import VideoRecorder, declared_rate
 from ..schedules import disable_videos, to_schedule
 from ..simulation.find_simulation import simulation_time
-from .base import MonitorBase
+from .base import EnvironmentMonitor
 from .cameras import Tiles
 
 logger = logging.getLogger(__name__)
@@ -78,7 +78,11 @@ class TiledVideo:
     """
 
     def __init__(
-        self, first: MonitorBase, tiles: Tiles, options: RecorderOptions, env: Any
+        self,
+        first: EnvironmentMonitor,
+        tiles: Tiles,
+        options: RecorderOptions,
+        env: Any,
     ) -> None:
         self._first = first
         self._tiles = tiles

@@ -10,7 +10,7 @@ import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -18,21 +18,16 @@ import numpy as np
 from ..environments.gymnasium_pictures import close_environment, free_viewers
 from ..errors import Error, ResetNeeded, ResetNotAllowed
 from ..formats.monitor_directory import infix_of, iter_monitor_files
-from ..recorder.ending_reasons import last_error
-from ..recorder.exit_guard import ExitGuard
 from ..recorder.options import RecorderOptions
 from ..rendering.background import Background
-from .base import Closable, MonitorBase, call_all
+from .base import NO_SIMULATION, MonitorBase, call_all
 from .gymnasium_monitor import GymnasiumMonitor
-from .progress import render_progress
 from .tiles import TiledVideo, has_videos, vector_tiles
 from .vector_slots import (
-    NEXT_STEP,
     SAME_STEP,
     UNSEEN,
     Env,
     Frames,
-    SlotMonitor,
     VectorEnv,
     autoreset_mode,
     check_outside,
@@ -51,7 +46,7 @@ logger = logging.getLogger(__name__)
 _TAILS = 4 << 20
 
 
-class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
+class VectorMonitor(MonitorBase, gymnasium.vector.VectorWrapper):
     """Records a Gymnasium vector environment; `mjrec.Monitor` makes one and says how.
 
     Every sub-environment has a monitor of its own, with its own infix, statistics,
@@ -121,12 +116,11 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
             )
         # How a sub-environment is closed; until all have monitors, not at all.
         closing: dict[str, Callable[[Env], None]] = {"by": lambda env: None}
-        kind = SlotMonitor if inside is None else GymnasiumMonitor
         self.monitors: tuple[GymnasiumMonitor, ...] = _all_or_none(
             directory,
             [
                 functools.partial(
-                    kind,
+                    GymnasiumMonitor,
                     each,
                     directory,
                     _options_of(index, len(envs), options, view),
@@ -135,11 +129,13 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
                     env_index=index,
                     rendering=None if shared is None else lambda _: shared.share(),
                     close_environment=lambda env: closing["by"](env),
+                    no_simulation=NO_SIMULATION if inside else UNSEEN,
                 )
                 for index, each in enumerate(envs)
             ],
         )
         closing["by"] = close_environment
+        self._recorders = [monitor._recorder for monitor in self.monitors]
         self._shared = shared
         self._tiled = None
         # What `close` passes on to the environment's own.
@@ -161,32 +157,7 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
             closings.append(lambda: inside.__setitem__(slice(None), originals))
             inside[:] = self.monitors
         closings.append(lambda: env.close(**options_of_close))
-        self._guard = ExitGuard(
-            self,
-            functools.partial(call_all, closings),
-            at_exit=functools.partial(_note_last_error, self.monitors),
-        )
-
-    @property
-    def directory(self) -> Path:
-        """The monitor directory, absolute."""
-        return self.monitors[0].directory
-
-    def set_monitor_mode(self, mode: str | None) -> None:
-        """Set the type of the episodes from the next resets on.
-
-        Args:
-            mode: "training", "evaluation", or None for training.
-
-        Raises:
-            InvalidArgument: it is something else.
-        """
-        for monitor in self.monitors:
-            monitor.set_monitor_mode(mode)
-
-    def get_total_steps(self) -> int:
-        """Return the number of all steps of all sub-environments."""
-        return sum(monitor.get_total_steps() for monitor in self.monitors)
+        self._guard_by(closings)
 
     def get_episode_rewards(self) -> list[list[float]]:
         """Return, by sub-environment, the sum of rewards of each complete episode."""
@@ -249,29 +220,15 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
         """Finish the recordings, then close the environment. Idempotent.
 
         Args:
-            wait: whether to wait, with a progress bar on a terminal, until all videos
-                are rendered; else what is not rendered yet is left pending, and
-                `mjrec render DIR` makes it. Ctrl-C while it waits is the same.
+            wait: as a `GymnasiumMonitor`.
             **options: of the environment's own `close`: `timeout` and `terminate` of
                 `AsyncVectorEnv`.
 
         Raises:
-            EncoderError: a running video could not be finished; all else is.
-            RenderError: videos could not be rendered; all else is done, and their
-                trajectories are kept.
-            FileNotWritten: the disk is full; the next call tries again.
+            Error: as a `GymnasiumMonitor`.
         """
         self._closing.update(options)
-        try:
-            if wait and not self._is_closed:
-                self._finish()
-        finally:
-            self._guard.close()
-        if wait:
-            failures: dict[str, str] = {}
-            for monitor in self.monitors:
-                failures.update(monitor._recorder.failures())
-            self._raise_failures(failures)
+        super().close(wait=wait)
 
     def __del__(self) -> None:
         # Gymnasium 1.0 would call `close`, which waits; the guard sees to the end.
@@ -279,17 +236,17 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
 
     @property
     def _is_closed(self) -> bool:
-        return all(monitor._recorder.closed for monitor in self.monitors)
+        return all(recorder.closed for recorder in self._recorders)
 
-    def _finish(self) -> None:
-        """End all episodes, then wait until all videos are rendered."""
+    def _finish(self, on_progress: Callable[[Any], None]) -> None:
+        if self._is_closed:
+            return
         if self._tiled is not None:
             self._tiled.take_last()
         with contextlib.ExitStack() as waiting:
-            on_progress = waiting.enter_context(render_progress(title="rendering "))
             if self._shared is not None:
                 waiting.enter_context(self._shared.waiting_at_the_end(on_progress))
-            call_all(monitor._recorder.finish for monitor in self.monitors)
+            call_all(recorder.finish for recorder in self._recorders)
 
     def _env_reset(self, seed: Any, options: Any) -> tuple[Any, dict[str, Any]]:
         result: tuple[Any, dict[str, Any]] = self.env.reset(seed=seed, options=options)
@@ -299,7 +256,7 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
         self, which: list[int], seed: Any, options: dict[str, Any] | None
     ) -> tuple[Any, dict[str, Any]]:
         result = self._env_reset(seed, options)
-        if any(self.monitors[index]._recorder.done is None for index in which):
+        if any(self._recorders[index].done is None for index in which):
             raise Error(
                 f"{type(self.env.unwrapped).__name__} was reset, and did not reset "
                 "the environments in its list `envs`, so that nothing could be "
@@ -311,7 +268,7 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
     def _reset_slots(
         self, which: list[int], seed: Any, options: dict[str, Any] | None
     ) -> tuple[Any, dict[str, Any]]:
-        slots = {index: slot for index, slot in self._open_slots() if index in which}
+        slots = {i: slot for i, slot in self._open_slots().items() if i in which}
         # A copy: the reset takes the mask out of the original.
         noted = options and {k: v for k, v in options.items() if k != "reset_mask"}
         for slot in slots.values():
@@ -331,31 +288,26 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
         return result
 
     def _step_slots(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        slots = list(self._open_slots())
-        resets = self._mode == NEXT_STEP
+        slots = self._open_slots()
         each = list(gymnasium.vector.utils.iterate(self.env.action_space, actions))
-        begins = [slot.before_step(each[i], resets=resets) for i, slot in slots]
+        begins = {i for i, slot in slots.items() if slot._before_step(each[i])}
         result = self.env.step(actions)
         self._frames.forget()
         observations, rewards, terminations, truncations, infos = result
-        firsts = self._split(observations)
-        lasts = firsts
+        firsts = lasts = self._split(observations)
         of_lasts: Any = infos
         if self._mode == SAME_STEP:
             lasts = infos.get("final_obs", firsts)
             of_lasts = infos.get("final_info", infos)
         ends = np.logical_or(terminations, truncations)
-        said: dict[int, dict[str, Any]] = {}
+        said = {i: info_of(of_lasts, i) for i in slots if ends[i] and i not in begins}
 
-        def record(index: int, slot: SlotMonitor, begins: bool) -> None:
-            if begins:
+        def record(index: int, slot: GymnasiumMonitor) -> None:
+            if index in begins:
                 slot._begin(observation=firsts[index])
                 return
-            is_end = bool(ends[index])
-            if is_end:
-                said[index] = info_of(of_lasts, index)
             slot._record(
-                lasts[index] if is_end else firsts[index],
+                lasts[index] if ends[index] else firsts[index],
                 rewards[index],
                 bool(terminations[index]),
                 bool(truncations[index]),
@@ -363,18 +315,14 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
                 firsts[index],
             )
 
-        call_all(
-            functools.partial(record, index, slot, begins)
-            for (index, slot), begins in zip(slots, begins, strict=True)
-        )
+        call_all(functools.partial(record, *each) for each in slots.items())
         if self._options.episode_info and not {"episode", "_episode"} & infos.keys():
             _add_episode_info(infos, said, ends)
         return result
 
-    def _open_slots(self) -> Iterator[tuple[int, SlotMonitor]]:
-        for index, monitor in enumerate(self.monitors):
-            if not monitor._recorder.closed:
-                yield index, cast(SlotMonitor, monitor)
+    def _open_slots(self) -> dict[int, GymnasiumMonitor]:
+        each = enumerate(self.monitors)
+        return {i: slot for i, slot in each if not slot._recorder.closed}
 
     def _split(self, observations: Any) -> Sequence[Any]:
         if not self._options.observations:
@@ -386,7 +334,7 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
         """Check before anything is reset that all may be."""
         if self._options.allow_early_reset or self._had_error:
             return
-        stats = [monitor.stats_recorder for monitor in self.monitors]
+        stats = [recorder.stats_recorder for recorder in self._recorders]
         running = [i for i in which if stats[i].done is False and stats[i].steps]
         if running:
             raise ResetNotAllowed(
@@ -409,8 +357,7 @@ class VectorMonitor(Closable, gymnasium.vector.VectorWrapper):
         if isinstance(error, ResetNeeded | ResetNotAllowed):
             return
         self._had_error = True
-        for monitor in self.monitors:
-            monitor._note_error(error)
+        super()._note_error(error)
         if self._tiled is not None:
             self._tiled.note_error(error)
 
@@ -522,10 +469,3 @@ def _warn_of_missing_frames(env: VectorEnv, is_outside: bool, is_tiled: bool) ->
             "others that have ended likewise, after the reset: with SAME_STEP they can "
             "be drawn together only then."
         )
-
-
-def _note_last_error(monitors: Sequence[MonitorBase]) -> None:
-    error = last_error()
-    if error is not None:
-        for monitor in monitors:
-            monitor._note_error(error)

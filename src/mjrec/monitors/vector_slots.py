@@ -17,7 +17,7 @@ import gymnasium
 
 from ..errors import InvalidArgument, PicturesDiffer
 from ..recorder.options import DEFERRED
-from .gymnasium_monitor import GymnasiumMonitor, env_id_of
+from .gymnasium_monitor import env_id_of
 
 logger = logging.getLogger(__name__)
 
@@ -129,8 +129,9 @@ class SubEnvironment(Env):
     def __init__(
         self, env: VectorEnv, frames: Frames, index: int, *, timestep: float | None
     ) -> None:
-        resets_itself = autoreset_mode(env) == SAME_STEP
-        self.metadata = {**env.metadata, "semantics.autoreset": resets_itself}
+        mode = autoreset_mode(env)
+        self.metadata = {**env.metadata, "semantics.autoreset": mode == SAME_STEP}
+        self.resets_in_next_step = mode == NEXT_STEP
         self.render_mode = env.render_mode
         self._frames = frames
         self._index = index
@@ -143,26 +144,6 @@ class SubEnvironment(Env):
 
     def close(self) -> None:
         """Do nothing: the vector environment is closed by its own monitor."""
-
-
-class SlotMonitor(GymnasiumMonitor):
-    """The monitor of a `SubEnvironment`; a `VectorMonitor` tells it what happens."""
-
-    _no_simulation = UNSEEN
-
-    def before_step(self, action: Any, *, resets: bool) -> bool:
-        """Note an action; return whether the step is going to be a reset.
-
-        Args:
-            action: of the coming step.
-            resets: whether the step after an episode's end is one.
-        """
-        recorder = self._recorder
-        if resets and recorder.done:
-            recorder.before_reset()
-            return True
-        recorder.before_step(action)
-        return False
 
 
 def slots_outside(env: VectorEnv, frames: Frames) -> list[SubEnvironment]:

@@ -24,9 +24,7 @@ from ..errors import (
     DifferentEnvironment,
     DirectoryNotWritable,
     ExistingRecordings,
-    UnreadableFile,
 )
-from ..formats.journal import MOST_EPISODES, JournalReader
 from ..formats.locks import Lock, is_locked
 from ..formats.monitor_directory import (
     Infix,
@@ -182,32 +180,18 @@ def _next_episode_id(path: Path, *, uid: str | None) -> int:
 def _last_episode_id(files: MonitorFiles) -> int:
     """Return the highest episode number that a monitor's files speak of; -1 if none."""
     # Names count too: an episode in flight when a process died has a number.
-    return max(files.last_episode_id, _last_journaled(files), _last_counted(files))
-
-
-def _last_journaled(files: MonitorFiles) -> int:
-    if files.journal is None:
-        return -1
-    reader = JournalReader(files.journal)
-    for _ in reader:
-        pass
-    reader.report()
-    return reader.last_episode_id
-
-
-def _last_counted(files: MonitorFiles) -> int:
-    """Return the last number that the manifest says or implies."""
     results = MonitorResults(files)
+    return max(
+        files.last_episode_id, results.run.last_episode_id, _last_counted(results)
+    )
+
+
+def _last_counted(results: MonitorResults) -> int:
+    """Return the last number that the manifest says or implies."""
     if results.manifest is None:
         return -1
     if results.manifest.mjrec is not None:
-        next_id = results.manifest.mjrec.get("next_episode_id")
-        if type(next_id) is not int or not 0 <= next_id <= MOST_EPISODES:
-            assert files.manifest is not None
-            raise UnreadableFile(
-                files.manifest, "its mjrec.next_episode_id is no episode's number"
-            )
-        return next_id - 1
+        return int(results.manifest.mjrec.get("next_episode_id") or 0) - 1
     # Gym's own: its numbers count the resets, each of which has a type, from 0.
     stats = results.saved
     if stats is None:

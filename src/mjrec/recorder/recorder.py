@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import DirectoryNotWritable, Error, FileNotWritten
 from ..formats.journal import JournalEntry
+from ..formats.manifest import GYM_VERSION
 from ..formats.monitor_directory import (
     episode_of,
     journal_name,
@@ -25,7 +26,6 @@ from ..formats.monitor_directory import (
 from ..formats.render_failures import note_failure, reason_of
 from ..formats.spans import FINISHED
 from ..results.manifest_and_stats import write_manifest_and_stats
-from ..results.recorded_environment import GYM_VERSION
 from .clips import Clips
 from .deferred_video import DeferredVideo
 from .ending_reasons import CLOSE, INTERRUPT, RESET, ending

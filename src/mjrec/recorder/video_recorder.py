@@ -344,13 +344,18 @@ class VideoRecorder:
         self._waiting.clear()
 
     def _note(self) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-        """Return what an unfinished file is, for whoever finds it."""
-        timing = {
-            "timestep": self._timestep,
-            "stride": self._stride,
-            "frames_per_step": self._frames_per_step,
-        }
+        """Return what an unfinished file is, for the finder of one."""
+        timing = {**self._timing(), "frames_per_step": self._frames_per_step}
         return {**self.metadata, **self._facts()}, timing
+
+    def _timing(self) -> Mapping[str, Any]:
+        return timing_facts(
+            self._steps,
+            fps=self._rate,
+            timestep=self._timestep,
+            stride=self._stride,
+            frames_per_step=self._frames_per_step,
+        )
 
     @contextlib.contextmanager
     def _abandoning(self) -> Iterator[None]:
@@ -392,15 +397,8 @@ class VideoRecorder:
             self.metadata["empty"] = True
             write_metadata(Path(self.path), self.metadata)
             return
-        timing = timing_facts(
-            self._steps,
-            fps=self._rate,
-            timestep=self._timestep,
-            stride=self._stride,
-            frames_per_step=self._frames_per_step,
-        )
         self.metadata = self._sink.describe(
-            {**self.metadata, **timing, **self._facts()}
+            {**self.metadata, **self._timing(), **self._facts()}
         )
 
 

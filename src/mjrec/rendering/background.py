@@ -192,7 +192,7 @@ class Background:
         for message in messages:
             self._take(message)
         if process.has_ended:
-            self._replace(process.child.last_words())
+            self._replace(f"it {process.child.last_words()}")
         return bool(messages)
 
     def _take(self, message: Mapping[str, Any]) -> None:

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
 from ..simulation.cameras import Camera, camera_from_members, is_tracking
-from ..simulation.canvas import KeptCanvas
 from ..simulation.recorded_scene import GivenStates, RecordedScene
-from ..simulation.renderer import SceneRenderer
+from ..simulation.renderer import Canvas, SceneRenderer
 from ..simulation.warnings import log_mujoco_warnings
 from .recorded_facts import open_for_rendering
 from .recorded_frames import check_has_frames
@@ -63,7 +62,7 @@ class Drawing:
 
     @property
     def gl_facts(self) -> dict[str, Any]:
-        """Who draws, and on which device: `gl_info.current_gl_facts`."""
+        """Who draws, and on which device: `gl_context.current_gl_facts`."""
         return self._cameras[0].renderer.gl_facts
 
     def draw(self, index: int, *, out: Frame | None = None) -> Frame:
@@ -150,7 +149,7 @@ def trajectory_drawing(
     view: View,
     *,
     cameras: Sequence[PlainCamera | None] | None = None,
-    kept: KeptCanvas | None = None,
+    canvas: Canvas | None = None,
 ) -> Drawing:
     """Return the frames that `env.render()` would have given in a recorded episode.
 
@@ -159,7 +158,7 @@ def trajectory_drawing(
         view: what of them is to be other than recorded.
         cameras: several in place of that of the view; None among them is as recorded.
             A frame is then all that they show, in a grid.
-        kept: what to draw on; something new, if None.
+        canvas: what to draw with; something new, if None.
 
     Raises:
         UnreadableFile: of the trajectory or its model.
@@ -180,9 +179,7 @@ def trajectory_drawing(
             "quality": view.quality
             or (facts.get("video") or {}).get("quality", "full"),
         }
-        if kept is None:
-            kept = opened.enter_context(contextlib.closing(KeptCanvas()))
-        canvas = kept.canvas(model, **look)
+        shared = canvas or opened.enter_context(contextlib.closing(Canvas()))
 
         def replay(asked: PlainCamera | None) -> _CameraReplay:
             # Of a camera as recorded it is known how the frames have moved it.
@@ -193,7 +190,7 @@ def trajectory_drawing(
                 scene_option=recorded.option,
                 max_geom=recorded.max_geom,
                 fresh=recorded.fresh,
-                canvas=canvas,
+                canvas=shared,
                 **look,
             )
             before = scene.previous_cameras if asked is None else np.zeros((2, 3))
@@ -204,7 +201,7 @@ def trajectory_drawing(
 
 
 def states_drawing(
-    directory: Path, spec: int, view: View, *, kept: KeptCanvas
+    directory: Path, spec: int, view: View, *, canvas: Canvas
 ) -> Drawing:
     """Return the frames of given states, with all that is computed from them.
 
@@ -212,7 +209,7 @@ def states_drawing(
         directory: where `save_states` wrote them.
         spec: which components a state has.
         view: how they are to be drawn, with nothing left open.
-        kept: what to draw on.
+        canvas: what to draw with.
 
     Raises:
         UnknownName, InvalidArgument, GLError: as `trajectory_drawing`.
@@ -224,26 +221,26 @@ def states_drawing(
         "width": view.width,
         "quality": view.quality,
     }
-    canvas = kept.canvas(scene.model, **look)
     renderer = SceneRenderer(scene.model, camera=camera, canvas=canvas, **look)
     replay = _CameraReplay(renderer, camera, np.zeros((2, 3)))
     return Drawing(scene, [replay], contextlib.ExitStack())
 
 
-def open_drawing(drawing: Mapping[str, Any], kept: KeptCanvas) -> Drawing:
+def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
     """Return what is described, for a worker, in plain JSON.
 
     Args:
         drawing: `trajectory` (a path), or `states` (a directory) and `spec`; and
             `view`; and, of a trajectory, `cameras`.
-        kept: what to draw on.
+        canvas: what to draw with.
     """
     log_mujoco_warnings()
     view = View(**drawing["view"])
     if "trajectory" in drawing:
         path, cameras = Path(drawing["trajectory"]), drawing.get("cameras")
-        return trajectory_drawing(path, view, cameras=cameras, kept=kept)
-    return states_drawing(Path(drawing["states"]), drawing["spec"], view, kept=kept)
+        return trajectory_drawing(path, view, cameras=cameras, canvas=canvas)
+    states = Path(drawing["states"])
+    return states_drawing(states, drawing["spec"], view, canvas=canvas)
 
 
 def _camera(model: Any, camera: Any) -> Camera:

@@ -85,7 +85,7 @@ class WorkerPool:
 
     Attributes:
         limit: how many of them draw the next job, up to `count`. The others stay.
-        gl_facts: who draws, as `gl_info.current_gl_facts`; empty before the first
+        gl_facts: who draws, as `gl_context.current_gl_facts`; empty before the first
             frame.
     """
 
@@ -291,7 +291,7 @@ class WorkerPool:
             try:
                 self._take_in(worker)
             except EOFError:
-                self._lose(worker, "died", worker.child.last_words())
+                self._lose(worker, "died", f"it {worker.child.last_words()}")
             except BaseException:
                 # Ctrl-C, in the midst of a message: what follows makes no sense.
                 worker.end()

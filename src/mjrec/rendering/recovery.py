@@ -6,17 +6,70 @@ from __future__ import annotations
 import math
 import numbers
 import os
+import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import DirectoryNotWritable, InvalidArgument
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.second_names import give_all_second_names
-from .killed_leftovers import Remains, has_work, is_open, model_leftovers, remains_of
-from .recovery_report import Recovery
+from .leftovers import Leftovers, leftovers_in, model_leftovers
 
 # One recovery of a directory at a time.
 _LOCK = ".openaigym.recover.lock"
 _SECONDS = 5.0
+
+
+@dataclass(frozen=True)
+class RecoveredFile:
+    """A file, and its state after a recovery.
+
+    Attributes:
+        name: its base name, in the end.
+        what: what was done, in words.
+    """
+
+    name: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.what}"
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What `recover` did. It is false where there was nothing to do.
+
+    Attributes:
+        directory: the directory.
+        files: what was put in order.
+        failures: what could not be, and why. It stays as it was.
+        open_monitors: infixes of the monitors that are still recording, and whose
+            files were left alone.
+    """
+
+    directory: Path
+    files: tuple[RecoveredFile, ...] = ()
+    failures: tuple[RecoveredFile, ...] = ()
+    open_monitors: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.files or self.failures)
+
+    def __str__(self) -> str:
+        if not self:
+            lines = [f"Nothing to recover in {self.directory}."]
+        elif not self.files:
+            lines = [f"Nothing could be recovered in {self.directory}."]
+        else:
+            lines = [f"Recovered in {self.directory}:"]
+        lines += [f"  {file}" for file in self.files]
+        if self.failures:
+            lines += ["Not recovered:", *(f"  {file}" for file in self.failures)]
+        if self.open_monitors:
+            listed = ", ".join(self.open_monitors)
+            lines += [f"Still recording, and left alone: {listed}."]
+        return "\n".join(lines)
 
 
 def recover(
@@ -27,7 +80,7 @@ def recover(
     Videos that were recorded live get their names, and metadata that says
     `complete: false` and `reason: "killed"`; logs become trajectories that say the
     same; statistics and manifest are made of the journal; unfinished files that
-    nobody will finish are removed. What was to be rendered stays pending: `mjrec
+    no process will finish are removed. What was to be rendered stays pending: `mjrec
     render DIR`. Files of monitors that are open, and of renderers at work, are left
     alone. `docs/reliability.md` has the details.
 
@@ -47,56 +100,56 @@ def recover(
         DirectoryNotWritable: it is read-only, and something is to be done.
     """
     path = Path(directory).absolute()
-    seconds = _check_timeout(timeout)
+    is_number = isinstance(timeout, numbers.Real) and not isinstance(timeout, bool)
+    if not is_number or not 0 <= timeout < math.inf:
+        raise InvalidArgument(
+            f"timeout must be a number of seconds, 0 or more, got {timeout!r}."
+        )
+    deadline = time.monotonic() + timeout
     if not path.is_dir():
         raise InvalidArgument(f"There is no directory {path} to recover.")
-    dead, open_monitors = _sorted_out(path)
-    # Whoever is recovering holds the locks of the dead, who look alive meanwhile.
+    dead, open_monitors = _dead_and_open(path)
+    # A recovering process holds the locks of the dead, who look alive meanwhile.
     if not (dead or model_leftovers(path) or is_locked(path / _LOCK)):
         return Recovery(path, open_monitors=open_monitors)
     # Not at the top: it loads HDF5, which a simulation that goes on where a closed
     # monitor left off has no use for.
-    from .killed_monitors import KilledMonitors
+    from .dead_monitors import Report, put_in_order
 
-    if not os.access(path, os.W_OK | os.X_OK):
-        raise DirectoryNotWritable(path, "permission denied")
+    report = Report(deadline=deadline)
     try:
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise PermissionError(0, "permission denied")
         lock = wait_for_lock(path / _LOCK, f"{os.getpid()}\n")
     except OSError as error:
         raise DirectoryNotWritable(path, error.strerror) from error
     try:
         # Once more, because another process may have done it meanwhile.
-        dead, open_monitors = _sorted_out(path)
-        killed_monitors = KilledMonitors(path, seconds=seconds)
-        for remains in dead:
-            killed_monitors.put_in_order(remains.infix)
-        killed_monitors.sweep_models()
+        dead, open_monitors = _dead_and_open(path)
+        for leftovers in dead:
+            put_in_order(leftovers, report)
+        for part in model_leftovers(path):
+            report.remove(part)
         give_all_second_names(path)
     finally:
         lock.release()
-    files, failures = tuple(killed_monitors.files), tuple(killed_monitors.failures)
+    files, failures = (
+        tuple(RecoveredFile(name, what) for name, what in each)
+        for each in (report.files, report.failures)
+    )
     return Recovery(path, files, failures, open_monitors)
 
 
-def _check_timeout(timeout: object) -> float:
-    is_number = isinstance(timeout, numbers.Real) and not isinstance(timeout, bool)
-    if not is_number or not 0 <= timeout < math.inf:  # type: ignore[operator]  # is_number
-        raise InvalidArgument(
-            f"timeout must be a number of seconds, 0 or more, got {timeout!r}."
-        )
-    return float(timeout)  # type: ignore[arg-type]  # is_number
-
-
-def _sorted_out(directory: Path) -> tuple[list[Remains], tuple[str, ...]]:
+def _dead_and_open(directory: Path) -> tuple[list[Leftovers], tuple[str, ...]]:
     """Return the monitors to be put in order, and the infixes of those open."""
-    dead: list[Remains] = []
+    dead: list[Leftovers] = []
     still_open: list[str] = []
-    for remains in remains_of(directory):
+    for leftovers in leftovers_in(directory):
         try:
-            if is_open(remains):
-                still_open.append(str(remains.infix))
-            elif has_work(remains):
-                dead.append(remains)
+            if leftovers.is_open:
+                still_open.append(str(leftovers.infix))
+            elif leftovers.has_work:
+                dead.append(leftovers)
         except OSError as error:
             raise DirectoryNotWritable(directory, error.strerror) from error
     return dead, tuple(still_open)

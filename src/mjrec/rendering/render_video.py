@@ -21,7 +21,7 @@ from ..annotation import Caption, check_annotation
 from ..errors import EncoderError, NoPictures
 from ..formats.journal import KILLED
 from ..formats.second_names import give_second_names, take_second_names
-from ..formats.unfinished_video import VideoFile
+from ..formats.video_file import VideoFile
 from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
 from ..formats.video_names import second_name_of
 from ..formats.video_sink import VideoSink

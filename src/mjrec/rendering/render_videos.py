@@ -13,9 +13,9 @@ from typing import Any, Self
 
 from ..annotation import check_annotation
 from ..engines.work import Engine
-from ..errors import InvalidArgument, UnreadableFile
+from ..errors import InvalidArgument
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
-from ..formats.spans import is_in_flight, list_paths, read_list
+from ..formats.spans import is_in_flight
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine, given_engine
@@ -242,17 +242,9 @@ def _afterwards(
     Of a whole directory, what killed monitors left is put in order too.
     """
     bring_up_to_date(directory)
-    if not target.is_dir() or episode is not None:
-        return
-    for path in list_paths(directory):
-        try:
-            read_list(path)
-        except UnreadableFile as error:
-            if path.exists():
-                reason = str(error)
-                yield Outcome(name=path.name, directory=directory, failure=reason)
-    for file in recover(directory).failures:
-        yield Outcome(name=file.name, directory=directory, failure=file.what)
+    if target.is_dir() and episode is None:
+        for file in recover(directory).failures:
+            yield Outcome(name=file.name, directory=directory, failure=file.what)
 
 
 def _trusting(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:

@@ -34,8 +34,8 @@ from typing import Any
 import numpy as np
 
 from ..child_python import carried, say_stacks_when_asked, take_standard_output
-from ..simulation.canvas import KeptCanvas
-from ..simulation.gl_probe import try_backend
+from ..simulation.gl_probe import draw_test_scene
+from ..simulation.renderer import Canvas
 from .drawing import open_drawing
 from .pool import FRAME, HEADER, TEXT, TRY
 
@@ -52,16 +52,16 @@ def main() -> None:
     threading.Thread(target=_read, args=[orders], daemon=True).start()
     if TRY in sys.argv[1:]:
         try:
-            try_backend(os.environ["MUJOCO_GL"])
+            draw_test_scene()
         except Exception as error:
             answers.say(untried=str(error))
             # Not `sys.exit`, which would wait for the driver.
             os._exit(1)
-    kept = KeptCanvas()
+    canvas = Canvas()
     while True:
         order = orders.get()
         try:
-            _draw(order, kept, answers)
+            _draw(order, canvas, answers)
         except Exception as error:
             answers.say(error=carried(error))
 
@@ -74,8 +74,8 @@ def _read(orders: queue.SimpleQueue[dict[str, Any]]) -> None:
     os._exit(0)
 
 
-def _draw(order: Mapping[str, Any], kept: KeptCanvas, answers: _Answers) -> None:
-    with contextlib.closing(open_drawing(order["drawing"], kept)) as drawing:
+def _draw(order: Mapping[str, Any], canvas: Canvas, answers: _Answers) -> None:
+    with contextlib.closing(open_drawing(order["drawing"], canvas)) as drawing:
         answers.say(size=drawing.size, gl=drawing.gl_facts)
         frame = np.empty((*drawing.size, 3), np.uint8)
         for first, step, count in order["runs"]:

@@ -26,7 +26,6 @@ from ..evaluation.summaries import AcrossTasks, Bootstrap, TaskSummary
 from ..results.episodes import episodes_of
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
-from ..results.recorded_environment import recorded_env_info
 from .contents import EpisodeColumns, ReportContents, ReportTask, ReportVideo, Verdict
 from .episode_columns import (
     EpisodeRows,
@@ -424,13 +423,7 @@ class _Gathering:
         yield from map(MonitorResults, filter(_has_something, found))
 
     def _environment(self, monitor: MonitorResults) -> str:
-        try:
-            info = monitor.env_info or {}
-        except UnreadableFile:
-            # Its episodes cannot be read either, and then that is said. There may be
-            # videos.
-            info = recorded_env_info(monitor.files, None) or {}
-        name = info.get("env_id")
+        name = (monitor.env_info or {}).get("env_id")
         is_name = isinstance(name, str) and name
         return str(name)[:_LONGEST_NAME] if is_name else _UNKNOWN_ENVIRONMENT
 

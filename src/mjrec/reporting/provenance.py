@@ -18,8 +18,8 @@ from ..errors import Error, UnreadableFile
 from ..evaluation.kept_episodes import keep_rule
 from ..evaluation.plan import SEEDED, EvaluationPlan
 from ..evaluation.results_files import ReadResults
+from ..formats.manifest import GYM_VERSION
 from ..results.journal_or_stats import MonitorResults
-from ..results.recorded_environment import GYM_VERSION
 from .contents import EpisodeColumns
 from .recorded_videos import RecordedVideo
 
@@ -175,10 +175,7 @@ def _in_words(versions: Any) -> str | None:
 
 
 def _gym(monitor: MonitorResults) -> str | None:
-    try:
-        version = (monitor.env_info or {}).get("gym_version")
-    except UnreadableFile:
-        return None
+    version = (monitor.env_info or {}).get("gym_version")
     if not isinstance(version, str) or version == GYM_VERSION:
         return None
     return f"gym {_short(version)}"

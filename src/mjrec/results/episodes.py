@@ -3,22 +3,21 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
-from ..formats.journal import MOST_EPISODES, JournalEntry, read_journal
-from ..formats.spans import find_recording
+from ..formats.journal import JournalEntry, read_journal
 from ..formats.stats_file import StatsFile
 from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles, monitors_of
-from .numbering import NumberedEpisode, number_episodes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Episode:
     """One completed episode.
 
@@ -42,26 +41,23 @@ class Episode:
         metadata: its video's metadata, where there is one.
         trajectory: its recorded states, where there are some. The file may not be
             there yet: `load_trajectory` reads what a log has of it so far.
-        pending: its video is promised and not there; `mjrec render` makes it. Where a
-            monitor was killed, a finished trajectory without a video counts as a
-            promise, though its monitor may have recorded no videos: that stands inside
-            the file, which is not opened here.
-        success: what the environment said of it; None also where nobody wrote it down.
+        pending: its video is promised and not there; `mjrec render` makes it.
+        success: what the environment said of it.
     """
 
     episode_id: int
     length: int
     reward: float
     type: str
-    start_time: float | None
+    start_time: float | None = None
     end_time: float
-    seed: Any
-    options: Any
-    terminated: bool | None
-    truncated: bool | None
+    seed: Any = None
+    options: Any = None
+    terminated: bool | None = None
+    truncated: bool | None = None
     monitor: str
-    video: Path | None
-    metadata: Path | None
+    video: Path | None = None
+    metadata: Path | None = None
     trajectory: Path | None = None
     pending: bool = False
     success: bool | None = None
@@ -105,129 +101,91 @@ def episodes_of(results: MonitorResults) -> Iterator[Episode]:
     Raises:
         UnreadableFile: its files are damaged, and no other has the same episodes.
     """
-    if results.files.journal is None and not results.details:
-        yield from _from_gym(results)
-    elif results.journal_count >= max(results.saved_count, 0):
-        yield from _from_journal(results)
+    saved, journal, count = results.saved, results.files.journal, results.run.count
+    entries = read_journal(journal) if journal and (count or not saved) else iter(())
+    if saved is None or count >= len(saved.timestamps):
+        for entry in entries:
+            yield _of_journal(results, entry)
+    elif journal is None and not results.details:
+        yield from _of_gym(results, saved)
     else:
-        yield from _from_stats(results)
+        yield from _of_both(results, saved, entries)
 
 
-def _from_journal(results: MonitorResults) -> Iterator[Episode]:
-    assert results.files.journal is not None
-    for entry in read_journal(results.files.journal):
-        yield _journaled(results, entry)
+def _of_journal(results: MonitorResults, entry: JournalEntry) -> Episode:
+    facts = {k: v for k, v in vars(entry).items() if k not in ("chosen", "recording")}
+    return Episode(**facts, **_files(results, entry.episode_id))
 
 
-def _journaled(results: MonitorResults, entry: JournalEntry) -> Episode:
-    files = results.files
-    return Episode(
-        episode_id=entry.episode_id,
-        length=entry.length,
-        reward=entry.reward,
-        type=entry.type,
-        start_time=entry.start_time,
-        end_time=entry.end_time,
-        seed=entry.seed,
-        options=entry.options,
-        terminated=entry.terminated,
-        truncated=entry.truncated,
-        monitor=files.infix,
-        video=files.videos.get(entry.episode_id),
-        metadata=files.metadata.get(entry.episode_id),
-        trajectory=files.trajectories.get(entry.episode_id),
-        pending=_is_pending(results, entry.episode_id),
-        success=entry.success if isinstance(entry.success, bool) else None,
-    )
+def _of_both(
+    results: MonitorResults, stats: StatsFile, entries: Iterable[JournalEntry]
+) -> Iterator[Episode]:
+    """Yield the episodes of a statistics file of which a journal lacks some.
 
-
-def _from_stats(results: MonitorResults) -> Iterator[Episode]:
-    """Yield what a statistics file of this package has and the journal lacks."""
-    stats = results.saved
-    if stats is None:
-        return
-    first = _episode_number(results.details.get("first_episode_id"))
-    for numbered in number_episodes(
-        stats,
-        _readable_entries(results),
-        first=0 if first is None else first,
-        following=_episode_number(results.details.get("next_episode_id")),
+    The neighbours in the journal often leave just as many numbers as are missing.
+    """
+    # Both are written from the same numbers, which JSON gives back exactly.
+    by_end = {(entry.end_time, entry.length): entry for entry in entries}
+    ends = zip(stats.timestamps, stats.episode_lengths, strict=True)
+    matches = [by_end.pop(end, None) for end in ends]
+    following = results.details.get("next_episode_id")
+    low = results.details.get("first_episode_id", 0)
+    for is_missing, group in itertools.groupby(
+        range(len(matches)), key=lambda index: matches[index] is None
     ):
-        if numbered.entry is not None:
-            yield _journaled(results, numbered.entry)
-        else:
-            yield _saved(results, stats, numbered)
+        indices = list(group)
+        if not is_missing:
+            for index in indices:
+                entry = matches[index]
+                assert entry is not None
+                yield _of_journal(results, entry)
+                low = entry.episode_id + 1
+            continue
+        after = next(iter(matches[indices[-1] + 1 :]), None)
+        high = following if after is None else after.episode_id
+        is_certain = high is not None and high - low == len(indices)
+        for number, index in enumerate(indices, start=low):
+            yield _of_stats(results, stats, index, number, is_certain=is_certain)
 
 
-def _readable_entries(results: MonitorResults) -> Iterator[JournalEntry]:
-    if results.files.journal is not None and results.journal_count > 0:
-        yield from read_journal(results.files.journal)
-
-
-def _saved(
-    results: MonitorResults, stats: StatsFile, numbered: NumberedEpisode
-) -> Episode:
-    number = numbered.episode_id
-    # A video is never shown for another episode.
-    files = results.files if numbered.is_certain else MonitorFiles("", ())
-    return Episode(
-        episode_id=number,
-        length=stats.episode_lengths[numbered.index],
-        reward=stats.episode_rewards[numbered.index],
-        type=_types(stats)[numbered.index],
-        start_time=None,
-        end_time=stats.timestamps[numbered.index],
-        seed=None,
-        options=None,
-        terminated=None,
-        truncated=None,
-        monitor=results.files.infix,
-        video=files.videos.get(number),
-        metadata=files.metadata.get(number),
-        trajectory=files.trajectories.get(number),
-        pending=numbered.is_certain and _is_pending(results, number),
-    )
-
-
-def _from_gym(results: MonitorResults) -> Iterator[Episode]:
-    stats = results.saved
-    if stats is None:
-        return
+def _of_gym(results: MonitorResults, stats: StatsFile) -> Iterator[Episode]:
     # Gym noted a type at each reset, and numbered the videos by resets. One more than
     # episodes is the last one, which did not end; two more are resets in a row.
-    is_numbered = len(_types(stats)) <= len(stats.timestamps) + 1
+    is_certain = len(stats.episode_types or ()) <= len(stats.timestamps) + 1
     for index in range(len(stats.timestamps)):
-        yield _saved(results, stats, NumberedEpisode(index, index, is_numbered, None))
+        yield _of_stats(results, stats, index, index, is_certain=is_certain)
 
 
-def _types(stats: StatsFile) -> Sequence[str]:
-    types = stats.episode_types
-    return ("t",) * len(stats.timestamps) if types is None else types
+def _of_stats(
+    results: MonitorResults,
+    stats: StatsFile,
+    index: int,
+    number: int,
+    *,
+    is_certain: bool,
+) -> Episode:
+    # A video is never shown for another episode.
+    files = _files(results, number) if is_certain else {"monitor": results.files.infix}
+    return Episode(
+        episode_id=number,
+        length=stats.episode_lengths[index],
+        reward=stats.episode_rewards[index],
+        type=stats.episode_types[index] if stats.episode_types else "t",
+        end_time=stats.timestamps[index],
+        **files,
+    )
 
 
-def _is_pending(results: MonitorResults, episode_id: int) -> bool:
-    """Tell whether an episode's video is promised and not there."""
+def _files(results: MonitorResults, number: int) -> dict[str, Any]:
     files = results.files
-    trajectory = files.trajectories.get(episode_id)
+    video, metadata = files.videos.get(number), files.metadata.get(number)
+    trajectory = files.trajectories.get(number)
     # Metadata without a video is what is left of one that could not be made.
-    if trajectory is None or episode_id in files.videos or episode_id in files.metadata:
-        return False
-    known = _episode_number(results.details.get("next_episode_id")) or 0
-    # The last one was running when the manifest was written that it outlived.
-    if episode_id < known - (results.is_behind and results.saved is not None):
-        return episode_id in results.pending_ids
-    # Its monitor is open, or was killed.
-    return trajectory.exists() or _says_deferred(trajectory)
-
-
-def _episode_number(value: object) -> int | None:
-    return value if type(value) is int and 0 <= value <= MOST_EPISODES else None
-
-
-def _says_deferred(trajectory: Path) -> bool:
-    try:
-        recording = find_recording(trajectory)
-    except UnreadableFile:
-        return False
-    video = None if recording is None else recording.facts.get("video")
-    return isinstance(video, dict) and video.get("recording") == "deferred"
+    is_missing = trajectory is not None and video is None and metadata is None
+    return {
+        "monitor": files.infix,
+        "video": video,
+        "metadata": metadata,
+        "trajectory": trajectory,
+        "pending": is_missing and number in results.promised,
+    }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of a monitor's files its statistics are taken from.
+"""Which of a monitor's files its results are taken from.
 
 A monitor writes each episode twice: into its journal as the episode ends, and into its
 statistics file, which belongs to the manifest, when it closes (or at each reset). A
@@ -9,25 +9,31 @@ more episodes wins, and never are episodes taken from both.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import math
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
-from ..formats.journal import JournalReader, count_lines
+from ..formats.journal import JournalEntry, read_journal
+from ..formats.json_fields import json_object
 from ..formats.manifest import Manifest, read_manifest
 from ..formats.stats_file import StatsFile, read_stats_file
 from .monitor_files import MonitorFiles
-from .recorded_environment import recorded_env_info
+from .run import Run
 
 logger = logging.getLogger(__name__)
 
+# A lock holds a line; this bounds what somebody may have put in its place.
+_LONGEST_LOCK = 1 << 16
+
 
 class MonitorResults:
-    """What one monitor counted, as far as its files still tell.
+    """What one monitor recorded, as far as its files still tell.
 
     Where a manifest or a statistics file is damaged or missing, the journal stands in
     for it, and the other way round; the log then has a warning that names the file.
@@ -67,7 +73,9 @@ class MonitorResults:
             UnreadableFile: it is missing though a manifest names it, or damaged, and
                 there is no journal either.
         """
-        path = self._stats_path
+        path = self.files.stats
+        if self.manifest is not None and self.files.manifest is not None:
+            path = self.files.manifest.with_name(self.manifest.stats)
         if path is None:
             return None
         try:
@@ -76,27 +84,65 @@ class MonitorResults:
             self._without(error)
             return None
 
+    @functools.cached_property
+    def run(self) -> Run:
+        """What the journal says; where there is none, a run without a fact.
+
+        Raises:
+            UnreadableFile: it cannot be read, and there are no statistics either.
+        """
+        if self.files.journal is None:
+            return Run()
+        try:
+            return Run.read(self.files.journal)
+        except UnreadableFile as error:
+            if self.saved is None:
+                raise
+            self._say(error, "statistics file")
+            return Run()
+
+    @functools.cached_property
+    def promised(self) -> set[int]:
+        """The episodes whose videos are rendered from their states, now or later.
+
+        Raises:
+            UnreadableFile: as `run`.
+        """
+        if self.run.facts or self.manifest is None:
+            return self.run.promised
+        return Run.of_manifest(self.manifest).promised
+
     @property
     def details(self) -> Mapping[str, Any]:
         """What this package adds to a manifest; nothing where there is none."""
         manifest = self.manifest
         return {} if manifest is None or manifest.mjrec is None else manifest.mjrec
 
-    @functools.cached_property
-    def pending_ids(self) -> frozenset[int]:
-        """The numbers of the episodes whose videos the manifest calls pending."""
-        entries = self.details.get("pending")
-        numbers = (
-            entry.get("episode_id")
-            for entry in (entries if isinstance(entries, list) else ())
-            if isinstance(entry, dict)
-        )
-        return frozenset(number for number in numbers if type(number) is int)
-
     @property
     def env_info(self) -> Mapping[str, Any] | None:
-        """What was recorded; None where nothing says it."""
-        return recorded_env_info(self.files, self.manifest)
+        """What was recorded, as manifest, journal or lock say it; None where none."""
+        with contextlib.suppress(UnreadableFile):
+            if self.manifest is not None:
+                return self.manifest.env_info
+        run: Mapping[str, Any] = {}
+        with contextlib.suppress(UnreadableFile):
+            run = self.run.facts
+        if not run.get("env_info") and self.files.lock is not None:
+            with contextlib.suppress(OSError, ValueError):
+                run = locked_run(self.files.lock)
+        info = run.get("env_info")
+        is_info = isinstance(info, Mapping) and isinstance(info.get("env_id"), str)
+        return info if is_info else None
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the journal has episodes that the statistics file lacks.
+
+        Raises:
+            UnreadableFile: the journal cannot be read, and there are no statistics.
+        """
+        saved = self.saved
+        return saved is None or self.run.count > len(saved.timestamps)
 
     def stats(self) -> StatsFile:
         """Return the statistics of the source with more episodes.
@@ -106,54 +152,8 @@ class MonitorResults:
         """
         saved, journal = self.saved, self.files.journal
         if journal is not None and self.is_behind:
-            return _stats_of(journal, saved)
+            return _stats_of([*read_journal(journal)], saved)
         return StatsFile(None, (), (), (), ()) if saved is None else saved
-
-    @functools.cached_property
-    def journal_count(self) -> int:
-        """How many episodes the journal has; -1 where there is none to read.
-
-        Raises:
-            UnreadableFile: it cannot be read, and there are no statistics either.
-        """
-        return self._of_journal(_count_episodes)
-
-    @property
-    def saved_count(self) -> int:
-        """How many episodes the statistics file has; -1 where there is none to read."""
-        return -1 if self.saved is None else len(self.saved.timestamps)
-
-    @functools.cached_property
-    def is_behind(self) -> bool:
-        """Whether the journal has episodes that the statistics file lacks.
-
-        Raises:
-            UnreadableFile: as `journal_count`.
-        """
-        # A closed monitor's journal need not be understood for that.
-        return (
-            self._of_journal(count_lines) > self.saved_count
-            and self.journal_count > self.saved_count
-        )
-
-    def _of_journal(self, count: Callable[[Path], int]) -> int:
-        if self.files.journal is None:
-            return -1
-        try:
-            return count(self.files.journal)
-        except UnreadableFile as error:
-            if self.saved is None:
-                raise
-            self._say(error, "statistics file")
-            return -1
-
-    @property
-    def _stats_path(self) -> Path | None:
-        if self.manifest is None:
-            # A process that died between writing the two.
-            return self.files.stats
-        assert self.files.manifest is not None
-        return self.files.manifest.with_name(self.manifest.stats)
 
     def _without(self, error: UnreadableFile) -> None:
         if self.files.journal is None:
@@ -166,30 +166,32 @@ class MonitorResults:
             logger.warning("%s Its monitor's %s is used instead.", error, instead)
 
 
-def _count_episodes(journal: Path) -> int:
-    reader = JournalReader(journal)
-    for _ in reader:
-        pass
-    return reader.count
+def locked_run(path: Path) -> Mapping[str, Any]:
+    """Return what the lock of a monitor says of its run.
+
+    Raises:
+        OSError, ValueError: it cannot be read.
+    """
+    # Empty for a moment after it was made. A link is nobody's lock.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        run = json_object(os.read(descriptor, _LONGEST_LOCK)).get("run")
+    finally:
+        os.close(descriptor)
+    return run if isinstance(run, Mapping) else {}
 
 
-def _stats_of(journal: Path, saved: StatsFile | None) -> StatsFile:
+def _stats_of(entries: list[JournalEntry], saved: StatsFile | None) -> StatsFile:
     """Return the statistics that a journal amounts to."""
-    starts: list[float] = []
-    ends: list[float] = []
-    lengths: list[int] = []
-    rewards: list[float] = []
-    types: list[str] = []
-    reader = JournalReader(journal)
-    for entry in reader:
-        starts.append(entry.start_time)
-        ends.append(entry.end_time)
-        lengths.append(entry.length)
-        rewards.append(entry.reward)
-        types.append(entry.type)
-    reader.report()
     # The first reset may have been one whose episode never ended.
     start = None if saved is None else saved.initial_reset_timestamp
     if start is None:
+        starts = (entry.start_time for entry in entries)
         start = min((s for s in starts if not math.isnan(s)), default=None)
-    return StatsFile(start, tuple(ends), tuple(lengths), tuple(rewards), tuple(types))
+    return StatsFile(
+        initial_reset_timestamp=start,
+        timestamps=tuple(entry.end_time for entry in entries),
+        episode_lengths=tuple(entry.length for entry in entries),
+        episode_rewards=tuple(entry.reward for entry in entries),
+        episode_types=tuple(entry.type for entry in entries),
+    )

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import os
@@ -10,13 +11,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..formats.manifest import GYM_VERSION
 from ..formats.stats_file import StatsFile, read_stats_file
 from ..formats.video_metadata import is_broken
 from .journal_or_stats import MonitorResults
-from .monitor_files import MonitorFiles, monitors_of
-from .recorded_environment import GYM_VERSION
+from .monitor_files import monitors_of
 
 logger = logging.getLogger(__name__)
+
+# Of gym's `load_results`, in its order.
+_KEYS = (
+    *("manifests", "env_info", "data_sources", "timestamps", "episode_lengths"),
+    *("episode_rewards", "episode_types", "initial_reset_timestamps"),
+    *("initial_reset_timestamp", "videos"),
+)
 
 
 class MergedStats(NamedTuple):
@@ -76,25 +84,22 @@ def load_results(directory: str | os.PathLike[str]) -> dict[str, Any] | None:
     if not directory.is_dir():
         logger.error("There is no directory %s.", directory)
         return None
-    monitors = [files for files in monitors_of(directory) if _has_results(files)]
+    monitors = [
+        each for each in monitors_of(directory) if each.manifest or each.journal
+    ]
     if not monitors:
         logger.error("There are no manifests in %s, and no journals.", directory)
         return None
     # In the order of the manifests' names, as gym has it.
-    kept = [_kept(MonitorResults(files)) for files in sorted(monitors, key=_gyms_order)]
-    merged = _merge([each.stats for each in kept])
-    return {
+    monitors.sort(key=lambda files: f"{files.infix}.manifest.json")
+    kept = [_kept(MonitorResults(files)) for files in monitors]
+    found = {
         "manifests": [each.path for each in kept],
         "env_info": _env_info(directory, kept),
-        "data_sources": merged.data_sources,
-        "timestamps": merged.timestamps,
-        "episode_lengths": merged.episode_lengths,
-        "episode_rewards": merged.episode_rewards,
-        "episode_types": merged.episode_types,
-        "initial_reset_timestamps": merged.initial_reset_timestamps,
-        "initial_reset_timestamp": merged.initial_reset_timestamp,
+        **_merge([each.stats for each in kept])._asdict(),
         "videos": _videos(directory, kept),
     }
+    return {key: found[key] for key in _KEYS}
 
 
 def merge_stats_files(paths: Iterable[str | os.PathLike[str]]) -> MergedStats:
@@ -126,58 +131,43 @@ def _kept(results: MonitorResults) -> _Kept:
     )
 
 
-class _Row(NamedTuple):
-    source: int
-    timestamp: float
-    length: int
-    reward: float
-    type: str
-
-
 def _merge(files: Sequence[StatsFile]) -> MergedStats:
     rows = [row for source, stats in enumerate(files) for row in _rows(source, stats)]
     # NaN, which is not less or greater than anything, comes last.
-    rows.sort(key=lambda row: (math.isnan(row.timestamp), row.timestamp))
+    rows.sort(key=lambda row: (math.isnan(row[1]), row[1]))
+    sources, times, lengths, rewards, types = (
+        [row[column] for row in rows] for column in range(5)
+    )
     with_episodes = [stats for stats in files if stats.timestamps]
     has_types = any(stats.episode_types is not None for stats in with_episodes)
     starts = [stats.initial_reset_timestamp for stats in with_episodes]
     return MergedStats(
-        data_sources=[row.source for row in rows],
+        data_sources=sources,
         initial_reset_timestamps=[stats.initial_reset_timestamp for stats in files],
-        timestamps=[row.timestamp for row in rows],
-        episode_lengths=[row.length for row in rows],
-        episode_rewards=[row.reward for row in rows],
-        episode_types=[row.type for row in rows] if has_types else None,
+        timestamps=times,
+        episode_lengths=lengths,
+        episode_rewards=rewards,
+        episode_types=types if has_types else None,
         initial_reset_timestamp=min(
             (start for start in starts if start is not None), default=0
         ),
     )
 
 
-def _rows(source: int, stats: StatsFile) -> Iterable[_Row]:
-    count = len(stats.timestamps)
+def _rows(source: int, stats: StatsFile) -> Iterable[tuple[Any, ...]]:
     # Before there were types every episode was a training episode. Gym noted a type
-    # at each reset, also of an episode that never ended.
-    types = ("t",) * count if stats.episode_types is None else stats.episode_types
-    return map(
-        _Row._make,
-        zip(
-            [source] * count,
-            stats.timestamps,
-            stats.episode_lengths,
-            stats.episode_rewards,
-            types[:count],
-            strict=True,
-        ),
+    # at each reset, also of an episode that never ended, so there may be more.
+    types = (
+        itertools.repeat("t") if stats.episode_types is None else stats.episode_types
     )
-
-
-def _has_results(files: MonitorFiles) -> bool:
-    return files.manifest is not None or files.journal is not None
-
-
-def _gyms_order(files: MonitorFiles) -> str:
-    return f"{files.infix}.manifest.json"
+    return zip(
+        itertools.repeat(source),
+        stats.timestamps,
+        stats.episode_lengths,
+        stats.episode_rewards,
+        types,
+        strict=False,
+    )
 
 
 def _env_info(directory: Path, monitors: Sequence[_Kept]) -> dict[str, Any]:
@@ -186,13 +176,14 @@ def _env_info(directory: Path, monitors: Sequence[_Kept]) -> dict[str, Any]:
     if not known:
         return {"gym_version": GYM_VERSION}
     newest = max(known, key=lambda each: _last_time(each.stats))
-    infos = [each.env_info or {} for each in known]
-    if any(info != newest.env_info for info in infos):
+    infos = {Path(each.path).name: each.env_info or {} for each in known}
+    if any(info != newest.env_info for info in infos.values()):
+        keys = dict.fromkeys(key for info in infos.values() for key in info)
         logger.warning(
             "The monitors of %s recorded different things: %s. Their results are "
             "merged; env_info is that of %s.",
             directory,
-            _differences([each.path for each in known], infos),
+            "; ".join(filter(None, (_difference(key, infos) for key in keys))),
             Path(newest.path).name,
         )
     return dict(newest.env_info or {})
@@ -203,23 +194,13 @@ def _last_time(stats: StatsFile) -> float:
     return max((time for time in times if not math.isnan(time)), default=-math.inf)
 
 
-def _differences(paths: Sequence[str], infos: Sequence[Mapping[str, Any]]) -> str:
-    keys = dict.fromkeys(key for info in infos for key in info)
-    return "; ".join(
-        text for key in keys if (text := _difference(key, paths, infos)) is not None
-    )
-
-
-def _difference(
-    key: str, paths: Sequence[str], infos: Sequence[Mapping[str, Any]]
-) -> str | None:
+def _difference(key: str, infos: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return which values a key has, and a file for each; empty where it has one."""
     values: dict[str, str] = {}
-    for path, info in zip(paths, infos, strict=True):
-        value = repr(info[key]) if key in info else "missing"
-        values.setdefault(value, Path(path).name)
-    if len(values) == 1:
-        return None
-    return f"{key} is " + ", ".join(f"{v} in {name}" for v, name in values.items())
+    for name, info in infos.items():
+        values.setdefault(repr(info[key]) if key in info else "missing", name)
+    listed = ", ".join(f"{value} in {name}" for value, name in values.items())
+    return f"{key} is {listed}" if len(values) > 1 else ""
 
 
 def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]:
@@ -242,19 +223,13 @@ def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]
 
 def _names_of_videos(results: MonitorResults) -> list[tuple[str, str]]:
     """Return what the manifest lists, and what was finished after it was written."""
-    manifest = results.manifest
+    manifest, files = results.manifest, results.files
     listed = [] if manifest is None else list(manifest.videos)
     if manifest is None or results.is_behind:
-        found = _finished_videos(results.files)
         # A video gets its name when it is whole, and its metadata after that.
-        known = set(listed)
-        listed += [pair for pair in found if pair not in known]
-    return listed
-
-
-def _finished_videos(files: MonitorFiles) -> list[tuple[str, str]]:
-    return [
-        (files.videos[number].name, files.metadata[number].name)
-        for number in sorted(files.videos.keys() & files.metadata.keys())
-        if not is_broken(files.metadata[number])
-    ]
+        listed += [
+            (files.videos[number].name, files.metadata[number].name)
+            for number in sorted(files.videos.keys() & files.metadata.keys())
+            if not is_broken(files.metadata[number])
+        ]
+    return list(dict.fromkeys(listed))

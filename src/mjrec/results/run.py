@@ -2,12 +2,13 @@
 """A run, as its journal tells it.
 
 The monitor adds each event to its `Run` when it writes it down; every other process
-reads the same events from the journal. So a manifest made while the run goes on and
-one made years later follow from the same facts.
+reads the same events from the journal. So results and manifests that are made while the
+run goes on and years later follow from the same facts.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,8 @@ from typing import Any
 
 from ..formats.journal import MOST_EPISODES, JournalEntry, JournalReader
 from ..formats.json_fields import base_name
+from ..formats.manifest import Manifest
+from ..formats.monitor_directory import episode_of
 
 
 @dataclass
@@ -25,14 +28,15 @@ class Run:
         facts: what the journal's first line says: `env_info`, `schedule` (its name),
             `keep` (`rule`, `left_open`), `first_episode_id`, `versions`, and `views`,
             what the names of further cameras' videos have before their ending.
-        surroundings: what was around it; None where that is not known.
+        surroundings: its provenance; None where that is not known.
+        count: how many episodes were completed.
         last_episode_id: the highest number of an episode that has begun; -1 before.
         chosen: the episodes that the schedule chose.
         filmed: those that have a video of their own, or will have one.
         deferred: those of them whose video is to be rendered from their states.
         clips: the clips, by the names of their videos. One that is to be rendered says
             what its first part is called, `clip`.
-        faults: what could not be recorded, likewise.
+        faults: what could not be recorded.
         keep: the latest word on which videos are kept; None before there is one.
         dropped: episodes whose video fell out, though their trajectory stays.
         recovered: another process has put it in order.
@@ -40,6 +44,7 @@ class Run:
 
     facts: Mapping[str, Any] = field(default_factory=dict)
     surroundings: Mapping[str, Any] | None = None
+    count: int = 0
     last_episode_id: int = -1
     chosen: set[int] = field(default_factory=set)
     filmed: set[int] = field(default_factory=set)
@@ -64,12 +69,55 @@ class Run:
         run.last_episode_id = max(run.last_episode_id, reader.last_episode_id)
         return run
 
+    @classmethod
+    def of_manifest(cls, manifest: Manifest) -> Run:
+        """Return what a manifest says of a run whose journal is gone."""
+        details = manifest.mjrec or {}
+        schedule, keep = details.get("schedule") or {}, details.get("keep")
+        recorded = schedule.get("recorded") or ()
+        run = cls(
+            facts={
+                "env_info": manifest.env_info,
+                "schedule": schedule.get("name"),
+                "first_episode_id": details.get("first_episode_id", 0),
+                "versions": details.get("versions", {}),
+            },
+            surroundings=details.get("surroundings"),
+            last_episode_id=(details.get("next_episode_id") or 0) - 1,
+            chosen=set(recorded),
+            faults=list(details.get("faults") or ()),
+            keep=None if keep is None else {**keep, "recorded": recorded},
+            recovered=bool(details.get("recovered")),
+        )
+        for entry in details.get("pending") or ():
+            if "clip" in entry:
+                run.note("clip", entry)
+            elif (video := named_video(entry)) is not None:
+                run.filmed.add(episode_of(video) or 0)
+        run.deferred = set(run.filmed)
+        metadata = [
+            *(about for _, about in manifest.videos),
+            *(details.get("broken") or ()),
+        ]
+        for name in metadata:
+            run.clips.setdefault(f"{name.removesuffix('.meta.json')}.mp4", {})
+        return run
+
+    @property
+    def promised(self) -> set[int]:
+        """The episodes whose videos are rendered from their states, now or later."""
+        keep = self.keep or {}
+        if keep.get("decided") is True:
+            return self.deferred & set(keep.get("recorded", ()))
+        return self.deferred - self.dropped
+
     def begin(self, number: int, *, chosen: bool) -> None:
         """Take note of an episode that has begun; the journal hears of its end."""
         self._add(number, chosen, None)
 
     def add(self, entry: JournalEntry) -> None:
         """Take note of a completed episode."""
+        self.count += 1
         self._add(entry.episode_id, entry.chosen, entry.recording)
 
     def note(self, kind: str, facts: Any) -> None:
@@ -84,8 +132,8 @@ class Run:
             case "clip", {"episode_id": int(number), "video": str(video)}:
                 self._add(number, ".step" not in video, None)
                 self._add(facts.get("last_episode_id", -1), False, None)
-                if _is_base_name(video):
-                    self.clips[video] = facts
+                with contextlib.suppress(ValueError):
+                    self.clips[base_name(video)] = facts
             case "dropped", int(number):
                 self.dropped.add(number)
             case "fault", dict():
@@ -111,9 +159,7 @@ class Run:
             self.deferred.add(number)
 
 
-def _is_base_name(name: str) -> bool:
-    try:
-        base_name(name)
-    except ValueError:
-        return False
-    return True
+def named_video(entry: Mapping[str, Any]) -> str | None:
+    """Return the video of this directory that a pending entry names, if it does."""
+    name = entry.get("video")
+    return name if isinstance(name, str) and episode_of(name) is not None else None

@@ -81,7 +81,7 @@ def _vet(path: Path) -> None:
         if not said.get("is_harmless"):
             raise UnreadableFile(
                 path,
-                f"the process that read it {sandbox.what_became_of_it()} (it may "
+                f"the process that read it {sandbox.last_words()} (it may "
                 f"use {memory / 2**30:.1f} GiB of memory and {seconds} seconds)",
             )
 

@@ -18,11 +18,9 @@ goes to standard error.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import ctypes
 import dataclasses
 import faulthandler
-import importlib
 import json
 import os
 import time
@@ -32,8 +30,8 @@ from typing import Any
 
 import numpy as np
 
+from ..gl.egl import egl_devices
 from ..machine import gpu_device_files
-from .gl_info import current_gl_strings, egl_devices
 
 _SIZE = 480
 _SMALL = 96
@@ -98,15 +96,33 @@ def check_picture(picture: np.ndarray) -> None:
             )
 
 
-def try_backend(backend: str) -> None:
-    """Raise unless a backend draws what it should, in a small frame of this process.
+def draw_test_scene(
+    side: int = _SMALL,
+) -> tuple[Callable[[], np.ndarray], dict[str, Any]]:
+    """Draw the test scene and look at the frame.
+
+    At MuJoCo's default quality; where a small frame is enough, without shadows.
+
+    Returns:
+        What draws it again, and what metadata says of who draws.
 
     Raises:
+        WrongPicture: it does not show what it should.
         Exception: of any kind; drivers raise what they like.
     """
-    with contextlib.ExitStack() as closing:
-        draw = _drawing_function(backend, _SMALL, closing=closing)
-        check_picture(draw())
+    # Not at the top: these imports are part of what is tried.
+    import mujoco
+
+    from .renderer import SceneRenderer
+
+    model = mujoco.MjModel.from_xml_string(_SCENE)
+    if side < _SIZE:
+        model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = SceneRenderer(model, height=side, width=side, camera="front")
+    check_picture(renderer.render(data))
+    return lambda: renderer.render(data), renderer.gl_facts
 
 
 def main() -> int:
@@ -144,80 +160,24 @@ def _reporter() -> Callable[..., None]:
 
 
 def _draw_and_report(say: Callable[..., None], backend: str, *, measure: bool) -> None:
-    draw = _drawing_function(backend)
-    check_picture(draw())
-    say(renders=True, **_gl_strings())
+    draw, facts = draw_test_scene(_SIZE)
+    say(renders=True, **facts)
     if measure:
         say(frames_per_second=_frames_per_second(draw))
-    _report_devices(say, backend)
+    _report_devices(say, backend, facts.get("gl_device", {}).get("index"))
 
 
-def _report_devices(say: Callable[..., None], backend: str) -> None:
+def _report_devices(
+    say: Callable[..., None], backend: str, used: int | None = None
+) -> None:
     # Last, because asking for CUDA's numbers begins CUDA, which may fail or hang.
     if backend == "egl":
-        say(devices=[*map(dataclasses.asdict, egl_devices())])
-
-
-def _drawing_function(
-    backend: str, size: int = _SIZE, *, closing: contextlib.ExitStack | None = None
-) -> Callable[[], np.ndarray]:
-    """Return a function that draws the scene.
-
-    At MuJoCo's default quality; where a small frame is enough, without shadows.
-    """
-    # Not at the top: this import is part of what is tried.
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_string(_SCENE)
-    if size < _SIZE:
-        model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    gl_context = _gl_context_class(mujoco, backend)(size, size)
-    gl_context.make_current()
-    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    if closing is not None:
-        # The drawing context first, while OpenGL's is current.
-        closing.callback(gl_context.free)
-        closing.callback(context.free)
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-    scene = mujoco.MjvScene(model, maxgeom=100)
-    camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-    camera.fixedcamid = 0
-    option = mujoco.MjvOption()
-    viewport = mujoco.MjrRect(0, 0, size, size)
-
-    def draw() -> np.ndarray:
-        # The context is named so that it lives as long as this function.
-        gl_context.make_current()
-        picture = np.zeros((size, size, 3), np.uint8)
-        everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
-        mujoco.mjr_render(viewport, scene, context)
-        mujoco.mjr_readPixels(picture, None, viewport, context)
-        return picture[::-1]
-
-    return draw
-
-
-def _gl_context_class(mujoco: Any, backend: str) -> Any:
-    try:
-        return mujoco.GLContext
-    except AttributeError:
-        # Some versions swallow the reason at import; asking again brings it out.
-        if backend:
-            importlib.import_module(f"mujoco.{backend}")
-        raise
-
-
-def _gl_strings() -> dict[str, str]:
-    # Not needed for drawing, so its failure is none.
-    try:
-        importlib.import_module("OpenGL.GL")
-        return current_gl_strings()
-    except Exception:  # PyOpenGL raises what it likes.
-        return {}
+        say(
+            devices=[
+                {**dataclasses.asdict(device), "in_use": device.index == used}
+                for device in egl_devices()
+            ]
+        )
 
 
 def _frames_per_second(draw: Callable[[], np.ndarray]) -> float:

@@ -16,9 +16,9 @@ from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
 from ..formats.trajectory import ModelChange, TrajectoryReader
 from .authored_model import with_embedded_files
 from .cameras import check_camera, raw_model
-from .canvas import is_kept_by_context
 from .fields import apply_fields, read_member
 from .model_store import load_model
+from .renderer import is_kept_by_context
 from .snapshot import restore_snapshot
 from .view import view_from_facts
 

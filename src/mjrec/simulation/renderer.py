@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a simulation from a renderer of our own, beside the environment's."""
+"""Frames of a simulation from a renderer of our own, beside the environment's."""
 
 from __future__ import annotations
 
+import copy
+import hashlib
+import weakref
 from types import TracebackType
 from typing import Any
 
@@ -10,27 +13,160 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..errors import InvalidArgument
 from ..frames import Frame, check_frame, check_quality, check_size
 from .cameras import FREE_CAMERA, Camera, resolve_camera
-from .canvas import Canvas
+from .fields import holder_of
+from .gl_context import GLContext, gl_error, raw_opengl
 
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
+_DRAFT_SHADOW_MAP = 1024
+_MAX_RENDERBUFFER_SIZE = 0x84E8
+
+# Most of a model is read anew for every frame. This was copied to the graphics card, or
+# compiled into a display list, when the context was made. Absent from some versions of
+# mujoco: tex_colorspace.
+_KEPT = (
+    *("hfield_data", "hfield_size"),
+    *("tex_data", "tex_type", "tex_width", "tex_height", "tex_nchannel"),
+    *("tex_colorspace", "mat_texid", "skin_face", "skin_texcoord"),
+    *("mesh_vert", "mesh_normal", "mesh_texcoord", "mesh_graph"),
+    *("mesh_face", "mesh_facenormal", "mesh_facetexcoord"),
+    *("vis.map.fogstart", "vis.map.fogend", "vis.map.haze"),
+    *("vis.map.shadowclip", "vis.map.shadowscale", "vis.rgba.fog", "vis.rgba.haze"),
+    *("vis.quality.shadowsize", "vis.quality.offsamples", "vis.quality.numslices"),
+    *("vis.quality.numstacks", "vis.quality.numquads", "vis.global_.linewidth"),
+)
+# Each plane has a display list; other geoms are scaled as they are drawn.
+_KEPT_OF_PLANES = ("geom_type", "geom_size")
+
+
+def is_kept_by_context(name: str) -> bool:
+    """Tell whether an OpenGL context may keep a field of this name.
+
+    Args:
+        name: of an array of `MjModel` (`tex_data`), or of a member of its structs
+            (`vis.map.haze`).
+    """
+    return name in (*_KEPT, *_KEPT_OF_PLANES)
+
+
+class Canvas:
+    """What scenes are drawn with: an OpenGL context for a model, size and quality.
+
+    It stays as it is from one `prepare` to the next where those three do, and nothing
+    has changed that the context keeps of the model.
+    """
+
+    def __init__(self) -> None:
+        self._context: GLContext | None = None
+        self._kind: object = None
+        self._kept = b""
+
+    @property
+    def gl_facts(self) -> dict[str, Any]:
+        """What metadata says of who draws, as `gl_context.current_gl_facts`."""
+        return {} if self._context is None else self._context.facts
+
+    def prepare(
+        self, model: mujoco.MjModel, *, height: int, width: int, quality: str
+    ) -> None:
+        """Make it ready for scenes of a model.
+
+        Raises:
+            InvalidArgument: a size that the driver cannot draw.
+            ClosedError, GLError: as of `GLContext`.
+        """
+        # Not by what a recording says of its model, which may be a stranger's.
+        buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, buffer)
+        kind = (hashlib.blake2b(buffer.data).digest(), height, width, quality)
+        if kind != self._kind:
+            self._kept = b""
+            self._rectangle = mujoco.MjrRect(0, 0, width, height)
+            self._bottom_up = np.empty((height, width, 3), np.uint8)
+            self._quality = quality
+        self._kind = kind
+        self.update(model)
+
+    def update(self, model: mujoco.MjModel) -> None:
+        """Bring it up to date with changes of its model.
+
+        Args:
+            model: the same, or loaded from the same file.
+
+        Raises:
+            InvalidArgument, ClosedError, GLError: as `prepare`.
+        """
+        kept = _kept_of(model)
+        if kept != self._kept:
+            self._kept = b""
+            self._load(model)
+            self._kept = kept
+
+    def draw(self, scene: mujoco.MjvScene, out: Frame | None = None) -> Frame:
+        """Return the frame of `scene`, the top row first, in `out` if that is given.
+
+        Raises:
+            ClosedError, GLError: as of `GLContext`.
+        """
+        assert self._context is not None
+        with self._context.current():
+            drawing = self._context.drawing
+            mujoco.mjr_render(self._rectangle, scene, drawing)
+            mujoco.mjr_readPixels(self._bottom_up, None, self._rectangle, drawing)
+        frame = np.empty_like(self._bottom_up) if out is None else out
+        np.copyto(frame, self._bottom_up[::-1])
+        return frame
+
+    def close(self) -> None:
+        """Free the context. Idempotent."""
+        if self._context is not None:
+            self._context.free()
+
+    def _load(self, model: mujoco.MjModel) -> None:
+        """Give the context what it keeps of a model."""
+        height, width = self._rectangle.height, self._rectangle.width
+        if self._context is None:
+            self._context = GLContext()
+            # Its own hook may come after EGL was shut down; the context has another.
+            weakref.finalize(self, self._context.free).atexit = False
+        with self._context.current():
+            limit = _largest_frame()
+            if max(height, width) > limit:
+                raise InvalidArgument(
+                    f"A frame of {width}x{height} pixels is larger than this OpenGL "
+                    f"driver ({self.gl_facts['gl_renderer']}) can draw: "
+                    f"{limit}x{limit}."
+                )
+            if self._context.drawing is not None:
+                self._context.drawing.free()
+                self._context.drawing = None
+            # Only the context needs these settings, and it keeps no reference.
+            for_context = _with_settings(model, height, width, self._quality)
+            try:
+                drawing = mujoco.MjrContext(
+                    for_context, int(mujoco.mjtFontScale.mjFONTSCALE_150)
+                )
+            except mujoco.FatalError as error:
+                what = f"A {width}x{height} frame cannot be drawn"
+                raise gl_error(what, error, remedy="Ask for a smaller one.") from error
+            self._context.drawing = drawing
+            mujoco.mjr_setBuffer(int(mujoco.mjtFramebuffer.mjFB_OFFSCREEN), drawing)
 
 
 class SceneRenderer:
-    """Draws a simulation: the pictures of `mujoco.Renderer`, byte for byte.
+    """Draws a simulation: the frames of `mujoco.Renderer`, byte for byte.
 
-    Its canvas has a GL context on a thread of its own, so that whatever draws on the
-    caller's thread is left alone. The scene is put together on the caller's thread from
-    the model and data as they are at that moment, and only the drawing is handed over.
-    Neither the model nor the data is written to.
+    What else draws on the caller's thread is left alone. Neither the model nor the data
+    is written to.
 
-    Most changes to the model show in the next picture. Those to height fields,
+    Most changes to the model show in the next frame. Those to height fields,
     textures, meshes, sizes of planes, textures of materials, fog and rendering quality
     show after `model_changed`.
 
-    An infinite plane is drawn around the place where the cameras stood in the picture
-    before. `camera_positions` and `look` give pictures in any order the same planes.
+    An infinite plane is drawn around the place where the cameras stood in the frame
+    before. `camera_positions` and `look` give frames in any order the same planes.
 
     ::
 
@@ -42,19 +178,19 @@ class SceneRenderer:
         height: in pixels; may be larger than the model's offscreen buffer.
         width: likewise.
         camera: the name or number of a camera of the model, -1 for the free camera, or
-            an `MjvCamera`, which is read anew for every picture.
-        scene_option: read anew for every picture; MuJoCo's default, if None, which is
+            an `MjvCamera`, which is read anew for every frame.
+        scene_option: read anew for every frame; MuJoCo's default, if None, which is
             not dm_control's: that draws no range finders.
         max_geom: how many geoms a scene may have; the rest is not drawn. Environments'
             own renderers have other limits (Gymnasium's 1000).
         quality: `"full"` is what the model asks for. `"draft"` is the model without
             multisampling and with a shadow map of at most 1024x1024.
-        fresh: draw each picture as if it were the first, as dm_control does.
-        canvas: where to draw, of this model, size and quality, which others may draw
-            on in turn; one of its own, if None.
+        fresh: draw each frame as if it were the first, as dm_control does.
+        canvas: what to draw with, which others of this model, size and quality may draw
+            with in turn; one of its own, if None.
 
     Attributes:
-        size: `(height, width)` of the pictures.
+        size: `(height, width)` of the frames.
 
     Raises:
         UnknownName: the model has no such camera, or there is no such quality.
@@ -86,20 +222,19 @@ class SceneRenderer:
         self._fresh = fresh
         self._scene = mujoco.MjvScene(model, maxgeom=max_geom)
         self._owns_canvas = canvas is None
-        self._canvas = canvas or Canvas(
-            model, height=height, width=width, quality=quality
-        )
+        self._canvas = canvas or Canvas()
+        self._canvas.prepare(model, height=height, width=width, quality=quality)
 
     @property
     def gl_facts(self) -> dict[str, Any]:
-        """What metadata says of who draws, as `gl_info.current_gl_facts`."""
+        """What metadata says of who draws, as `gl_context.current_gl_facts`."""
         return self._canvas.gl_facts
 
     @property
     def camera_positions(self) -> NDArray[np.float32]:
-        """Where the two cameras stood in the last picture, `(2, 3)`, in metres.
+        """Where the two cameras stood in the last frame, `(2, 3)`, in metres.
 
-        All zeros before the first. Set it to draw the next picture as if another one
+        All zeros before the first. Set it to draw the next frame as if another one
         had been drawn before.
         """
         return np.array([camera.pos for camera in self._scene.camera])
@@ -111,12 +246,12 @@ class SceneRenderer:
             camera.pos = position
 
     def look(self, data: mujoco.MjData) -> None:
-        """Leave in the scene what a picture of `data` would, without drawing one."""
+        """Leave in the scene what a frame of `data` would, without drawing one."""
         camera = resolve_camera(self._model, self._camera)
         mujoco.mjv_updateCamera(self._model, data, camera, self._scene)
 
     def render(self, data: mujoco.MjData, *, out: Frame | None = None) -> Frame:
-        """Return the picture of `data`, a new `(height, width, 3) uint8` array.
+        """Return the frame of `data`, a new `(height, width, 3) uint8` array.
 
         The first row is the top one.
 
@@ -126,14 +261,12 @@ class SceneRenderer:
             out: an array to draw into and return, instead of a new one.
 
         Raises:
-            InvalidFrame: `out` is no picture of this size.
+            InvalidFrame: `out` is no frame of this size.
             ClosedError: after `close`.
-            GLError: in a forked child, or the driver hangs.
+            GLError: in a forked child.
         """
         if out is not None:
             check_frame(out, size=self.size)
-        # The last scene may still be drawn, after Ctrl-C.
-        self._canvas.settle()
         if self._fresh:
             self.camera_positions = np.zeros((2, 3))
         # The model's free camera and the number of a name may have changed.
@@ -147,9 +280,8 @@ class SceneRenderer:
     def model_changed(self) -> None:
         """Bring the canvas up to date with the model.
 
-        Compares what a GL context keeps of a model (milliseconds where there are large
-        textures) and uploads what differs; a context is made anew only where that is
-        not enough.
+        Compares what an OpenGL context keeps of a model (milliseconds where there are
+        large textures), and gives it that anew where something differs.
 
         Raises:
             GLError: as `render`.
@@ -171,3 +303,40 @@ class SceneRenderer:
         traceback: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _kept_of(model: mujoco.MjModel) -> bytes:
+    """Return a digest of what an OpenGL context keeps of a model."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name in _KEPT:
+        if "." in name or hasattr(model, name):
+            value = getattr(*holder_of(model, name))
+            digest.update(np.ascontiguousarray(value).data)
+    is_plane = model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)
+    digest.update(is_plane.tobytes() + model.geom_size[is_plane].tobytes())
+    return digest.digest()
+
+
+def _with_settings(
+    model: mujoco.MjModel, height: int, width: int, quality: str
+) -> mujoco.MjModel:
+    """Return `model`, or a copy with a large enough buffer and of that quality."""
+    buffer = model.vis.global_
+    is_large_enough = height <= buffer.offheight and width <= buffer.offwidth
+    if is_large_enough and quality == "full":
+        return model
+    changed = copy.copy(model)
+    changed.vis.global_.offheight = max(height, buffer.offheight)
+    changed.vis.global_.offwidth = max(width, buffer.offwidth)
+    if quality == "draft":
+        settings = changed.vis.quality
+        settings.offsamples = 0
+        settings.shadowsize = min(settings.shadowsize, _DRAFT_SHADOW_MAP)
+    return changed
+
+
+def _largest_frame() -> int:
+    """Return the longest side that the driver of the current context can draw."""
+    limit = np.zeros(1, np.int32)
+    raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limit)
+    return int(limit[0])

@@ -63,7 +63,7 @@ def compile_within(
                     return mujoco.MjModel.from_binary_path(str(place / _COMPILED))
             raise UnreadableFile(
                 path,
-                f"the process that compiled it {sandbox.what_became_of_it()} (it may "
+                f"the process that compiled it {sandbox.last_words()} (it may "
                 f"use {memory / 2**30:.1f} GiB of memory)",
             )
 

@@ -13,8 +13,8 @@ Of a staged monitor directory, which is nobody's original:
   or `host` instead, and whatever refers to them says the same;
 - trajectories have other facts, and the same arrays (`amend_trajectory`);
 - models have no comments, and compile to the same (`anonymous_models`);
-- what nobody can read (`.damaged`) is removed, and so is a compiled model that has the
-  identity in it, which only its author could have loaded.
+- a compiled model that has the identity in it, which only its author could have
+  loaded, is removed.
 
 What is matched how, `identity_matching` says. Times stay, and so do all numbers, the
 process id in a default uid among them.
@@ -146,8 +146,6 @@ def _make_file_anonymous(path: Path, texts: _Texts, matcher: IdentityMatcher) ->
     elif name.endswith(".h5"):
         with _writing(path):
             amend_trajectory(path, texts.value)
-    elif name.endswith(".damaged"):
-        path.unlink()
     elif name.startswith(_MODEL) and name.endswith(".zip"):
         _rewrite(path, lambda data: anonymous_sources(data, matcher))
     elif name.startswith(_MODEL) and matcher.found_in_bytes(compiled_model(path)):

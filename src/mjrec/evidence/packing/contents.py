@@ -38,7 +38,7 @@ from ...formats.monitor_directory import (
     where_recordings_are,
 )
 from ...formats.regular_files import regular_path
-from ...rendering.killed_leftovers import Remains, has_work, is_open, remains_of
+from ...rendering.leftovers import Leftovers, leftovers_in
 from ...rendering.recorded_facts import open_for_rendering
 from ...rendering.recordings import look_at, recordings
 from ...results import iter_episodes
@@ -146,11 +146,11 @@ def _check_nobody_writes(directory: Path) -> None:
 
 
 def _check_all_is_done(directory: Path) -> None:
-    closed = [remains for remains in remains_of(directory) if not is_open(remains)]
-    killed = [str(remains.infix) for remains in closed if has_work(remains)]
+    closed = [each for each in leftovers_in(directory) if not each.is_open]
+    killed = [str(leftovers.infix) for leftovers in closed if leftovers.has_work]
     if killed:
         raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))
-    strays = [name for remains in closed for name in _strays(remains)]
+    strays = [name for leftovers in closed for name in _strays(leftovers)]
     if strays:
         raise UnfinishedRecordings(directory, strays, advice=_STRAY)
     pending = [
@@ -162,9 +162,9 @@ def _check_all_is_done(directory: Path) -> None:
         raise UnfinishedRecordings(directory, pending, advice=_RENDER.format(directory))
 
 
-def _strays(remains: Remains) -> list[str]:
+def _strays(leftovers: Leftovers) -> list[str]:
     """Return the names of files of a monitor that has no manifest."""
-    names = [path.name for path in remains.paths if not path.name.startswith(".")]
+    names = [path.name for path in leftovers.paths if not path.name.startswith(".")]
     return [] if any(map(is_manifest, names)) else names
 
 

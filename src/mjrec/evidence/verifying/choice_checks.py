@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ...errors import InvalidArgument, UnreadableFile
-from ...formats.journal import UNKNOWN, JournalEntry
+from ...formats.journal import JournalEntry
 from ...formats.monitor_directory import Infix, video_prefix
 from ...formats.trajectory_file import open_trajectory
 from ...recorder.keep_rules import Selection, selection_from
@@ -163,13 +163,6 @@ def _check_selection(
             episodes=len(monitor.entries),
             chosen=len(chosen),
         )
-    if rule.startswith("failures") and not _says_success(monitor.entries):
-        return _unknown(
-            recording,
-            f"{rule} goes by what the environment says of success, which is not "
-            "recorded; by terminations alone it would be "
-            f"{_listed(chosen)}, not {_listed(recorded)}",
-        )
     return _check(
         recording,
         Verdict.FAIL,
@@ -193,21 +186,13 @@ def _finished(entry: JournalEntry) -> FinishedEpisode:
         type=entry.type,
         terminated=entry.terminated,
         truncated=entry.truncated,
-        success=_success(entry),
+        success=entry.success,
         seed=None,
         options=None,
         start_time=entry.start_time,
         end_time=entry.end_time,
         total_steps=0,
     )
-
-
-def _success(entry: JournalEntry) -> bool | None:
-    return entry.success if isinstance(entry.success, bool) else None
-
-
-def _says_success(entries: Iterable[JournalEntry]) -> bool:
-    return all(entry.success != UNKNOWN for entry in entries)
 
 
 def _schedule(name: str) -> Schedule | None:

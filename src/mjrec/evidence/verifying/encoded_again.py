@@ -97,9 +97,9 @@ class EncodedAgain:
 
     def _refusal(self) -> str | None:
         video = self._video
-        unfinished = self._writer.unfinished(video.height, video.width)
         # But for the name of the file.
-        ours = unfinished.encoder["arguments"][:-1]
+        file = self._writer.file_of(video.height, video.width)
+        ours = file.encoder["arguments"][:-1]
         theirs = list(video.encoder_arguments)[:-1]
         # An older mjrec said `-framerate`, which gives the same file wherever its
         # frames then last as long as recorded; else that is told already.

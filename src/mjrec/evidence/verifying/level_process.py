@@ -97,7 +97,7 @@ class _Conversation:
 
     def _broken_off(self) -> Iterator[Check]:
         after = f" after {self._last}" if self._last else ""
-        why = self._failure or f"their process {self._sandbox.what_became_of_it()}"
+        why = self._failure or f"their process {self._sandbox.last_words()}"
         yield Check(
             level=self._at,
             claim="the checks of this level come to an end",

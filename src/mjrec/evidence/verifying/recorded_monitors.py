@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import UnreadableFile
-from ...formats.journal import JournalEntry, JournalReader, run_facts
+from ...formats.journal import JournalEntry, JournalReader
 from ...formats.json_fields import read_object
 from ...formats.manifest import Manifest, read_manifest
 from ...formats.monitor_directory import episode_of
@@ -18,6 +18,7 @@ from ...formats.stats_file import StatsFile, read_stats_file
 from ...formats.video_metadata import metadata_path
 from ...formats.video_names import view_of
 from ...results.monitor_files import MonitorFiles, monitors_of
+from ...results.run import Run
 
 # Of each, some hundred bytes are in memory.
 _MOST_EPISODES = 10_000_000
@@ -130,13 +131,14 @@ def _stats(
 
 
 def _entries(journal: Path) -> tuple[tuple[JournalEntry, ...], int, Any]:
-    reader = JournalReader(journal)
+    run = Run()
+    reader = JournalReader(journal, on_event=run.note)
     entries: list[JournalEntry] = []
     for entry in reader:
         entries.append(entry)
         if len(entries) > _MOST_EPISODES:
             raise UnreadableFile(journal, f"it has more than {_MOST_EPISODES} episodes")
-    env_info = (run_facts(journal) or {}).get("env_info")
+    env_info = run.facts.get("env_info")
     env_id = env_info.get("env_id") if isinstance(env_info, Mapping) else None
     return tuple(entries), reader.dropped, env_id
 

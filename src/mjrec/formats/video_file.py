@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One video from its first frame to its last: the encoder, and what it has written."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, TextIO
+
+from ..atomic_files import file_sha256
+from ..errors import DirectoryNotWritable, FileNotWritten, FrameCountError
+from ..frames import Frame, pad_to_even
+from ..worker_thread import WorkerThread
+from .ffmpeg import FfmpegProcess, as_file, every_frame_arguments, ffmpeg_sha256
+from .frame_hashes import frame_hash_header, frame_hash_line, frame_hash_path
+from .locks import Lock
+
+_QUEUED_BYTES = 32 << 20
+_MAX_QUEUED_FRAMES = 64
+_READ_SIZE = 1 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoFile:
+    """A finished video.
+
+    Attributes:
+        path: the file.
+        height: of a frame as it was written, in pixels; the file's is even.
+        width: likewise.
+        fps: frames per second.
+        codec: ffmpeg's name of the encoder.
+        pixel_format: ffmpeg's name of the encoded pixels' format.
+        encoder: `ffmpeg` (the binary's base name), `version` (its first line),
+            `sha256` (the binary's) and `arguments` (all of them; the output file is
+            its base name, so that they stay true when the directory moves).
+        frame_hash_path: the `.framehash` file, if one was asked for.
+        frame_count: how many frames it holds, counted by decoding it.
+        file_sha256: of the file's bytes.
+        decoded_sha256: of the decoded frames, one after the other: the planes Y, U, V
+            for yuv420p, else rgb24.
+    """
+
+    path: Path
+    height: int
+    width: int
+    fps: Fraction
+    codec: str
+    pixel_format: str
+    encoder: Mapping[str, Any]
+    frame_hash_path: Path | None
+    frame_count: int = 0
+    file_sha256: str = ""
+    decoded_sha256: str = ""
+
+    @property
+    def padded_height(self) -> int:
+        """The file's, even where the codec needs it."""
+        return self.height + self.height % 2
+
+    @property
+    def padded_width(self) -> int:
+        """The file's, even where the codec needs it."""
+        return self.width + self.width % 2
+
+
+def count_frames(
+    path: Path, *, height: int, width: int, pixel_format: str
+) -> tuple[int, str]:
+    """Decode a video; return how many frames it holds and the sha256 of all of them.
+
+    Args:
+        path: the file.
+        height: of a frame in the file.
+        width: likewise.
+        pixel_format: of the encoded pixels. They are decoded as yuv420p, or as rgb24
+            if it is another.
+
+    Raises:
+        EncoderError: it cannot be decoded to its end.
+    """
+    decoded = "yuv420p" if pixel_format == "yuv420p" else "rgb24"
+    frame_bytes = 3 * height * width // (2 if decoded == "yuv420p" else 1)
+    arguments = [
+        *("-hide_banner", "-loglevel", "error", "-nostdin", "-xerror"),
+        # More would take a third more of the CPUs, which others are drawing with.
+        *("-threads", "1", "-filter_threads", "1"),
+        *("-i", as_file(path), "-map", "0:v:0", *every_frame_arguments()),
+        *("-f", "rawvideo", "-pix_fmt", decoded, "pipe:1"),
+    ]
+    what = f"The finished video {path} cannot be decoded."
+    digest, total = hashlib.sha256(), 0
+    with FfmpegProcess(arguments, what=what, writes=True) as process:
+        while block := process.read(_READ_SIZE):
+            digest.update(block)
+            total += len(block)
+        process.wait()
+    return -(-total // frame_bytes), digest.hexdigest()
+
+
+class Encoding:
+    """A video in the making: ffmpeg, the thread that feeds it, temporary files."""
+
+    def __init__(self, file: VideoFile, temporary: Path, hashes: Path | None) -> None:
+        self.size = (file.height, file.width)
+        self.is_ending = False
+        self._file = file
+        self.temporary = temporary
+        self._parts = {temporary: file.path}
+        self._encoded = 0
+        self._input_ended = False
+        self._hashes: TextIO | None = None
+        with contextlib.ExitStack() as on_failure:
+            try:
+                # First of all: what is not locked may be swept up. With the mode that a
+                # new file gets from every program.
+                self._lock = Lock(temporary, "", mode=0o666)
+            except OSError as error:
+                raise DirectoryNotWritable(file.path.parent, error) from error
+            on_failure.callback(self._remove_files)
+            if hashes is not None and file.frame_hash_path is not None:
+                self._parts[hashes] = file.frame_hash_path
+                header = frame_hash_header(
+                    height=file.height, width=file.width, fps=file.fps
+                )
+                with self._naming_the_hashes():
+                    # A line is with the operating system before the next one.
+                    self._hashes = hashes.open("w", encoding="ascii", buffering=1)
+                    self._hashes.write(header)
+            self._process = FfmpegProcess(
+                [*file.encoder["arguments"][:-1], as_file(temporary)],
+                what=f"The video {file.path} could not be encoded.",
+                reads=True,
+                # It shares the lock, which it holds to its own end when we die.
+                keeps=self._lock.fileno(),
+            )
+            on_failure.callback(self._process.release)
+            on_failure.callback(self._process.kill)
+            frame_bytes = 3 * file.height * file.width
+            self.thread = WorkerThread[Frame](
+                self._encode,
+                capacity=min(_MAX_QUEUED_FRAMES, max(2, _QUEUED_BYTES // frame_bytes)),
+                name=f"encoder of {file.path.name}",
+                finish=self._end_input,
+            )
+            on_failure.pop_all()
+
+    def finish(self) -> VideoFile | None:
+        """Complete the file, check it and give it its name.
+
+        Each part can be done again, where Ctrl-C came in between. None on the encoder's
+        own thread, which cannot wait for itself.
+        """
+        self.is_ending = True
+        self.thread.close()
+        if not self._input_ended:
+            return None
+        self._process.wait()
+        if not self._file.file_sha256:
+            self._file = self._checked()
+        if self._hashes is None:
+            # Those of the video that is replaced now would be wrong.
+            frame_hash_path(self._file.path).unlink(missing_ok=True)
+        else:
+            self._hashes.close()
+        try:
+            # The hashes first: where there is a video, what belongs to it is there too.
+            for part, final in reversed(self._parts.items()):
+                if part.exists():
+                    part.replace(final)
+        except OSError as error:
+            raise DirectoryNotWritable(self._file.path.parent, error) from error
+        self._process.release()
+        self._lock.release()
+        return self._file
+
+    def abort(self) -> None:
+        """End everything and remove the temporary files."""
+        # First the process: the thread may be waiting for it to read.
+        self._process.kill()
+        self.thread.abort()
+        self._process.release()
+        self._remove_files()
+
+    def leave(self) -> None:
+        """Let the encoder go on to the end of what it was given, by itself."""
+        self.thread.leave()
+        self._lock.let_go()
+
+    def _encode(self, frame: Frame) -> None:
+        if not self._encoded:
+            # It is remembered, and the next frames are still being drawn.
+            ffmpeg_sha256()
+        if self._hashes is not None:
+            with self._naming_the_hashes():
+                self._hashes.write(frame_hash_line(self._encoded, frame))
+        self._process.write(pad_to_even(frame))
+        self._encoded += 1
+
+    def _end_input(self) -> None:
+        self._process.end_input()
+        self._input_ended = True
+
+    def _checked(self) -> VideoFile:
+        """Return the finished file, which has its temporary name, with what it holds.
+
+        Raises:
+            FrameCountError: it does not hold what was encoded.
+        """
+        file = self._file
+        count, digest = count_frames(
+            self.temporary,
+            height=file.padded_height,
+            width=file.padded_width,
+            pixel_format=file.pixel_format,
+        )
+        if count != self._encoded:
+            raise FrameCountError(
+                f"{file.path} was to hold {self._encoded} frames, and decoding gives "
+                f"{count}. It was not kept.",
+                command=self._process.command,
+                returncode=0,
+                stderr="",
+            )
+        return replace(
+            file,
+            encoder={**file.encoder, "sha256": ffmpeg_sha256()},
+            frame_count=count,
+            file_sha256=file_sha256(self.temporary),
+            decoded_sha256=digest,
+        )
+
+    def _remove_files(self) -> None:
+        with contextlib.suppress(OSError):
+            # What cannot be written any more need not be.
+            if self._hashes is not None:
+                self._hashes.close()
+        # ffmpeg may have put another file in the place of the one that is locked.
+        for part in self._parts:
+            part.unlink(missing_ok=True)
+        self._lock.release()
+
+    @contextlib.contextmanager
+    def _naming_the_hashes(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise FileNotWritten(
+                frame_hash_path(self._file.path), error.strerror
+            ) from error

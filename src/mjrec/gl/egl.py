@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""EGL's devices, as its library tells of them.
+
+By ctypes alone: this also answers where neither mujoco nor PyOpenGL can be imported.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import uuid
+from dataclasses import dataclass
+from typing import Any
+
+_EXTENSIONS = 0x3055
+_DEVICE = 0x322C
+_CUDA_DEVICE = 0x323A
+_DRM_DEVICE_FILE = 0x3233
+_DRM_RENDER_NODE_FILE = 0x3377
+_DEVICE_UUID = 0x335C
+_UUID_LENGTH = 16
+# mujoco 3 itself asks for ten.
+_MOST_DEVICES = 256
+
+
+@dataclass(frozen=True)
+class EglDevice:
+    """One of EGL's devices.
+
+    Attributes:
+        index: its place in EGL's list, which is what `MUJOCO_EGL_DEVICE_ID` means to
+            mujoco 3 (and to mujoco 4 where no device has a CUDA number).
+        device_file: for example `/dev/dri/renderD128`; empty where EGL does not tell.
+        cuda_id: CUDA's number of the same device; None where it has none, or where
+            `CUDA_VISIBLE_DEVICES` hides it.
+        software: whether it is the CPU.
+        in_use: whether the current context draws on it.
+        uuid: of the GPU, as `nvidia-smi -L` shows it; empty where EGL does not tell.
+    """
+
+    index: int
+    device_file: str
+    cuda_id: int | None
+    software: bool
+    in_use: bool
+    uuid: str = ""
+
+
+def egl_devices(*, with_cuda: bool = True) -> list[EglDevice]:
+    """Return what EGL tells about its devices, in the order of its list.
+
+    Empty where it does not tell, or is not there.
+
+    Args:
+        with_cuda: ask for CUDA's numbers. The driver begins CUDA for that, which a
+            process that is forked afterwards cannot use any more.
+    """
+    try:
+        address_of = ctypes.CDLL("libEGL.so.1").eglGetProcAddress
+    except OSError:
+        return []
+    address_of.restype = ctypes.c_void_p
+    address_of.argtypes = [ctypes.c_char_p]
+
+    def call(name: str, *arguments: Any, result: Any = ctypes.c_uint) -> Any:
+        """Return what a function returns; None where there is no such function."""
+        address = address_of(name.encode())
+        if not address:
+            return None
+        return ctypes.CFUNCTYPE(result, *map(type, arguments))(address)(*arguments)
+
+    def attribute(function: str, holder: int, name: int) -> int | None:
+        value = ctypes.c_ssize_t()
+        key = ctypes.c_int(name)
+        found = call(function, ctypes.c_void_p(holder), key, ctypes.pointer(value))
+        return value.value if found else None
+
+    def text(device: int, name: int) -> str:
+        handle, key = ctypes.c_void_p(device), ctypes.c_int(name)
+        found = call("eglQueryDeviceStringEXT", handle, key, result=ctypes.c_char_p)
+        return (found or b"").decode(errors="replace")
+
+    def identity(device: int) -> str:
+        value = (ctypes.c_char * _UUID_LENGTH)()
+        found = call(
+            *("eglQueryDeviceBinaryEXT", ctypes.c_void_p(device)),
+            *(ctypes.c_int(_DEVICE_UUID), ctypes.c_int(_UUID_LENGTH)),
+            *(value, ctypes.pointer(ctypes.c_int())),
+        )
+        return f"GPU-{uuid.UUID(bytes=value.raw)}" if found else ""
+
+    handles = (ctypes.c_void_p * _MOST_DEVICES)()
+    count, most = ctypes.c_int(), ctypes.c_int(_MOST_DEVICES)
+    call("eglQueryDevicesEXT", most, handles, ctypes.pointer(count))
+    display = call("eglGetCurrentDisplay", result=ctypes.c_void_p)
+    in_use = attribute("eglQueryDisplayAttribEXT", display, _DEVICE) if display else 0
+    devices = []
+    for index, device in enumerate(filter(None, handles[: count.value])):
+        has = text(device, _EXTENSIONS).split()
+        file, cuda_id = "", None
+        if "EGL_EXT_device_drm_render_node" in has:
+            file = text(device, _DRM_RENDER_NODE_FILE)
+        if not file and "EGL_EXT_device_drm" in has:
+            file = text(device, _DRM_DEVICE_FILE)
+        if with_cuda and "EGL_NV_device_cuda" in has:
+            cuda_id = attribute("eglQueryDeviceAttribEXT", device, _CUDA_DEVICE)
+        devices.append(
+            EglDevice(
+                index=index,
+                device_file=file,
+                cuda_id=cuda_id,
+                software="EGL_MESA_device_software" in has,
+                in_use=device == in_use,
+                uuid=identity(device) if "EGL_EXT_device_persistent_id" in has else "",
+            )
+        )
+    return devices

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Videos that were recorded live when their process was killed.
+
+The encoder goes on to the end of what it was given, and finishes its hidden file. A
+note beside it says what it is.
+
+Text recordings are on the disk frame by frame, and have no note: their frames tell the
+rate, and the trajectory, where there is one, the episode.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import EncoderError, Error, UnreadableFile
+from ..formats.asciicast import AsciicastWriter, unfinished_recording
+from ..formats.journal import KILLED
+from ..formats.locks import is_locked
+from ..formats.monitor_directory import episode_of
+from ..formats.unfinished_video import UnfinishedVideo, read_note
+from ..formats.video_metadata import (
+    StepRuns,
+    further_live_videos,
+    metadata_path,
+    timing_facts,
+    write_metadata,
+)
+
+_MOMENT = 0.05
+_CUT = {"complete": False, "reason": KILLED}
+_BROKEN = (
+    "the recording process was killed, and its encoder before it had finished the file"
+)
+_SAID_BY_TRAJECTORY = ("type", "env_id", "seed", "options", "versions")
+
+
+def finish_video(
+    note_file: Path, known: Mapping[str, Any], *, deadline: float
+) -> Iterator[tuple[str, str]]:
+    """Give a live video its name and its metadata, as far as it goes.
+
+    A file that cannot be decoded keeps its hidden name, and the metadata says that the
+    video broke, and why.
+
+    Args:
+        note_file: the note beside it. That of an episode's first video comes after
+            those of its further cameras, which its metadata names.
+        known: what is known of the end of its episode, with `complete` where it ended,
+            and of its `length` and `reward`.
+        deadline: until when to wait for its encoder, by `time.monotonic`.
+
+    Yields:
+        The name of the file and what was done; nothing where only the note was left.
+
+    Raises:
+        Error: its encoder is still at it, or the files cannot be written.
+    """
+    try:
+        video = read_note(note_file)
+    except UnreadableFile:
+        # A note is written before there is a video.
+        note_file.unlink(missing_ok=True)
+        return
+    _wait_for_encoder(video, deadline)
+    if not metadata_path(video.path).exists() and _is_begun(video):
+        ending = known if "complete" in known else {**known, **_CUT}
+        without_video = {**video.metadata, **ending, "empty": True, "recovered": True}
+        try:
+            if not _holds_frames(video):
+                # It was killed before its encoder had been given a frame.
+                write_metadata(video.path, without_video)
+                yield metadata_path(video.path).name, "there was no frame yet"
+            else:
+                metadata = _metadata(video, video.finish(), known)
+                write_metadata(video.path, metadata)
+                yield video.path.name, _counted(metadata["frame_count"], metadata)
+        except EncoderError as error:
+            why = (error.stderr.strip().splitlines() or [str(error)])[-1]
+            broken = {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
+            write_metadata(video.path, {**without_video, **broken})
+            if video.hashes is not None:
+                video.hashes.unlink(missing_ok=True)
+            kept = f"its data is in {video.temporary.name}"
+            yield video.path.name, f"broken ({why}); {kept}"
+            return
+    video.temporary.unlink(missing_ok=True)
+    if video.hashes is not None:
+        video.hashes.unlink(missing_ok=True)
+    # The note last, which says what they were.
+    note_file.unlink(missing_ok=True)
+
+
+def _counted(count: int, metadata: Mapping[str, Any]) -> str:
+    ending = "" if metadata["complete"] else f", incomplete: {metadata['reason']}"
+    return f"{count} {'frame' if count == 1 else 'frames'}{ending}"
+
+
+def _wait_for_encoder(video: UnfinishedVideo, deadline: float) -> None:
+    while is_locked(video.temporary):
+        if time.monotonic() >= deadline:
+            raise Error(
+                f"The encoder of {video.path.name} is still finishing its file. To "
+                f"wait longer: mjrec recover --timeout 60 {video.path.parent}"
+            )
+        time.sleep(_MOMENT)
+
+
+def _is_begun(video: UnfinishedVideo) -> bool:
+    """Tell whether there is a file that anything was written into."""
+    for path in (video.temporary, video.path):
+        # A link may lead anywhere.
+        if path.is_file() and not path.is_symlink():
+            return path.stat().st_size > 0
+    return False
+
+
+def _holds_frames(video: UnfinishedVideo) -> bool:
+    """Tell whether the file holds anything besides what every mp4 begins with."""
+    path = video.temporary if video.temporary.exists() else video.path
+    end = path.stat().st_size
+    with path.open("rb") as file:
+        position = 0
+        while position + 8 <= end:
+            file.seek(position)
+            size, kind = struct.unpack(">I4s", file.read(8))
+            if kind not in (b"ftyp", b"moov", b"free", b"mdat"):
+                return True
+            # 0 is to the end, as in one that is not finished, and 1 very large.
+            held = end - position if size == 0 else size
+            if kind == b"mdat" and held != 8:
+                return True
+            position += max(size, 8)
+    return False
+
+
+def _metadata(
+    video: UnfinishedVideo, facts: dict[str, Any], known: Mapping[str, Any]
+) -> dict[str, Any]:
+    frame_count, stride = facts["frame_count"], facts["stride"]
+    frames_per_step = facts.pop("frames_per_step")
+    length = known.get("length", 0)
+    # The last step is always among them.
+    steps = [*range(0, length, stride), length]
+    is_whole = len(steps) == frame_count and frames_per_step == 1
+    if not is_whole or "complete" not in known:
+        # The last frames were on their way to the encoder.
+        steps = [*range(0, frame_count * stride, stride)]
+        known = {**_sums(known), **_CUT}
+    # How many frames each step gave is known only where it is one.
+    is_known = frames_per_step == 1
+    further = further_live_videos(video.path)
+    return {
+        **video.metadata,
+        **facts,
+        **known,
+        "frame_steps": StepRuns(steps, stride=stride).ranges if is_known else None,
+        **({"further_videos": further} if further else {}),
+        "recovered": True,
+    }
+
+
+def _sums(known: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: known[key] for key in ("length", "reward") if key in known}
+
+
+def finish_text(
+    part: Path, path: Path, facts: Mapping[str, Any], known: Mapping[str, Any]
+) -> Iterator[tuple[str, str]]:
+    """Make a text recording, and its metadata, of the frames that are there.
+
+    Args:
+        part: the hidden file that the frames were written into.
+        path: of the recording.
+        facts: what the trajectory of its episode says; nothing without one.
+        known: as of `finish_video`.
+
+    Yields:
+        The name of the file and what was done; nothing where it was there already.
+
+    Raises:
+        Error: the files cannot be written.
+    """
+    if not metadata_path(path).exists():
+        try:
+            rate, frames = unfinished_recording(part)
+        except UnreadableFile:
+            # There is no whole frame in it.
+            part.unlink(missing_ok=True)
+            yield part.name, "unfinished, removed"
+            return
+        if "complete" not in known or known.get("length") != len(frames) - 1:
+            known = {**_sums(known), **_CUT}
+        writer = AsciicastWriter(path, rate=rate)
+        for frame in frames:
+            writer.write(frame)
+        writer.close()
+        metadata = {
+            "episode_id": episode_of(path.name),
+            "content_type": "video/vnd.openai.ansivid",
+            "encoder_version": {"backend": "TextEncoder", "version": 1},
+            "recording": "live",
+            **{key: facts[key] for key in _SAID_BY_TRAJECTORY if key in facts},
+            **known,
+            **timing_facts(StepRuns(range(len(frames))), fps=rate, timestep=None),
+            "recovered": True,
+        }
+        write_metadata(path, metadata)
+        yield path.name, _counted(len(frames), metadata)
+    part.unlink(missing_ok=True)

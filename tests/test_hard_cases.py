@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Environments and users that a recorder of states must survive, from outside.
+
+Each is recorded as a user would, and what was drawn later is compared with what the
+environment itself draws.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from robots import robots_that_reset
+
+import mjrec
+from mjrec.commands import main
+
+SIZE = {"height": 32, "width": 48}
+
+
+class Around(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Does something before every step, and changes what it returns."""
+
+    def __init__(
+        self,
+        env: Any,
+        before: Callable[[int, Any], None] = lambda *_: None,
+        after: Callable[[int, Any], Any] = lambda _, result: result,
+    ) -> None:
+        super().__init__(env)
+        self.before, self.after, self.steps = before, after, 0
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        self.before(self.steps, self.env.unwrapped)
+        return self.after(self.steps, self.env.step(action))
+
+
+def pendulum(length: int = 5, **more: Any) -> Any:
+    """Return a small environment whose episodes have `length` steps."""
+    made = {"max_episode_steps": length, "render_mode": "rgb_array", **SIZE, **more}
+    return gymnasium.make("InvertedPendulum-v5", **made)
+
+
+def play(env: Any, steps: int, *, seen: list[Any] | None = None) -> None:
+    """Take steps with small actions, and resets where an episode is over."""
+    is_over = True
+    for number in range(steps):
+        if is_over:
+            env.reset(seed=number)
+            _see(env, seen)
+        action = np.full(env.action_space.shape, 0.1 * (number % 3 - 1), np.float32)
+        *_, terminated, truncated, _ = env.step(action)
+        is_over = terminated or truncated
+        _see(env, seen)
+
+
+def _see(env: Any, seen: list[Any] | None) -> None:
+    if seen is not None:
+        seen.append(hashlib.sha256(env.render().tobytes()).hexdigest())
+
+
+def play_task(env: Any, episodes: int) -> None:
+    """Play episodes of a dm_control task with small actions."""
+    for _ in range(episodes):
+        timestep, number = env.reset(), 0
+        while not timestep.last():
+            number += 1
+            timestep = env.step(np.full(env.action_spec().shape, 0.1 * (number % 3)))
+
+
+def growing() -> Any:
+    """Return a composer task that compiles another model at each reset."""
+    from dm_control import composer
+
+    class Growing(composer.Task):  # type: ignore[misc]  # no stubs
+        root_entity = None
+
+        def __init__(self) -> None:
+            self.root_entity = composer.Arena()
+            world = self.root_entity.mjcf_model.worldbody
+            world.add("light", pos=(0, 0, 3))
+            world.add("camera", pos=(0, -3, 0.5), xyaxes=(1, 0, 0, 0, 0, 1))
+            self.set_timesteps(control_timestep=0.02, physics_timestep=0.002)
+            pole = world.add("body", pos=(0, 0, 0.5))
+            hinge = pole.add("joint", type="hinge", axis=(0, 1, 0))
+            self.box = pole.add("geom", type="box", size=(0.1, 0.1, 0.3))
+            self.root_entity.mjcf_model.actuator.add("motor", joint=hinge)
+
+        def initialize_episode_mjcf(self, random_state: Any) -> None:
+            self.box.size = random_state.uniform(0.1, 0.5, 3)
+
+        def get_reward(self, physics: Any) -> float:
+            return 1.0
+
+    return composer.Environment(Growing(), time_limit=0.08, random_state=3)
+
+
+def hashes(directory: Path) -> list[str]:
+    """Return the hashes of all frames of all videos, in the order of their names."""
+    return [
+        line.split(",")[-1].strip()
+        for path in sorted(directory.glob("*.framehash"))
+        for line in path.read_text().splitlines()
+        if not line.startswith("#")
+    ]
+
+
+def trajectories(directory: Path) -> Iterator[mjrec.Trajectory]:
+    for path in sorted(directory.glob("*.h5")):
+        yield mjrec.load_trajectory(path)
+
+
+def live_and_later(
+    make: Callable[[], Any], play: Callable[[Any], None], out: Path, **options: Any
+) -> None:
+    """Record the same twice, drawn while it runs and from its states."""
+    for way in ("live", "deferred"):
+        with mjrec.Monitor(make(), out / way, render=way, workers=1, **options) as env:
+            play(env)
+        del env
+        # dm_control frees its OpenGL context here, not on whichever thread comes next.
+        gc.collect()
+    assert hashes(out / "live")
+    assert hashes(out / "live") == hashes(out / "deferred")
+    recordings = {
+        json.loads(path.read_text())["recording"]
+        for path in (out / "deferred").glob("*.meta.json")
+    }
+    assert recordings == {"deferred"}
+
+
+def test_a_model_whose_colours_change_at_every_step(tmp_path: Path) -> None:
+    """As those that show touch sensors do."""
+
+    def paint(number: int, env: Any) -> None:
+        env.model.geom_rgba[:, 0] = number % 5 / 4
+
+    env = Around(pendulum(), before=paint)
+    seen: list[str] = []
+    with mjrec.Monitor(env, tmp_path, lambda _: True, workers=1) as monitor:
+        play(monitor, 10, seen=seen)
+    assert len(set(seen)) > 5
+    assert hashes(tmp_path) == seen
+
+
+@pytest.mark.dm_control
+def test_a_task_that_shows_its_reward(tmp_path: Path) -> None:
+    """`visualize_reward` paints the robot anew at every step."""
+    from dm_control import suite
+
+    def make() -> Any:
+        task = {"random": 0, "time_limit": 0.05}
+        return suite.load("cartpole", "balance", task, visualize_reward=True)
+
+    live_and_later(
+        make, lambda env: play_task(env, 1), tmp_path, env_id="dm_control/x", **SIZE
+    )
+
+
+@pytest.mark.dm_control
+@pytest.mark.parametrize(
+    "options", [{}, {"step_trigger": lambda step: step == 2, "video_length": 9}]
+)
+def test_a_task_that_compiles_its_model_at_each_reset(
+    options: dict[str, Any], tmp_path: Path
+) -> None:
+    """Videos of episodes, and a clip that crosses such resets."""
+    whole = {} if options else {"video_callable": lambda _: True}
+    live_and_later(
+        growing,
+        lambda env: play_task(env, 3),
+        tmp_path,
+        **{**options, **whole, "env_id": "dm_control/growing", **SIZE},
+    )
+
+
+def test_an_environment_that_moves_things_while_it_draws(tmp_path: Path) -> None:
+    """Fetch puts its target at the goal in `_render_callback`; not every step is drawn.
+
+    The simulation goes on as if nothing had been drawn.
+    """
+    pytest.importorskip("gymnasium_robotics")
+
+    def make() -> Any:
+        return gymnasium.make(
+            "FetchReach-v4", max_episode_steps=5, render_mode="rgb_array", **SIZE
+        )
+
+    options: dict[str, Any] = {"video_callable": lambda _: True, "max_fps": 10}
+    with robots_that_reset():
+        live_and_later(make, lambda env: play(env, 5), tmp_path, **options)
+    [trajectory] = trajectories(tmp_path / "deferred")
+    assert trajectory.frame_steps.tolist() == [0, 3, 5]
+
+
+def test_large_observations_and_actions_that_change(tmp_path: Path) -> None:
+    """300 KiB for each step; one action is of another shape than those before."""
+
+    def enlarge(number: int, result: Any) -> Any:
+        return (np.full((300, 1024), number, np.uint8), *result[1:])
+
+    env = Around(pendulum(9), after=enlarge)
+    env.reset = lambda **options: (  # type: ignore[method-assign]
+        np.zeros((300, 1024), np.uint8),
+        env.env.reset(**options)[1],
+    )
+    with mjrec.Monitor(
+        env, tmp_path, False, trajectory_callable=True, observations=True
+    ) as monitor:
+        monitor.reset(seed=1)
+        for number in range(9):
+            shape = (1, 1) if number == 4 else (1,)
+            action = np.full(shape, 0.1, np.float32)
+            env.before = lambda *_, a=action: a.resize((1,), refcheck=False)  # type: ignore[misc]
+            monitor.step(action)
+    [trajectory] = trajectories(tmp_path)
+    assert trajectory.observations is not None
+    assert (trajectory.observations[:, 0, 0] == np.arange(10)).all()
+    assert trajectory.actions is not None
+    given = np.full((9, 1), np.float32(0.1))
+    given[4] = 0
+    np.testing.assert_array_equal(trajectory.actions, given)
+    assert trajectory.facts["irregular_actions_from"] == 4
+
+
+def test_a_state_that_is_reset_away_is_not_shown(tmp_path: Path) -> None:
+    """Where an environment resets itself inside its last step, that frame is not."""
+    vector = gymnasium.vector.SyncVectorEnv(
+        [pendulum], autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP
+    )
+    with mjrec.Monitor(vector, tmp_path, lambda _: True, workers=1) as env:
+        env.reset(seed=1)
+        for _ in range(5):
+            env.step(np.zeros((1, 1), np.float32))
+    first = next(trajectories(tmp_path))
+    assert len(first.actions) == 5
+    is_known = ~np.isnan(first.states).any(axis=1)
+    assert len(first.frame_steps) == is_known.sum()
+
+
+@pytest.mark.parametrize("is_freed", [True, False])
+def test_data_that_is_replaced_in_mid_episode(is_freed: bool, tmp_path: Path) -> None:
+    """Also where nobody else holds what was there before."""
+    kept = []
+
+    def replace(number: int, env: Any) -> None:
+        if number != 3:
+            return
+        old, env.data = env.data, mujoco.MjData(env.model)
+        env.data.qpos[:], env.data.qvel[:] = old.qpos, old.qvel
+        env.data.time = old.time
+        mujoco.mj_forward(env.model, env.data)
+        if not is_freed:
+            kept.append(old)
+        del old
+        env.mujoco_renderer.close()
+        env.mujoco_renderer.__init__(env.model, env.data, **SIZE)
+        gc.collect()
+
+    env = Around(pendulum(), before=replace)
+    states = []
+    with mjrec.Monitor(env, tmp_path, lambda _: True, workers=1) as monitor:
+        monitor.reset(seed=1)
+        for _ in range(5):
+            monitor.step(np.full(1, 0.1, np.float32))
+            states.append(env.unwrapped.data.qpos.copy())
+    [trajectory] = trajectories(tmp_path)
+    found = [trajectory.component("qpos")[step] for step in range(1, 6)]
+    np.testing.assert_array_equal(found, states)
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_a_fork_in_mid_episode(tmp_path: Path) -> None:
+    """The child cannot write into its parent's recording, and ends as usual."""
+    with mjrec.Monitor(pendulum(), tmp_path, lambda _: True, workers=0) as env:
+        env.reset(seed=0)
+        env.step(np.zeros(1, np.float32))
+        child = os.fork()
+        if child == 0:
+            try:
+                env.step(np.zeros(1, np.float32))
+            except mjrec.Error:
+                os._exit(5)
+            os._exit(1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 5
+        for _ in range(4):
+            env.step(np.zeros(1, np.float32))
+    mjrec.render_videos(tmp_path)
+    assert len(hashes(tmp_path)) == 6
+
+
+# Takes more than five seconds: a monitor in a process of its own, and a renderer.
+def test_two_monitors_of_which_one_never_ends(tmp_path: Path) -> None:
+    """What the other recorded is drawn and loaded beside it."""
+    program = (
+        "import sys, gymnasium, mjrec\n"
+        "env = gymnasium.make('InvertedPendulum-v5')\n"
+        "env = mjrec.Monitor(env, sys.argv[1], resume=True, uid='a', workers=0)\n"
+        "env.reset(seed=0); env.step(env.action_space.sample())\n"
+        "print('begun', flush=True); sys.stdin.read()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"begun\n"
+        before = sorted(path.name for path in tmp_path.glob("*.a*"))
+        options: dict[str, Any] = {"resume": True, "uid": "b", "workers": 1}
+        with mjrec.Monitor(pendulum(), tmp_path, lambda _: True, **options) as env:
+            play(env, 10)
+        assert len(list(tmp_path.glob("*.b.*.mp4"))) == 2
+        results = mjrec.load_results(tmp_path)
+        assert results is not None
+        assert results["episode_lengths"] == [5, 5]
+        assert sorted(path.name for path in tmp_path.glob("*.a*")) == before
+        other.kill()
+
+
+def test_a_run_that_another_machine_renders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`close(wait=False)` draws and converts nothing; a copy of what it left does."""
+    seen: list[str] = []
+    env = mjrec.Monitor(pendulum(), tmp_path / "here", lambda _: True, workers=0)
+    play(env, 10, seen=seen)
+    env.close(wait=False)
+    assert not list((tmp_path / "here").glob("*.mp4"))
+    shutil.copytree(tmp_path / "here", tmp_path / "there")
+    # Its user has never seen the model.
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    assert main(["render", str(tmp_path / "there"), "--workers", "1"]) == 0
+    assert hashes(tmp_path / "there") == seen
+
+
+# Takes more than five seconds: a million steps.
+@pytest.mark.thorough
+def test_an_episode_of_a_million_steps_needs_no_more_memory(tmp_path: Path) -> None:
+    """Neither while it is recorded nor while its file is written."""
+    program = (
+        "import resource, sys, gymnasium, mjrec, numpy\n"
+        "env = gymnasium.make('InvertedPendulum-v5', max_episode_steps=10**7)\n"
+        "steps = int(sys.argv[2])\n"
+        "env = mjrec.Monitor(env, sys.argv[1], False, trajectory_callable=True)\n"
+        "action = numpy.zeros(1)\n"
+        "start = env.unwrapped.init_qpos, env.unwrapped.init_qvel\n"
+        "env.reset(seed=0)\n"
+        "for step in range(steps):\n"
+        "    if step % 10 == 0:\n"
+        "        env.unwrapped.set_state(*start)\n"
+        "    env.step(action)\n"
+        "env.close()\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    used = {}
+    for steps in (10_000, 1_000_000):
+        done = subprocess.run(
+            [sys.executable, "-c", program, str(tmp_path / str(steps)), str(steps)],
+            check=True,
+            stdout=subprocess.PIPE,
+        )
+        used[steps] = int(done.stdout) << 10
+    assert used[1_000_000] - used[10_000] < 32 << 20, used
