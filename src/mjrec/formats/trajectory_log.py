@@ -152,6 +152,9 @@ def _sound_heads(
         for name in names:
             part[name] = found[name]
         parts.append(part)
+        if (part["row"] != np.arange(start, start + len(part))).any():
+            # A log may have a hole behind its rows.
+            break
     heads = np.concatenate(parts)
     is_step = heads["flags"] & STEP != 0
     sound = heads["row"] == np.arange(first, first + len(heads))
