@@ -30,7 +30,6 @@ from sound_files import (
     manifest,
     metadata,
     source,
-    stats,
     stored,
 )
 from trajectories_by_hand import add_row, new_logs, write_log
@@ -40,7 +39,6 @@ from mjrec.formats.manifest import read_manifest
 from mjrec.formats.monitor_directory import Infix, episode_of, infix_of
 from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.json_text import dumps, loads
 from mjrec.results.manifest_and_stats import update_manifests
 from mjrec.simulation.model_trust import note_models
 from mjrec.simulation.source_compiler import compile_within
@@ -209,42 +207,6 @@ def test_json_bombs_are_refused(
     inspector.refuses(kind, path)
 
 
-@pytest.mark.parametrize("value", ["1e400", "1e30", "-9223372036854775808", "NaN"])
-def test_counts_are_numbers_that_can_be_counted(
-    inspector: Inspector, directory: Path, value: str
-) -> None:
-    """An episode's length is none of these."""
-    path = stats(directory)
-    path.write_text(path.read_text().replace("[3]", f"[{value}]"))
-    assert "episode_lengths" in inspector.refuses("stats", path)
-
-
-NO_NAMES = (
-    *("../x.mp4", "/etc/passwd", "a/b.mp4", "..", "a\\b", "a\0b", "a\nb", "\x1b[2J"),
-    *("\ud800", "x" * 256, "é" * 128),
-)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        *({"stats": name} for name in NO_NAMES),
-        *({"videos": [["a.mp4", name]]} for name in NO_NAMES),
-        *({"mjrec": {"broken": [name]}} for name in NO_NAMES),
-        *({"mjrec": {"pending": wrong}} for wrong in (5, [5])),
-        *({"mjrec": {"broken": wrong}} for wrong in (5, [None])),
-        *({"mjrec": {"next_episode_id": n}} for n in (-1, 1.5, True, 10**30)),
-    ],
-)
-def test_a_manifest_names_files_of_its_directory_and_counts(
-    inspector: Inspector, directory: Path, values: dict[str, Any]
-) -> None:
-    """By short names, which can be printed."""
-    path = manifest(directory)
-    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
-    inspector.refuses("manifest", path)
-
-
 def test_a_pending_video_elsewhere_is_not_looked_at(directory: Path) -> None:
     """Though its name begins as that of a video of the directory does."""
     outside = directory.parent / "openaigym.video.0.7.video000000.mp4"
@@ -266,16 +228,6 @@ def test_names_hold_small_numbers_and_no_slash() -> None:
     assert infix_of("openaigym.episodes.0.7/../x.jsonl") is None
     assert Infix.parse("1" * 10**6 + ".7") is None
     assert Infix.parse("0.7/../..") is None
-
-
-@pytest.mark.parametrize("depth", [1, 50, 99, 100, 101, 500, 100_000])
-def test_whatever_is_written_can_be_read(depth: int) -> None:
-    """What is nested too deeply is written as what Python shows of it."""
-    value: Any = 1
-    for _ in range(depth):
-        value = [value]
-    again = loads(dumps({"options": value}))
-    assert (again == {"options": value}) == (depth < 100)
 
 
 # --- trajectories --------------------------------------------------------------------

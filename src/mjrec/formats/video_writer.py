@@ -218,6 +218,15 @@ class VideoWriter:
             self._encoding.abort()
         self.closed = True
 
+    def leave(self) -> None:
+        """Take no more frames; the encoder finishes the unfinished file by itself.
+
+        Never waits. Idempotent.
+        """
+        if not self.closed and self._encoding is not None and not self._was_forked():
+            self._encoding.leave()
+        self.closed = True
+
     def __enter__(self) -> Self:
         return self
 
@@ -240,7 +249,7 @@ class VideoWriter:
             return
         # Waiting is not for a finaliser. The thread encodes what waits and ffmpeg
         # finishes its file, under the temporary name.
-        self._encoding.leave()
+        self.leave()
         warnings.warn(
             f"The VideoWriter of {self.path} was never closed; its frames are in "
             f"{self.temporary}. Use it in a with statement.",

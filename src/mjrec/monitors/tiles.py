@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ..environments.gymnasium_pictures import gymnasium_pictures
@@ -164,7 +165,7 @@ class TiledVideo:
             base_path=self._first.directory
             / f"{video_prefix(infix, episode_id)}.tiled",
             metadata={
-                **self._first._recorder.live_video_facts(),
+                **self._first._recorder.run.live_facts(),
                 "tiled": True,
                 "sub_environments": len(self._tiles.sources),
             },
@@ -196,4 +197,5 @@ class TiledVideo:
 
     def _list(self, video: VideoRecorder) -> None:
         self._video = None
-        self._first._recorder.add_video(video)
+        if video.path is not None:
+            self._first._recorder.run.trackers.expect(Path(video.path))

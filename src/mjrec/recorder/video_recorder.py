@@ -241,6 +241,12 @@ class VideoRecorder:
         if self.finished and self._sink is not None:
             self._sink.blank.judge(self._sink.path, strict=self._strict)
 
+    def leave(self) -> None:
+        """Let go of the files as SIGKILL would; recovery finishes the video."""
+        if not self.closed and self._sink is not None:
+            self._sink.leave()
+        self.closed = True
+
     def discard(self) -> None:
         """End without a video and without metadata."""
         if not self.closed:
