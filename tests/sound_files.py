@@ -21,7 +21,7 @@ from mjrec.formats.spans import list_paths
 from mjrec.formats.stats_file import StatsFile, write_stats_file
 from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.simulation.authored_model import authored_from_file
+from mjrec.simulation.model_sources import authored_from_file
 from mjrec.simulation.model_store import ModelStore
 
 PARTS = (".spans", ".log", ".tail", ".looks")

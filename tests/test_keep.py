@@ -109,7 +109,7 @@ def facts_of(directory: Path, episode: int) -> dict[str, Any]:
 def render(directory: Path) -> None:
     """Render what is pending."""
     outcomes = finish(directory, workers=1)
-    assert [each.failure for each in outcomes if each.failure] == []
+    assert not any(each.failures for each in outcomes)
 
 
 class Listener(Tracker):

@@ -38,8 +38,9 @@ from ..formats.trajectory_file import (
     finish_trajectory,
 )
 from ..formats.video_metadata import is_done
+from ..rendering.jobs import RecordingKey
 from ..rendering.recorded_facts import open_for_rendering
-from ..rendering.recordings import RecordingKey, claim, recorded_episodes
+from ..rendering.recordings import claim, recorded_episodes
 from ..results.manifest_and_stats import manifest_lock, write_manifest_and_stats
 from ..results.run import Run
 

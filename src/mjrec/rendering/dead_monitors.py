@@ -47,9 +47,10 @@ from ..results.manifest_and_stats import (
     write_manifest_and_stats,
 )
 from .cut_videos import finish_text, finish_video
+from .jobs import key_of
 from .leftovers import Leftovers, leftovers_of
 from .recorded_facts import open_for_rendering, video_path
-from .recordings import claim, key_of, parts_of
+from .recordings import claim, parts_of
 
 logger = logging.getLogger(__name__)
 

@@ -17,8 +17,12 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidArgument
 from ..frames import Frame
 from .pool import WorkerPool
-from .recorded_facts import open_for_rendering
-from .recorded_frames import check_has_frames, chosen_frames, warn_of_other_frames
+from .recorded_facts import (
+    check_has_frames,
+    chosen_frames,
+    open_for_rendering,
+    warn_of_other_frames,
+)
 from .views import View, plain_camera
 
 if TYPE_CHECKING:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ClosedError, PicturesDiffer
-from .authored_model import AuthoredModel
 from .cameras import is_tracking, raw_data, raw_model
 from .captured_arrays import (
     STATE_SPEC,
@@ -27,6 +26,7 @@ from .captured_arrays import (
 )
 from .change_detection import Looks
 from .fields import VIEW_PREFIXES, is_settable
+from .model_sources import AuthoredModel
 from .model_store import ModelStore
 from .self_check import scene_difference
 from .snapshot import SnapshotSource

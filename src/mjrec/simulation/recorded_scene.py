@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
 from ..formats.trajectory import ModelChange, TrajectoryReader
-from .authored_model import with_embedded_files
 from .cameras import check_camera, raw_model
 from .fields import apply_fields, read_member
+from .model_sources import with_embedded_files
 from .model_store import load_model
 from .renderer import is_kept_by_context
 from .snapshot import restore_snapshot

@@ -28,15 +28,13 @@ from ...formats.video_metadata import StepRuns
 from ...formats.video_names import view_of
 from ...frames import grid_shape
 from ...rendering.recorded_facts import (
-    further_video_paths,
-    open_for_rendering,
-    video_path,
-)
-from ...rendering.recorded_frames import (
     ChosenFrames,
     captions,
     check_has_frames,
+    further_video_paths,
+    open_for_rendering,
     usual_fps,
+    video_path,
 )
 from ...rendering.views import PlainCamera, View, plain_camera
 from .live_pictures import told_live, why_others_are_shown
