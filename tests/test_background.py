@@ -24,8 +24,8 @@ from trajectories_by_hand import write_log
 from waiting import wait_until
 
 from mjrec import Error, Monitor
-from mjrec.formats.in_flight import find_recording, is_in_flight
 from mjrec.formats.monitor_directory import Infix
+from mjrec.formats.spans import find_recording, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.background import Background
 from mjrec.rendering.jobs import Progress
@@ -33,7 +33,7 @@ from mjrec.rendering.jobs import Progress
 # A program around it, with the directory at argv[1].
 PROGRAM = """
 import pathlib, sys
-from mjrec.formats.in_flight import recordings_in_flight
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering.background import Background
 directory = pathlib.Path(sys.argv[1])
 background = Background(directory, workers=1)

@@ -21,7 +21,7 @@ from recordings import in_flight, manifest_of
 
 import mjrec
 from mjrec.commands import main
-from mjrec.formats.in_flight import add_facts
+from mjrec.formats.spans import add_facts
 from mjrec.rendering import finish as module
 from mjrec.rendering.jobs import key_of
 from mjrec.rendering.recordings import recordings

@@ -103,7 +103,7 @@ def facts_of(directory: Path, episode: int) -> dict[str, Any]:
     found = {*directory.glob("*.h5"), *in_flight(directory)}
     [path] = [p for p in found if p.name.endswith(f".episode{episode:06d}.h5")]
     with open_trajectory(path) as reader:
-        return dict(reader.header.facts)
+        return dict(reader.facts)
 
 
 def render(directory: Path) -> None:

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import random
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from trajectories_by_hand import INFIX, add_row, new_logs, write_log
 
 from mjrec.errors import InvalidArgument, NoPictures, UnreadableFile
 from mjrec.formats.monitor_directory import trajectory_prefix
-from mjrec.formats.trajectory import Array, RowLayout, TrajectoryHeader
+from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.drawing import Drawing, trajectory_drawing
 from mjrec.rendering.pool import WorkerPool
@@ -172,11 +171,10 @@ def test_a_trajectory_without_snapshots(tmp_path: Path) -> None:
 
 def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:
     """The arrays do not fit."""
-    header = header_of(ride)
-    layout = RowLayout.packed([("geom_xpos", Array("<f8", (1, 3)))])
+    dtype = row_dtype(snapshot=packed([("geom_xpos", ("<f8", (1, 3)))]))
     logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
     path = logs.path_of(name)
-    span = logs.begin(name, dataclasses.replace(header, snapshot=layout))
+    span = logs.begin(name, facts_of(ride), dtype)
     add_row(span, 0, snapshot=0)
     logs.close()
     [model] = ride.path.parent.glob("openaigym.model.*")
@@ -188,13 +186,13 @@ def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:
     drawing.close()
 
 
-def header_of(ride: Ride) -> TrajectoryHeader:
+def facts_of(ride: Ride) -> dict[str, Any]:
     with open_trajectory(ride.path) as reader:
-        return reader.header
+        return dict(reader.facts)
 
 
 def scene_of(ride: Ride) -> dict[str, Any]:
-    return dict(header_of(ride).facts["scene"])
+    return dict(facts_of(ride)["scene"])
 
 
 def inertia_shown() -> mujoco.MjvOption:

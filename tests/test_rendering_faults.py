@@ -27,7 +27,7 @@ from mjrec import (
     render_videos,
 )
 from mjrec.formats.ffmpeg import ffmpeg_executable
-from mjrec.formats.in_flight import recordings_in_flight
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.trajectory_file import (
     find_trajectory,
     finish_trajectory,

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import time
 from collections.abc import Callable
@@ -24,13 +23,13 @@ from trajectories_by_hand import (
 )
 
 from mjrec import UnreadableFile, load_results
-from mjrec.formats.in_flight import add_facts, is_in_flight
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import (
     lock_name,
     trajectory_prefix,
     video_lock_name,
 )
+from mjrec.formats.spans import add_facts, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
 from mjrec.rendering.finish import Finisher
@@ -282,11 +281,10 @@ def write_saying(directory: Path, **facts: Any) -> Path:
     """Write a log of two frames that says these facts, of any kind."""
     usual = write_finished(directory, 1)
     with open_trajectory(usual) as reader:
-        header = reader.header
+        known, dtype = {**reader.facts, **facts}, reader.dtype
     usual.unlink()
-    header = dataclasses.replace(header, facts={**header.facts, **facts})
     logs = new_logs(directory)
-    span = logs.begin(trajectory_prefix(INFIX, 1), header)
+    span = logs.begin(trajectory_prefix(INFIX, 1), known, dtype)
     for step in range(2):
         add_row(span, step, snapshot=grey(step))
     logs.close()

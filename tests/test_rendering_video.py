@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import json
 from collections.abc import Callable
@@ -37,7 +36,7 @@ from mjrec import (
 from mjrec.annotation import Caption, annotated
 from mjrec.formats.frame_hashes import frame_hash_path
 from mjrec.formats.monitor_directory import trajectory_prefix
-from mjrec.formats.trajectory import StateComponent
+from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.video_metadata import is_done, metadata_path
 from mjrec.rendering.finish import Finisher, bring_up_to_date, finish
@@ -255,15 +254,17 @@ def facts_of_the_video(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `write_log` write what a recorder says of several cameras."""
     import trajectories_by_hand
 
-    usual = trajectories_by_hand.TrajectoryHeader
+    usual = trajectories_by_hand.SpanLogs.begin
     keys = ("cameras", "tiled", "annotate", "also_named", "selection")
 
-    def header(*, facts: dict[str, Any], **rest: Any) -> Any:
+    def begin(
+        self: Any, name: str, facts: dict[str, Any], *rest: Any, **more: Any
+    ) -> Any:
         own = {key: facts.pop(key) for key in keys if key in facts}
         video = facts["video"] and {**facts["video"], **own}
-        return usual(facts={**facts, "video": video}, **rest)
+        return usual(self, name, {**facts, "video": video}, *rest, **more)
 
-    monkeypatch.setattr(trajectories_by_hand, "TrajectoryHeader", header)
+    monkeypatch.setattr(trajectories_by_hand.SpanLogs, "begin", begin)
 
 
 def test_each_camera_has_a_video(
@@ -444,11 +445,10 @@ def test_captions_tell_time_by_what_is_known(tmp_path: Path) -> None:
     with open_trajectory(write_log(tmp_path, 1, steps=3, stride=2)) as reader:
         said = [(c.step, c.time) for c in captions(reader, [0, 1, 2])]
         assert said == [(0, 0.0), (2, 0.1), (3, 0.15)]
-        clock = dataclasses.replace(
-            reader.header, state=(StateComponent("time", 0, 1),)
-        )
+        facts, shown = reader.facts, reader.kind("snapshot")
+        clock = row_dtype(state=packed([("time", ("<f8", (1,)))]), snapshot=shown)
     logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
-    span = logs.begin(name, clock)
+    span = logs.begin(name, facts, clock)
     for step, (time, reward) in enumerate([(7.0, 0), (7.5, 0.25), (9.0, -1)]):
         add_row(span, step, reward=reward, state=time, snapshot=grey(step))
     logs.close()

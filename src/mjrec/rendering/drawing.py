@@ -169,7 +169,7 @@ def trajectory_drawing(
     with contextlib.ExitStack() as opened:
         reader = opened.enter_context(open_for_rendering(path, is_vetted=True))
         check_has_frames(reader)
-        facts = reader.header.facts
+        facts = reader.facts
         scene = RecordedScene(reader)
         model, recorded = scene.model, scene.view
         look: dict[str, Any] = {

@@ -21,8 +21,8 @@ from ..errors import (
     InvalidArgument,
 )
 from ..formats import render_failures
-from ..formats.in_flight import drop_recording, list_paths, remove_if_done
 from ..formats.second_names import give_all_second_names
+from ..formats.spans import drop_recording, list_paths, remove_if_done
 from ..formats.trajectory_file import finish_trajectory
 from ..results.manifest_and_stats import update_manifests
 from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of

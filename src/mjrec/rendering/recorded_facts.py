@@ -79,7 +79,7 @@ def open_for_rendering(path: Path, *, is_vetted: bool = False) -> TrajectoryRead
     reader = open_trajectory(path) if is_vetted else open_vetted_trajectory(path)
     try:
         with unreadable(path):
-            _check_all(reader.header.facts, _FACTS)
+            _check_all(reader.facts, _FACTS)
     except BaseException:
         reader.close()
         raise
@@ -153,7 +153,7 @@ class ChosenFrames(NamedTuple):
 
 def check_has_frames(reader: TrajectoryReader) -> None:
     """Raise NoPictures, with the reason, if a trajectory has nothing to be drawn."""
-    facts = reader.header.facts
+    facts = reader.facts
     if facts.get("scene") is not None and reader.frame_count:
         return
     reason = facts.get("refusal") or (
@@ -231,7 +231,7 @@ def captions(reader: TrajectoryReader, indices: Sequence[int]) -> Iterator[Capti
     Raises:
         UnreadableFile: the file is damaged. All of it is read before this returns.
     """
-    facts = reader.header.facts
+    facts = reader.facts
     episode_id, before = int(facts.get("episode_id") or 0), facts.get("clip") or {}
     steps = reader.frame_steps[list(indices)]
     # One after the other, as the monitor adds them up.
@@ -260,7 +260,7 @@ def _times(
         began = clock[0] if reset_time is None else reset_time
         elapsed: list[float] = (clock[steps] - began).tolist()
         return elapsed
-    timestep = reader.header.facts.get("timestep")
+    timestep = reader.facts.get("timestep")
     if timestep is None:
         return None
     return [float(step * Fraction(timestep)) for step in steps.tolist()]
@@ -268,13 +268,13 @@ def _times(
 
 def _clock(reader: TrajectoryReader) -> NDArray[np.float64] | None:
     """Return the simulated time of each state, read in blocks; None without states."""
-    offsets = [part.offset for part in reader.header.state if part.name == "time"]
-    if not offsets or not reader.row_count:
+    clock = reader.columns.get("time")
+    if clock is None or not reader.row_count:
         return None
-    rows = max(1, _BLOCK_BYTES // (8 * max(1, reader.header.state_length)))
+    rows = max(1, _BLOCK_BYTES // reader.dtype["state"].itemsize)
     blocks = [
         # A copy, so that the states themselves need not stay in memory.
-        reader.states(start, min(start + rows, reader.row_count))[:, offsets[0]].copy()
+        reader.states(start, min(start + rows, reader.row_count))[:, clock.start].copy()
         for start in range(0, reader.row_count, rows)
     ]
     return np.concatenate(blocks)

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from ..errors import DirectoryNotWritable, UnreadableFile
 from ..formats.frame_hashes import frame_hash_path
-from ..formats.in_flight import recordings_in_flight
 from ..formats.locks import Lock, is_locked, try_lock
 from ..formats.monitor_directory import (
     ClipPart,
@@ -30,7 +29,7 @@ from ..formats.monitor_directory import (
     lock_name,
     names_in,
 )
-from ..formats.spans import FINISHED
+from ..formats.spans import FINISHED, recordings_in_flight
 from ..formats.trajectory import added_up
 from ..formats.trajectory_file import find_trajectory
 from ..formats.video_metadata import is_done, metadata_path
@@ -133,7 +132,7 @@ def read_recording(parts: Sequence[Path]) -> Recorded:
         if clip is not None and clip.number != number:
             raise UnreadableFile(path, f"part {number} of its video is not there")
         with open_for_rendering(path) as reader:
-            facts.append(reader.header.facts)
+            facts.append(reader.facts)
             frame_counts.append(reader.frame_count)
             rewards.append(reader.rewards)
             steps = reader.frame_steps

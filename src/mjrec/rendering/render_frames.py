@@ -90,7 +90,7 @@ def render(
         quality=quality,
     )
     with open_for_rendering(path) as reader:
-        facts = reader.header.facts
+        facts = reader.facts
         check_has_frames(reader)
         warn_of_other_frames(path.name, facts)
         chosen = chosen_frames(reader.frame_count, facts, max_fps)

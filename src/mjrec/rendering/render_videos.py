@@ -15,8 +15,8 @@ from typing import Any
 from ..annotation import check_annotation
 from ..engines.work import Engine
 from ..errors import InvalidArgument
-from ..formats.in_flight import is_in_flight
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
+from ..formats.spans import is_in_flight
 from ..formats.video_names import camera_part, name_part
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_models

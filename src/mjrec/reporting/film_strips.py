@@ -156,7 +156,7 @@ class _Shots:
 def _of_trajectory(path: Path, count: int, view: View) -> Iterator[_Shots]:
     with open_for_rendering(path) as reader:
         check_has_frames(reader)
-        warn_of_other_frames(path.name, reader.header.facts)
+        warn_of_other_frames(path.name, reader.facts)
         indices = _spread(reader.frame_count, count, path)
         times = [caption.time for caption in captions(reader, indices)]
     workers = WorkerPool(1)
