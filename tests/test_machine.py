@@ -10,7 +10,6 @@ import pytest
 
 from mjrec.machine import cgroup_cpu_quota, gpu_device_files, usable_cpus
 
-_OLD = {"cpu.cfs_quota_us": "150000\n", "cpu.cfs_period_us": "100000\n"}
 _DEEP = {
     "a/cpu.max": "100000 100000\n",
     "a/b/cpu.max": "400000 100000\n",
@@ -22,29 +21,19 @@ _DEEP = {
     ("own", "files", "expected"),
     [
         ("0::/\n", {"cpu.max": "250000 100000\n"}, 2.5),
-        # The same with the files of version 1.
-        (
-            "4:cpu,cpuacct:/job\n0::/\n",
-            {f"cpu,cpuacct/job/{name}": text for name, text in _OLD.items()},
-            1.5,
-        ),
         # The least quota on the way up counts.
         ("0::/a/b/c\n", _DEEP, 1.0),
         # No limit is said, or none is to be found.
         ("0::/\n", {"cpu.max": "max 100000\n"}, None),
         ("0::/\n", {}, None),
-        (
-            "1:cpu:/\n",
-            {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"},
-            None,
-        ),
+        ("1:cpu:/\n", {"cpu.max": "100000 100000\n"}, None),
         ("", {}, None),
     ],
 )
 def test_cpus_that_the_cgroup_grants(
     own: str, files: dict[str, str], expected: float | None, tmp_path: Path
 ) -> None:
-    """Of both versions; None where nothing limits them."""
+    """None where nothing limits them."""
     root = tmp_path / "cgroup"
     for name, content in files.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from pathlib import Path
 
 import pytest
 
@@ -29,37 +29,23 @@ NAMES = (
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_name_stays_in_its_directory_and_is_short(name: str) -> None:
-    """However the model calls its camera."""
+    """However the model calls its camera; it is no first video's."""
+    file = with_part(FIRST, camera_part(name))
+    assert (infix_of(file), episode_of(file)) == ("0.7", 27)
+    assert MonitorFiles("0.7", [Path(file)]).videos == {}
     assert re.fullmatch(r"[A-Za-z0-9_%-]{1,90}", camera_part(name))
     hidden = f".{with_part(FIRST, camera_part(name))}.framehash.12345678.part"
     assert len(hidden) < 255
 
 
-def test_names_are_readable_and_reversible() -> None:
-    """Plain ones stay as they are; others are percent-encoded."""
-    assert camera_part("top-left_2") == "top-left_2"
-    assert camera_part("a b/ü.~") == "a%20b%2F%C3%BC%2E%7E"
-    assert camera_part(-1) == "-1"
-
-
 def test_each_name_gives_another_part() -> None:
     """None is taken for another one, or for another part of a name."""
+    assert camera_part("a b/ü.~") == "a%20b%2F%C3%BC%2E%7E"
+    assert tiled_name(FIRST) == "openaigym.video.0.7.video000027.tiled.mp4"
     parts = [camera_part(name) for name in NAMES]
     assert len(set(parts)) == len(parts)
     taken = {"tiled", "draft", "full", "640x480", "25fps", "meta", "plain", "annotated"}
     assert not taken & set(parts)
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("ending", ["mp4", "meta.json", "framehash"])
-def test_a_further_video_is_of_its_episode_and_not_the_first(
-    name: str, ending: str, tmp_path: Any
-) -> None:
-    """Also where the camera is called like an episode."""
-    file = with_part(FIRST, camera_part(name)).removesuffix("mp4") + ending
-    assert (infix_of(file), episode_of(file)) == ("0.7", 27)
-    files = MonitorFiles("0.7", [tmp_path / file])
-    assert {**files.videos, **files.metadata} == {}
 
 
 def test_further_cameras_never_share_a_name() -> None:
@@ -70,32 +56,17 @@ def test_further_cameras_never_share_a_name() -> None:
     ]
 
 
-def test_the_tiled_video_has_a_name_of_its_own() -> None:
-    """No camera is called so."""
-    assert tiled_name(FIRST) == "openaigym.video.0.7.video000027.tiled.mp4"
-    assert further_parts(["a", "tiled"]) == ["camera-tiled"]
-
-
-@pytest.mark.parametrize(
-    "name", ["rl-video-episode-27.mp4", "a-step-0.mp4", "_.x-1-episode-3-step-4.mp4"]
-)
-def test_gymnasiums_names_are_second_names(name: str) -> None:
-    """With any prefix that is portable."""
-    assert is_second_name(name)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
+def test_gymnasiums_names_are_second_names() -> None:
+    """With any prefix that is portable; others may come from a file of anybody's."""
+    for name in ("rl-video-episode-27.mp4", "a-step-0.mp4", "_.x-1-episode-3.mp4"):
+        assert is_second_name(name)
+    for name in (
         *("openaigym-episode-1.mp4", "../rl-video-episode-27.mp4", ".x-episode-1.mp4"),
         *("rl-video-27.mp4", "a-episode-1.mp4\n", "a-episode-1.sh", "-episode-1.mp4"),
         *("a/b-episode-1.mp4", f"{'a' * 200}-episode-1.mp4", f"a-step-{'1' * 99}.mp4"),
         *("ü-episode-1.mp4", "a-episode-\N{ARABIC-INDIC DIGIT ONE}.mp4", ""),
-    ],
-)
-def test_other_names_are_none(name: str) -> None:
-    """They may come from a file that is anybody's."""
-    assert not is_second_name(name)
+    ):
+        assert not is_second_name(name)
 
 
 def test_what_belongs_to_a_video_is_called_alike() -> None:

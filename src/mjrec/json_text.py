@@ -13,11 +13,9 @@ stack than its length lets one expect, is refused.
 
 from __future__ import annotations
 
-import contextlib
-import functools
 import json
 import math
-import uuid
+import re
 from collections import Counter
 from typing import Any
 
@@ -33,6 +31,10 @@ _MOST_VALUES = 1 << 24
 
 _FLAT = {str, int, float, bool, type(None)}
 
+# Texts, and what Python writes of numbers that JSON does not have.
+_TOKENS = re.compile(r'"(?:[^"\\]|\\.)*"|-?Infinity|NaN')
+_NUMBERS = {"NaN": "null", "Infinity": "1e999", "-Infinity": "-1e999"}
+
 
 def dumps(value: object, *, indent: int | None = None) -> str:
     """Return `value` as JSON text.
@@ -42,19 +44,15 @@ def dumps(value: object, *, indent: int | None = None) -> str:
     must never stop a run.
     """
     # Nearly everything is plain, and this is many times as fast.
-    if _is_plain(value):
-        with contextlib.suppress(TypeError, ValueError):
-            return _encoder(indent).encode(value)
-    # json offers no hook for floats. A string that cannot occur by chance stands in
-    # for infinity and is exchanged for the number afterwards.
-    mark = uuid.uuid4().hex
-    text = json.dumps(_made_plain(value, mark, ()), indent=indent, allow_nan=False)
-    return text.replace(f'"-{mark}"', "-1e999").replace(f'"{mark}"', "1e999")
-
-
-@functools.cache
-def _encoder(indent: int | None) -> json.JSONEncoder:
-    return json.JSONEncoder(allow_nan=False, indent=indent)
+    try:
+        text = json.dumps(
+            value if _is_plain(value) else _made_plain(value), indent=indent
+        )
+    except TypeError:
+        text = json.dumps(_made_plain(value), indent=indent)
+    if "NaN" in text or "Infinity" in text:
+        text = _TOKENS.sub(lambda match: _NUMBERS.get(match[0], match[0]), text)
+    return text
 
 
 def loads(text: str | bytes) -> Any:
@@ -122,53 +120,31 @@ def _is_plain(value: object, room: int = _DEEPEST) -> bool:
     )
 
 
-def _made_plain(value: object, mark: str, outer: tuple[int, ...]) -> Any:
+def _made_plain(value: object, outer: tuple[int, ...] = ()) -> Any:
     """Return `value` as what JSON knows.
 
     Args:
         value: anything.
-        mark: stands for infinity.
         outer: the identities of what `value` is inside of.
     """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     is_too_deep = len(outer) == _DEEPEST - 1 or id(value) in outer
     inside = (*outer, id(value))
     match value:
-        case None | bool() | str():
+        case None | bool() | str() | int() | float():
             return value
-        case np.bool_():
-            return bool(value)
-        case int() | np.integer():
-            return int(value)
-        case float() | np.floating():
-            return _plain_float(float(value), mark)
-        case np.ndarray():
-            return _made_plain(value.tolist(), mark, outer)
         case dict() if not is_too_deep and len(set(map(_key, value))) == len(value):
-            return {
-                _key(k): _made_plain(item, mark, inside) for k, item in value.items()
-            }
+            return {_key(k): _made_plain(item, inside) for k, item in value.items()}
         case list() | tuple() | set() | frozenset() if not is_too_deep:
-            return [_made_plain(item, mark, inside) for item in value]
-        case _:
-            return {"repr": _shown(value)}
+            return [_made_plain(item, inside) for item in value]
+    try:
+        return {"repr": repr(value)}
+    except RecursionError:
+        return {"repr": f"<{type(value).__name__}, nested very deeply>"}
 
 
 def _key(key: object) -> str:
     if key is None or isinstance(key, bool | int | float):
         return json.dumps(key)
     return str(key)
-
-
-def _shown(value: object) -> str:
-    try:
-        return repr(value)
-    except RecursionError:
-        return f"<{type(value).__name__}, nested very deeply>"
-
-
-def _plain_float(value: float, mark: str) -> float | str | None:
-    if math.isnan(value):
-        return None
-    if math.isinf(value):
-        return mark if value > 0 else f"-{mark}"
-    return value

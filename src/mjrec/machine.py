@@ -41,20 +41,23 @@ def cgroup_cpu_quota(
 ) -> float | None:
     """Return the CPUs that the cgroup grants, or None where nothing limits them.
 
-    A limit on any group above counts too; both versions of cgroups are read.
+    A limit on any group above counts too. Those of version 2 are read.
 
     Args:
-        root: where the cgroup file systems are mounted.
+        root: where the cgroup file system is mounted.
         own: the file that names the groups of this process.
     """
-    quotas = []
-    for controllers, group in _own_groups(own):
-        if controllers == "":
-            quotas += [_quota_v2(root / part) for part in _upwards(group)]
-        elif "cpu" in controllers.split(","):
-            for mounted in (root / "cpu", root / controllers):
-                quotas += [_quota_v1(mounted / part) for part in _upwards(group)]
-    return min((quota for quota in quotas if quota is not None), default=None)
+    # Inside a container the path may be the host's, of which nothing is mounted; the
+    # root then is the container's own group.
+    groups = [line.split("::", 1) for line in _lines(own)]
+    quotas = [
+        quota
+        for group in groups
+        if group[0] == "0" and len(group) == 2
+        for path in (PurePosixPath(group[1].lstrip("/")) / "_").parents
+        if (quota := _quota(root / path / "cpu.max")) is not None
+    ]
+    return min(quotas, default=None)
 
 
 def gpu_device_files(*, root: Path = Path("/dev")) -> list[str]:
@@ -98,56 +101,24 @@ def cpu_flags() -> tuple[str, ...]:
     return tuple(sorted(flags.split()))
 
 
-def _own_groups(own: Path) -> list[tuple[str, str]]:
-    """Return pairs of controllers ("" is version 2) and the group's path."""
-    try:
-        lines = own.read_text().splitlines()
-    except OSError:
-        return []
-    fields = (line.split(":", 2) for line in lines)
-    return [(field[1], field[2]) for field in fields if len(field) == 3]
-
-
-def _upwards(group: str) -> list[str]:
-    """Return the relative paths of a group and all those above it.
-
-    Inside a container the path may be the host's, of which nothing is mounted; the
-    last one, the root, then is the container's own group.
-    """
-    path = PurePosixPath(group.lstrip("/"))
-    return [str(part) for part in (path, *path.parents)]
-
-
-def _quota_v2(group: Path) -> float | None:
-    words = _words(group / "cpu.max")
+def _quota(file: Path) -> float | None:
+    words = " ".join(_lines(file)).split()
     if len(words) != 2 or words[0] == "max":
         return None
     return int(words[0]) / int(words[1])
 
 
-def _quota_v1(group: Path) -> float | None:
-    quota = _words(group / "cpu.cfs_quota_us")
-    period = _words(group / "cpu.cfs_period_us")
-    if not quota or not period or int(quota[0]) <= 0:
-        return None
-    return int(quota[0]) / int(period[0])
-
-
-def _words(path: Path) -> list[str]:
+def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text().split()
+        return path.read_text(errors="replace").splitlines()
     except OSError:
         return []
 
 
 @functools.cache
 def _cpuinfo() -> Mapping[str, str]:
-    try:
-        lines = _CPUINFO.read_text(errors="replace").splitlines()
-    except OSError:
-        lines = []
     said: dict[str, str] = {}
-    for line in lines:
+    for line in _lines(_CPUINFO):
         name, colon, value = line.partition(":")
         if colon:
             said.setdefault(name.strip(), value.strip())

@@ -12,6 +12,7 @@ permissions are left out, so the same videos give the same bytes.
 
 from __future__ import annotations
 
+import errno
 import gzip
 import io
 import os
@@ -26,6 +27,7 @@ from typing import IO
 
 from ..errors import ArchiveError
 from ..json_text import dumps
+from .regular_files import open_regular
 
 MAX_VIDEOS = 100
 
@@ -83,21 +85,15 @@ def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
                 "recorder's `functional`."
             )
         if not os.path.lexists(metadata):
-            yield (
-                f"There is no metadata {metadata} for the video {video}. A video "
-                "recorder writes it beside each video."
-            )
+            yield f"There is no metadata {metadata} for the video {video}."
         for path in (video, metadata):
             if not stat.S_ISREG(path.lstat().st_mode):
-                yield (
-                    f"{path} is a link, a directory or a device. Give the file itself."
-                )
+                yield f"{path} is a link, a directory or a device. Give the file."
         for path in (video, metadata):
             if path.name in taken:
                 yield (
                     f"The name {path.name!r} is there twice (the second time as "
-                    f"{path}). An archive has no directories: every file needs a name "
-                    "of its own."
+                    f"{path}), and an archive has no directories."
                 )
             taken.add(path.name)
         plain = "it must be letters, digits, '_', '-' and '.', ending in"
@@ -106,10 +102,7 @@ def _objections(pairs: Sequence[_Pair]) -> Iterator[str]:
         if video.name.endswith(".meta.json"):
             yield f"{video.name!r} is the name of metadata, not of a video."
         if video.name.lower() == _MANIFEST:
-            yield (
-                f"A video cannot be called {video.name!r}: that is the archive's own "
-                "list."
-            )
+            yield f"{video.name!r} is the archive's own list, and no name for a video."
         if not _METADATA_NAME.fullmatch(metadata.name):
             yield f"{metadata.name!r} is no name for metadata: {plain} .meta.json."
 
@@ -130,16 +123,12 @@ def _pack(pairs: Sequence[_Pair], whole: IO[bytes]) -> None:
 
 
 def _add_file(tar: tarfile.TarFile, path: Path) -> None:
-    # Whatever was put there since the checks is not followed or waited for.
-    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
-        with os.fdopen(os.open(path, flags), "rb") as file:
-            status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise OSError("it is no regular file any more")
-            _add(tar, path.name, status.st_size, file)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+        with open_regular(path) as file:
+            _add(tar, path.name, os.fstat(file.fileno()).st_size, file)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise OSError(errno.EIO, reason or str(error), str(path)) from error
 
 
 def _add(tar: tarfile.TarFile, name: str, size: int, content: IO[bytes]) -> None:

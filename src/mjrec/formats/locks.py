@@ -24,7 +24,6 @@ import stat
 import time
 import weakref
 from pathlib import Path
-from typing import Self
 
 # Whoever asks `is_locked` holds a lock for a moment, which is no reason to give up.
 _MOMENTS = 5
@@ -52,36 +51,34 @@ class Lock:
         OSError: it cannot be made there.
     """
 
-    _path: Path
-    _descriptor: int | None = None
-
     def __init__(self, path: Path, content: str, *, mode: int = 0o644) -> None:
-        self._path = path
         # Python opens every descriptor close-on-exec: an encoder that outlives this
         # process does not keep the lock.
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
-        self._hold(descriptor)
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
+        self._take(path, os.open(path, flags, mode))
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-            os.write(descriptor, content.encode())
-            if not _is_at(descriptor, path):
+            if not self._lock(fcntl.LOCK_EX, content):
                 # Before it was locked it looked like a dead monitor's.
                 raise FileExistsError(f"{path} was removed while it was being locked")
         except BaseException:
             self.release()
             raise
 
-    @classmethod
-    def _of(cls, path: Path, descriptor: int) -> Self:
-        """Return the lock of a file that this process has open and locked."""
-        lock = cls.__new__(cls)
-        lock._path = path
-        lock._hold(descriptor)
-        return lock
-
-    def _hold(self, descriptor: int) -> None:
-        self._descriptor = descriptor
+    def _take(self, path: Path, descriptor: int) -> None:
+        self._path = path
+        self._descriptor: int | None = descriptor
         _held.add(self)
+
+    def _lock(self, operation: int, content: str) -> bool:
+        """Lock the file; False where another one is in its place by now."""
+        fcntl.flock(self.fileno(), operation)
+        if not _is_at(self.fileno(), self._path):
+            return False
+        # A full disk takes no content; what counts is who holds the file.
+        with contextlib.suppress(OSError):
+            os.ftruncate(self.fileno(), 0)
+            os.write(self.fileno(), content.encode())
+        return True
 
     def fileno(self) -> int:
         """Return the descriptor. A process that inherits it holds the lock too."""
@@ -100,15 +97,12 @@ class Lock:
 
         A file that somebody has put in its place stays.
         """
-        descriptor, self._descriptor = self._descriptor, None
-        if descriptor is None:
-            return
         try:
             # Removed while it is still held: nobody ever sees it unlocked.
-            if _is_at(descriptor, self._path):
+            if self._descriptor is not None and _is_at(self._descriptor, self._path):
                 self._path.unlink(missing_ok=True)
         finally:
-            os.close(descriptor)
+            self.let_go()
 
 
 def try_lock(path: Path, content: str) -> Lock | None:
@@ -143,21 +137,17 @@ def wait_for_lock(path: Path, content: str) -> Lock:
 
 def _taken(path: Path, content: str, operation: int) -> Lock:
     while True:
-        descriptor = _opened(path)
+        lock = Lock.__new__(Lock)
+        lock._take(path, _opened(path))
         try:
-            fcntl.flock(descriptor, operation)
-            # Its holder may have removed it between the two lines above, and somebody
-            # else have made another: then this one guards nothing.
-            if _is_at(descriptor, path):
-                os.ftruncate(descriptor, 0)
-                # A full disk takes no content; what counts is who holds the file.
-                with contextlib.suppress(OSError):
-                    os.write(descriptor, content.encode())
-                return Lock._of(path, descriptor)
+            # Its holder may have removed it after it was opened, and somebody else
+            # have made another: then this one guards nothing.
+            if lock._lock(operation, content):
+                return lock
         except BaseException:
-            os.close(descriptor)
+            lock.let_go()
             raise
-        os.close(descriptor)
+        lock.let_go()
 
 
 def _opened(path: Path) -> int:
@@ -165,26 +155,16 @@ def _opened(path: Path) -> int:
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR | _CAREFULLY, 0o644)
     except OSError as error:
-        if error.errno in _OF_OTHER_THINGS:
-            raise _no_lock(path) from error
-        raise
-    if not _can_be_lock(descriptor):
+        if error.errno not in _OF_OTHER_THINGS:
+            raise
+    else:
+        facts = os.fstat(descriptor)
+        # One that has just been removed has no name at all.
+        if stat.S_ISREG(facts.st_mode) and facts.st_nlink <= 1:
+            return descriptor
         os.close(descriptor)
-        raise _no_lock(path)
-    return descriptor
-
-
-def _can_be_lock(descriptor: int) -> bool:
-    facts = os.fstat(descriptor)
-    # One that has just been removed has no name at all.
-    return stat.S_ISREG(facts.st_mode) and facts.st_nlink <= 1
-
-
-def _no_lock(path: Path) -> OSError:
-    return OSError(
-        errno.EINVAL,
-        f"{path.name} is a link or no regular file, which no lock is. Remove it",
-    )
+    what = f"{path.name} is a link or no regular file, which no lock is. Remove it"
+    raise OSError(errno.EINVAL, what)
 
 
 def is_locked(path: Path) -> bool:
@@ -223,9 +203,7 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 def _forget_locks_of_the_parent() -> None:
     for lock in list(_held):
-        descriptor, lock._descriptor = lock._descriptor, None
-        if descriptor is not None:
-            os.close(descriptor)
+        lock.let_go()
 
 
 os.register_at_fork(after_in_child=_forget_locks_of_the_parent)

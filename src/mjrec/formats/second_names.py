@@ -13,15 +13,12 @@ is neither replaced nor removed.
 from __future__ import annotations
 
 import contextlib
-import filecmp
 import itertools
 import logging
 import os
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
-from ..atomic_files import temporary_path
 from .monitor_directory import episode_of, iter_monitor_files
 from .video_metadata import finished_videos, metadata_of, metadata_path
 from .video_names import is_second_name, second_name_of, without_part
@@ -65,8 +62,9 @@ def take_second_names(video: Path) -> None:
     Raises:
         OSError: one cannot be removed.
     """
-    for link in second_names(video):
-        link.unlink(missing_ok=True)
+    for file, link in _second_names(video):
+        if _is_same(file, link):
+            link.unlink()
 
 
 def is_called_like_second(name: str) -> bool:
@@ -76,15 +74,6 @@ def is_called_like_second(name: str) -> bool:
             video = f"{name.removesuffix(ending)}.mp4"
             return is_second_name(video) or is_second_name(without_part(video))
     return False
-
-
-def second_names(video: Path) -> list[Path]:
-    """Return the second names that a video and what belongs to it have now.
-
-    Args:
-        video: the first video of an episode.
-    """
-    return [link for file, link in _second_names(video) if _is_same(file, link)]
 
 
 def _second_names(video: Path) -> Iterator[tuple[Path, Path]]:
@@ -119,44 +108,18 @@ def _link(file: Path, link: Path) -> None:
                 file.name,
             )
         return
-    ways: tuple[Callable[[], object], ...] = (
-        lambda: link.hardlink_to(file),
-        lambda: link.symlink_to(file.name),
-        # Where the file system knows no links at all.
-        lambda: _copy(file, link),
-    )
-    for way in ways:
+    # Somebody else may be quicker.
+    with contextlib.suppress(FileExistsError):
         try:
-            way()
+            link.hardlink_to(file)
         except FileExistsError:
-            # Somebody else was quicker.
-            return
-        except OSError as error:
-            failure = error
-        else:
-            return
-    raise failure
-
-
-def _copy(file: Path, link: Path) -> None:
-    unfinished = temporary_path(link)
-    try:
-        shutil.copyfile(file, unfinished)
-        # Claimed, so that nothing is replaced that is anybody else's.
-        with contextlib.suppress(FileExistsError):
-            link.open("xb").close()
-            unfinished.replace(link)
-    finally:
-        unfinished.unlink(missing_ok=True)
+            raise
+        except OSError:
+            link.symlink_to(file.name)
 
 
 def _is_same(file: Path, link: Path) -> bool:
-    """Tell whether a name leads to a file, or to a copy of it."""
     try:
-        return link.samefile(file) or (
-            link.is_file()
-            and not link.is_symlink()
-            and filecmp.cmp(file, link, shallow=False)
-        )
+        return link.samefile(file)
     except OSError:
         return False

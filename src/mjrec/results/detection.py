@@ -11,7 +11,7 @@ from pathlib import Path
 from ..errors import DirectoryInUse
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import is_manifest, iter_monitor_files
-from ..formats.second_names import is_called_like_second, second_names
+from ..formats.second_names import is_called_like_second
 
 logger = logging.getLogger(__name__)
 
@@ -69,16 +69,14 @@ def clear_monitor_files(directory: str | os.PathLike[str]) -> None:
 
 
 def _second_names(directory: Path, paths: Iterable[Path]) -> list[Path]:
-    """Return the other names in a directory of these files, and copies of them."""
+    """Return the other names in a directory of these files."""
     # What a monitor's file itself is a link to is somebody else's.
     files = {file for path in paths if (file := _file(path, follow=False))}
-    links = [
+    return [
         path
         for path in (directory.iterdir() if files else ())
         if is_called_like_second(path.name) and _file(path, follow=True) in files
     ]
-    copies = (path for video in paths for path in second_names(video))
-    return list(dict.fromkeys([*links, *copies]))
 
 
 def _file(path: Path, *, follow: bool) -> tuple[int, int] | None:
