@@ -12,10 +12,10 @@ In the run's folder, which all machines see::
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import logging
 import math
-import os
 import shutil
 import signal
 import threading
@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 from ..atomic_files import write_text
-from ..formats.locks import is_locked, try_lock
 from ..gl.devices import visible_gpus
 from . import worker
 from .gpu_shares import GpuShare
@@ -90,7 +89,8 @@ class ArrayRun:
         self._most, self._workers, self._share = most, workers, share
         for name in ("outcomes", "logs"):
             (self._folder / name).mkdir(parents=True)
-        self._lock = try_lock(self._folder / "driver", f"{os.getpid()}\n")
+        self._sign_of_life = (self._folder / "driver").open("wb")
+        fcntl.flock(self._sign_of_life, fcntl.LOCK_EX)
         _end_earlier_runs(cluster, place)
         self._new: dict[int, Mapping[str, Any]] = {}
         self._futures: dict[int, Future[Any]] = {}
@@ -127,8 +127,7 @@ class ArrayRun:
             for job in [job for job, state in states.items() if state.is_over]:
                 del self._elements[job]
             time.sleep(_SECONDS_BETWEEN_LOOKS)
-        if self._lock is not None:
-            self._lock.release()
+        self._sign_of_life.close()
 
     def _follow(self) -> None:
         try:
@@ -284,9 +283,21 @@ def _resolve(future: Future[Any], said: Any) -> None:
 def _end_earlier_runs(cluster: Cluster, place: Path) -> None:
     """End what a killed driver has left in the same shared directory."""
     for folder in place.parent.glob("*/slurm"):
-        if folder.parent == place or is_locked(folder / "driver"):
+        if folder.parent == place or _has_driver(folder):
             continue
         logger.info("The run in %s has no driver, and is ended.", folder.parent)
         with contextlib.suppress(OSError):
             cluster.end((folder / "submitted").read_text().split())
         shutil.rmtree(folder.parent, ignore_errors=True)
+
+
+def _has_driver(folder: Path) -> bool:
+    """Tell whether the driver lives whose Slurm jobs a folder is of."""
+    try:
+        with (folder / "driver").open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
