@@ -353,7 +353,6 @@ def test_a_slack_cable_is_not_mixed_although_its_limit_is_active() -> None:
         (FLEX, "flexvert_xpos", "pos of geom"),
         (TENDONS, "wrap_xpos", "geoms instead of"),
         (TENDONS, "tendon_rgba", "rgba of geom"),
-        (TENDONS, "ten_length", "geom"),
         (SENSORS, "sensordata", "geom"),
     ],
 )
