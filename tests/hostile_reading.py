@@ -149,9 +149,9 @@ def _model(path: Path) -> None:
 
 def _source(path: Path) -> None:
     """Read what a model is made from as the process that compiles it does."""
-    from mjrec.simulation.authored_model import read_authored
+    from mjrec.simulation.model_sources import read_authored
 
-    read_authored(path, limit=1 << 24)
+    read_authored(path)
 
 
 def _mjcf(path: Path) -> None:

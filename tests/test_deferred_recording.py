@@ -16,7 +16,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -494,3 +494,39 @@ def test_works_in_a_script_without_a_main_guard(tmp_path: Path) -> None:
     command = [sys.executable, str(script), str(tmp_path / "out")]
     assert subprocess.check_output(command, text=True) == "once\n"
     assert len(list((tmp_path / "out").glob("*.mp4"))) == 1
+
+
+class Dictionaries(gymnasium.Env[Any, Any]):
+    """Nobody sees its state; observations and actions are dictionaries."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_fps": 20}
+    action_space = gymnasium.spaces.Dict(
+        {"arm": gymnasium.spaces.Box(-1, 1, (2,)), "grip": gymnasium.spaces.Box(-1, 1)}
+    )
+    observation_space = action_space
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return self.action_space.sample(), {}
+
+    def step(self, action: Any) -> Any:
+        return action, 1.5, False, False, {}
+
+
+def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> None:
+    """Dictionaries are one vector, and it is said what that was made from."""
+    options: dict[str, Any] = {"trajectory_callable": True, "observations": True}
+    with mjrec.Monitor(
+        Dictionaries(), tmp_path, False, env_id="Dict-v0", **options
+    ) as env:
+        env.reset(seed=0)
+        env.step({"arm": np.array([1.0, 2.0]), "grip": np.array([3.0])})
+        env.step({"arm": np.array([1.0, 2.0, 3.0])})
+    [path] = tmp_path.glob("*.h5")
+    recorded = mjrec.load_trajectory(path)
+    assert recorded.actions.tolist() == [[1, 2, 3], [0, 0, 0]]
+    assert recorded.rewards.tolist() == [1.5, 1.5]
+    assert recorded.facts["action_parts"] == [["arm", [2]], ["grip", [1]]]
+    assert recorded.facts["observation_parts"] == [["arm", [2]], ["grip", [1]]]
+    assert recorded.facts["irregular_actions_from"] == 1
+    assert recorded.facts["rate"] == "20"

@@ -264,7 +264,7 @@ def test_the_end_of_an_episode_that_is_interrupted(
     steps(monitor, 2)
     with monkeypatch.context() as patch:
         patch.setattr(
-            "mjrec.recorder.trajectory_recorder.TrajectoryRecorder.end",
+            "mjrec.recorder.recording.Recording.end",
             lambda *_: signal.raise_signal(signal.SIGINT),
         )
         with pytest.raises(KeyboardInterrupt):
@@ -279,16 +279,16 @@ def test_the_end_of_an_episode_that_is_interrupted(
 def test_a_handlers_exception_between_a_step_and_its_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The last step is counted and has no row: it is that exception that ended it."""
+    """The step is not counted and has no row: it is that exception that ended it."""
     env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=3)
     monitor = Monitor(env, tmp_path, lambda _: True, workers=0)
     monitor.reset(seed=0)
     steps(monitor, 2)
 
-    def handler(*_: object) -> None:
+    def handler(*_: object, **__: object) -> None:
         raise ArithmeticError("the handler's")
 
-    row = "mjrec.recorder.trajectory_recorder.TrajectoryRecorder.step"
+    row = "mjrec.recorder.recording.Recording.step"
     monkeypatch.setattr(row, handler)
     with pytest.raises(ArithmeticError), monitor:
         steps(monitor, 1)
@@ -296,3 +296,4 @@ def test_a_handlers_exception_between_a_step_and_its_row(
     facts = mjrec.load_trajectory(path).facts
     assert (facts["complete"], facts["reason"]) == (False, "exception")
     assert facts["exception"]["message"] == "the handler's"
+    assert stats_of(tmp_path)["episode_lengths"] == []

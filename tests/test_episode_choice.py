@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from mjrec.recorder.episode_choice import EpisodeChoice
-from mjrec.recorder.options import DEFERRED, OFF, RecorderOptions
+from mjrec.recorder.options import DEFERRED, RecorderOptions
 
 
 def choice(*, mode: str = DEFERRED, **options: Any) -> EpisodeChoice:
@@ -26,43 +26,6 @@ def test_a_schedule_is_asked_once_for_a_number() -> None:
     chosen = choice(video_callable=schedule)
     assert [chosen.decide(k) for k in (0, 0, 1, 1, 2)] == [True, True, False, False, 1]
     assert asked == [0, 1, 2]
-
-
-def test_what_was_decided_last_is_known() -> None:
-    """Before the first episode nothing was."""
-    chosen = choice(video_callable=lambda k: k == 1)
-    assert not chosen.is_scheduled
-    chosen.decide(1)
-    assert chosen.is_scheduled
-    chosen.decide(2)
-    assert not chosen.is_scheduled
-
-
-@pytest.mark.parametrize(
-    ("mode", "options"),
-    [
-        (DEFERRED, {"video_callable": False}),
-        (DEFERRED, {"step_trigger": lambda steps: True}),
-        (OFF, {}),
-        (OFF, {"video_callable": lambda k: True}),
-    ],
-    ids=["asked", "by steps", "off", "off though asked"],
-)
-def test_no_episode_has_a_video_of_its_own(mode: str, options: Any) -> None:
-    """Where none was asked for, where steps begin them, and where none are drawn."""
-    chosen = choice(mode=mode, **options)
-    assert not chosen.has_videos
-    assert not any(chosen.decide(k) for k in range(3))
-
-
-def test_a_selection_is_the_schedule() -> None:
-    """Every episode may be chosen when it has ended, and the manifest says by what."""
-    chosen = choice(keep="best:2")
-    assert chosen.selection is not None
-    assert chosen.has_videos
-    assert chosen.decide(5)
-    assert chosen.schedule_name == "keep:best:2"
-    assert choice().selection is None
 
 
 @pytest.mark.parametrize(
@@ -87,37 +50,6 @@ def test_trajectories_are_kept_as_asked(
     )
     assert found == expected
     assert all(type(keeps) is bool for keeps in found)
-
-
-@pytest.mark.parametrize(
-    ("options", "episode_type", "stays"),
-    [
-        ({}, "t", False),
-        ({}, "e", True),
-        ({"trajectory_callable": True}, "t", True),
-    ],
-)
-def test_a_trajectory_may_be_there_for_its_video_only(
-    options: Any, episode_type: str, stays: bool
-) -> None:
-    """It then goes where the video is not kept."""
-    assert choice(**options).keeps_without_video(episode_type) is stays
-
-
-@pytest.mark.parametrize(
-    ("options", "episode_type", "may"),
-    [
-        ({"video_callable": False}, "t", False),
-        ({"video_callable": False}, "e", True),
-        ({"video_callable": False, "trajectory_callable": True}, "t", True),
-        ({}, "t", True),
-    ],
-)
-def test_whether_there_may_be_a_trajectory_is_known_before(
-    options: Any, episode_type: str, may: bool
-) -> None:
-    """So that nothing is taken down at a reset for nobody."""
-    assert choice(**options).may_keep_trajectory(episode_type) is may
 
 
 def test_trajectories_are_asked_for_once_a_number() -> None:

@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
-import json
-import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,14 +13,11 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from full_disk import file_size_limit
 from recorded_states import assert_same, changes_in, is_fast, trajectories
-from recordings import manifest_of, stats_of
-from waiting import wait_until
+from recordings import stats_of
 
 import mjrec
-from mjrec import FileNotWritten, Monitor, ResetNeeded
-from mjrec.formats.in_flight import recordings_in_flight
+from mjrec import Monitor
 
 CHEETAH, HOPPER, PENDULUM = "HalfCheetah-v5", "Hopper-v5", "InvertedPendulum-v5"
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -110,7 +104,7 @@ def cheetah() -> Iterator[Any]:
 # --- what is recorded ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", [CHEETAH, HOPPER, PENDULUM])
+@pytest.mark.parametrize("env_id", [HOPPER, PENDULUM])
 def test_usual_steps_are_recorded_as_others_are(env_id: str, tmp_path: Path) -> None:
     """States, actions, rewards, ends and frames are the same, bit for bit."""
     usual = recorded(make(env_id, max_episode_steps=5), tmp_path / "usual", 5)
@@ -119,27 +113,6 @@ def test_usual_steps_are_recorded_as_others_are(env_id: str, tmp_path: Path) -> 
     assert len(usual) == 5
     assert usual.frame_steps.tolist() == list(range(6))
     assert_same(usual, other)
-
-
-@pytest.mark.parametrize(
-    "camera",
-    ["track", 0, -1, mujoco.MjvCamera()],
-    ids=["name", "number", "free", "own"],
-)
-def test_usual_steps_are_shown_by_any_camera(camera: Any, tmp_path: Path) -> None:
-    """One that was asked for is no reason to look more closely."""
-
-    def check(number: int, monitor: Any) -> None:
-        assert is_fast(monitor) == (number > 1)
-        assert number < 3 or monitor._recorder._subject.states._quick.is_current()
-
-    directories = tmp_path / "usual", tmp_path / "other"
-    env = make(max_episode_steps=5)
-    usual = recorded(env, directories[0], 5, camera=camera, before=check)
-    env = make(max_episode_steps=5)
-    other = recorded(env, directories[1], 5, camera=camera, usual=False)
-    assert_same(usual, other)
-    assert usual.facts["scene"] == other.facts["scene"]
 
 
 def test_states_are_those_of_the_environment(cheetah: Any, tmp_path: Path) -> None:
@@ -183,33 +156,6 @@ def test_frames_keep_to_the_rate(tmp_path: Path) -> None:
     np.testing.assert_array_equal(few.states, all_of_them.states)
     for name, values in all_of_them.snapshots.items():
         np.testing.assert_array_equal(few.snapshots[name], values[few.frame_steps])
-
-
-@pytest.mark.parametrize(
-    ("max_fps", "steps"), [(8, [0, 3, 5]), (None, [0, 1, 2, 3, 4, 5])]
-)
-def test_an_unfinished_episode_ends_with_a_frame(
-    max_fps: int | None, steps: list[int], tmp_path: Path
-) -> None:
-    """With one, also where its last step is none that the rate has one for."""
-    with monitored(make(), tmp_path, max_fps=max_fps) as monitor:
-        begin(monitor)
-        go(monitor, 5)
-    [trajectory] = trajectories(tmp_path)
-    assert trajectory.frame_steps.tolist() == steps
-    assert not trajectory.complete
-
-
-def test_observations_are_recorded_too(cheetah: Any, tmp_path: Path) -> None:
-    """Each with the state that belongs to it."""
-    with monitored(cheetah, tmp_path, observations=True) as monitor:
-        begin(monitor)
-        observations = [result[0] for result in go(monitor, 8)]
-    [trajectory] = trajectories(tmp_path)
-    assert trajectory.observations is not None
-    np.testing.assert_array_equal(trajectory.observations[1:], observations)
-    same = recorded(make(max_episode_steps=8), tmp_path / "without")
-    assert_same(trajectory, same)
 
 
 # --- statistics ----------------------------------------------------------------------
@@ -309,65 +255,6 @@ def test_a_changed_model_is_noticed_at_the_very_step(
     assert trajectory.frame_steps.tolist() == list(range(9))
 
 
-def test_a_change_that_was_said_is_recorded(cheetah: Any, tmp_path: Path) -> None:
-    """`model_changed()` finds a mass, which no picture shows, at the next step."""
-    model = cheetah.unwrapped.model
-    mass = float(model.body_mass[1])
-
-    def load(number: int, monitor: Any) -> None:
-        if number == 4:
-            model.body_mass[1] = 2 * mass
-            monitor.model_changed()
-
-    trajectory = recorded(cheetah, tmp_path, before=load)
-    assert [trajectory.model(k).body_mass[1] for k in (3, 4, 8)] == [
-        *(mass, 2 * mass, 2 * mass)
-    ]
-    assert trajectory.frame_steps.tolist() == list(range(9))
-
-
-def test_other_data_is_recorded_from_its_first_step_on(tmp_path: Path) -> None:
-    """And the first data again, where the environment goes back to it."""
-    env = make(max_episode_steps=8)
-    inner = env.unwrapped
-    first, second = inner.data, copy.copy(inner.data)
-    states = []
-
-    def swap(number: int, _: Any) -> None:
-        states.append(state_of(env))
-        if number in (3, 6):
-            inner.data = second if number == 3 else first
-            inner.data.qpos[2] += 0.1
-
-    trajectory = recorded(env, tmp_path, before=swap)
-    np.testing.assert_array_equal(trajectory.states[:8], states)
-    np.testing.assert_array_equal(trajectory.states[8, :10], state_of(env)[:10])
-    positions = trajectory.snapshots["geom_xpos"]
-    assert len(positions) == 9
-    np.testing.assert_array_equal(positions[-1], first.geom_xpos)
-
-
-def test_data_that_come_back_are_looked_at_closely(
-    cheetah: Any, tmp_path: Path
-) -> None:
-    """What was told of a change meanwhile is told of all of them."""
-    inner = cheetah.unwrapped
-    first, second = inner.data, copy.copy(inner.data)
-    mass = float(inner.model.body_mass[1])
-
-    def swap(number: int, monitor: Any) -> None:
-        if number == 3:
-            inner.data = second
-        if number == 5:
-            inner.data = first
-            inner.model.body_mass[1] = 2 * mass
-            monitor.model_changed()
-
-    trajectory = recorded(cheetah, tmp_path, before=swap)
-    masses = [trajectory.model(k).body_mass[1] for k in (4, 5, 8)]
-    assert masses == [mass, 2 * mass, 2 * mass]
-
-
 def test_another_camera_is_noticed_at_the_very_step(
     cheetah: Any, tmp_path: Path
 ) -> None:
@@ -436,34 +323,6 @@ def test_actions_of_another_kind_are_recorded_as_they_are(
     assert "not like those before" not in caplog.text
 
 
-def test_an_action_of_another_shape_is_zeros(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """With one warning; state and reward of the step are recorded as ever."""
-
-    class Repeating(gymnasium.ActionWrapper[Any, Any, Any]):
-        def action(self, action: Any) -> Any:
-            return np.resize(action, 6)
-
-    env = Repeating(make(max_episode_steps=8))
-    actions = [np.full(6, 0.1 * k) for k in range(8)]
-    actions[3] = actions[5] = np.full(2, 0.7)
-    states = []
-    with monitored(env, tmp_path) as monitor:
-        begin(monitor)
-        for action in actions:
-            monitor.step(action)
-            states.append(state_of(env))
-    [trajectory] = trajectories(tmp_path)
-    assert trajectory.actions is not None
-    for k in (3, 5):
-        actions[k] = np.zeros(6)
-    np.testing.assert_array_equal(trajectory.actions, actions)
-    np.testing.assert_array_equal(trajectory.states[1:], states)
-    assert trajectory.facts["irregular_actions_from"] == 3
-    assert caplog.text.count("not like those before") == 1
-
-
 def test_an_action_that_the_environment_overwrites(tmp_path: Path) -> None:
     """Is recorded as it was given."""
 
@@ -483,95 +342,6 @@ def test_an_action_that_the_environment_overwrites(tmp_path: Path) -> None:
 
 
 # --- errors, and the end -------------------------------------------------------------
-
-
-def test_an_environment_that_raises_may_go_on(tmp_path: Path) -> None:
-    """The failed step is not recorded, and those after it are, again as usual ones."""
-
-    def fail() -> None:
-        raise ZeroDivisionError
-
-    env = Changed(make(max_episode_steps=8), after={4: fail})
-    with monitored(env, tmp_path) as monitor:
-        begin(monitor)
-        go(monitor, 3)
-        with pytest.raises(ZeroDivisionError):
-            go(monitor, 1)
-        assert not is_fast(monitor)
-        rewards = [float(result[1]) for result in go(monitor, 2)]
-        assert is_fast(monitor)
-        state = state_of(env)
-        assert monitor.get_total_steps() == 5
-    [trajectory] = trajectories(tmp_path)
-    assert len(trajectory) == 5
-    assert trajectory.rewards[3:].tolist() == rewards
-    np.testing.assert_array_equal(trajectory.states[-1], state)
-
-
-def test_an_episode_that_ends_with_an_error_says_so(tmp_path: Path) -> None:
-    """Its last frame is that of the last step that was made."""
-
-    def fail() -> None:
-        raise ZeroDivisionError
-
-    monitor = monitored(Changed(make(), after={5: fail}), tmp_path, max_fps=8)
-    begin(monitor)
-    with pytest.raises(ZeroDivisionError):
-        go(monitor, 5)
-    monitor.close()
-    [trajectory] = trajectories(tmp_path)
-    assert len(trajectory) == 4
-    assert trajectory.facts["reason"] == "exception"
-    assert trajectory.frame_steps.tolist() == [0, 3]
-
-
-@pytest.mark.parametrize("on_error", ["raise", "warn"])
-def test_a_disk_that_is_full_in_mid_episode(on_error: str, tmp_path: Path) -> None:
-    """The trajectory ends there, the statistics do not, and the next one is whole."""
-    env = make(max_episode_steps=400)
-    monitor = monitored(env, tmp_path, on_error=on_error)
-    begin(monitor)
-    go(monitor, 400)
-    wait_until(lambda: list(tmp_path.glob("*.mjb.gz")))
-    monitor.reset(seed=1)
-    go(monitor, 2)
-    assert is_fast(monitor)
-    states, errors = [], 0
-    with file_size_limit(200):
-        for _ in range(300):
-            try:
-                go(monitor, 1)
-            except FileNotWritten:
-                errors += 1
-            states.append(state_of(env))
-    assert not is_fast(monitor)
-    go(monitor, 98)
-    begin(monitor)
-    go(monitor, 400)
-    monitor.close()
-    assert stats_of(tmp_path)["episode_lengths"] == [400, 400, 400]
-    whole, torn, same = trajectories(tmp_path)
-    assert 2 < len(torn) < 300
-    np.testing.assert_array_equal(torn.states[3:], states[: len(torn) - 2])
-    assert_same(same, whole)
-    faults = [fault["what"] for fault in manifest_of(tmp_path)["mjrec"]["faults"]]
-    assert faults.count("trajectory") == (on_error == "warn")
-    assert errors == (on_error == "raise")
-
-
-@pytest.mark.parametrize("schedule", [False, lambda _: True], ids=["counted", "all"])
-def test_statistics_may_be_set_in_mid_episode(schedule: Any, tmp_path: Path) -> None:
-    """As with gym's recorder, which is there to be used."""
-    with Monitor(make(max_episode_steps=8), tmp_path, schedule, workers=0) as monitor:
-        begin(monitor)
-        go(monitor, 3)
-        assert is_fast(monitor)
-        monitor.stats_recorder.rewards = 0
-        monitor.stats_recorder.steps = 100
-        rewards = [float(result[1]) for result in go(monitor, 5)]
-    stats = stats_of(tmp_path)
-    assert stats["episode_rewards"] == [sum(rewards)]
-    assert stats["episode_lengths"] == [105]
 
 
 def interrupt_in(monitor: Any, event_number: int) -> bool:
@@ -637,62 +407,6 @@ def test_an_interrupted_step_is_recorded_or_is_not(
     assert number > 4
 
 
-@pytest.mark.parametrize("way", ["done", "closed", "reset", "error"])
-def test_episodes_that_are_only_counted_end_like_others(
-    way: str, tmp_path: Path
-) -> None:
-    """Whoever ends them, and however."""
-    env = Changed(make())
-    monitor = Monitor(env, tmp_path, False, allow_early_reset=True)
-    begin(monitor)
-    go(monitor, 3)
-    assert is_fast(monitor)
-    if way == "done":
-        monitor.stats_recorder.done = True
-        with pytest.raises(ResetNeeded):
-            go(monitor, 1)
-    elif way == "closed":
-        monitor.close()
-        go(monitor, 1)
-    elif way == "reset":
-        begin(monitor)
-        go(monitor, 1)
-    else:
-        env.after[4] = lambda: 1 // 0
-        with pytest.raises(ZeroDivisionError):
-            go(monitor, 1)
-        assert not is_fast(monitor)
-    assert monitor.get_total_steps() == (4 if way == "reset" else 3)
-    monitor.close()
-    assert stats_of(tmp_path)["episode_lengths"] == []
-
-
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-def test_a_child_forked_in_mid_episode_is_told(cheetah: Any, tmp_path: Path) -> None:
-    """Its step does not reach the environment, and the parent goes on."""
-    told = tmp_path / "told.json"
-    with monitored(cheetah, tmp_path / "run") as monitor:
-        begin(monitor)
-        go(monitor, 4)
-        assert is_fast(monitor)
-        before = state_of(cheetah).tolist()
-        child = os.fork()
-        if child == 0:
-            try:
-                monitor.step(np.zeros(6))
-            except mjrec.Error as error:
-                same = state_of(cheetah).tolist() == before
-                told.write_text(json.dumps([str(error), same]))
-            os._exit(0)
-        assert os.waitpid(child, 0)[1] == 0
-        go(monitor, 4)
-    message, is_same = json.loads(told.read_text())
-    assert "forked" in message
-    assert is_same
-    [trajectory] = trajectories(tmp_path / "run")
-    assert_same(trajectory, recorded(make(max_episode_steps=8), tmp_path / "same"))
-
-
 def test_steps_after_the_close_go_to_the_environment(
     cheetah: Any, tmp_path: Path
 ) -> None:
@@ -711,63 +425,7 @@ def test_steps_after_the_close_go_to_the_environment(
     assert len(trajectory) == 4
 
 
-def test_a_reset_in_mid_episode_ends_it(cheetah: Any, tmp_path: Path) -> None:
-    """The next episode begins with a step that is not usual, and is its own."""
-    with monitored(cheetah, tmp_path, allow_early_reset=True) as monitor:
-        begin(monitor)
-        go(monitor, 4)
-        begin(monitor)
-        assert not is_fast(monitor)
-        go(monitor, 8)
-    early, whole = trajectories(tmp_path)
-    assert (len(early), len(whole)) == (4, 8)
-    np.testing.assert_array_equal(early.states, whole.states[:5])
-    assert (early.complete, whole.complete) == (False, True)
-
-
 # --- with others ---------------------------------------------------------------------
-
-
-def test_steps_that_reset_begin_the_next_episode(tmp_path: Path) -> None:
-    """Gymnasium's Autoreset resets in the step after the end; no episode has it."""
-    env = gymnasium.wrappers.Autoreset(make(max_episode_steps=4))
-    states = []
-    with monitored(env, tmp_path) as monitor:
-        begin(monitor)
-        states.append(state_of(env))
-        for _ in range(13):
-            go(monitor, 1)
-            states.append(state_of(env))
-        assert monitor.get_episode_lengths() == [4, 4]
-        assert monitor.get_total_steps() == 11
-    found = trajectories(tmp_path)
-    assert [len(each) for each in found] == [4, 4, 3]
-    np.testing.assert_array_equal(np.concatenate([t.states for t in found]), states)
-
-
-def test_clips_are_recorded_beside_trajectories(tmp_path: Path) -> None:
-    """Both as ever, though no step of such a monitor is a usual one."""
-    with Monitor(
-        *(make(max_episode_steps=8), tmp_path / "both"),
-        trajectory_callable=True,
-        step_trigger=lambda step: step == 2,
-        video_length=3,
-        workers=0,
-    ) as monitor:
-        begin(monitor)
-        for _ in range(8):
-            go(monitor, 1)
-            assert not is_fast(monitor)
-    same = recorded(make(max_episode_steps=8), tmp_path / "same")
-    [whole] = trajectories(tmp_path / "both")
-    np.testing.assert_array_equal(whole.states, same.states)
-    np.testing.assert_array_equal(whole.rewards, same.rewards)
-    [recording] = [
-        r for r in recordings_in_flight(tmp_path / "both") if "clip" in r.name
-    ]
-    clip = mjrec.load_trajectory(recording.path)
-    np.testing.assert_array_equal(clip.states, same.states[2:6])
-    assert clip.frame_steps.tolist() == [0, 1, 2, 3]
 
 
 # --- faults --------------------------------------------------------------------------
@@ -785,19 +443,3 @@ def test_a_monitor_may_be_closed_within_a_step(tmp_path: Path) -> None:
     assert observation.shape == (17,)
     [trajectory] = trajectories(tmp_path)
     assert len(trajectory) == 3
-
-
-def test_a_full_disk_with_a_changed_texture(tmp_path: Path) -> None:
-    """The first rows of an episode may be many bytes, and none of them is there."""
-    env = make(max_episode_steps=8)
-    with monitored(env, tmp_path, on_error="warn") as monitor:
-        begin(monitor)
-        go(monitor, 8)
-        wait_until(lambda: list(tmp_path.glob("*.mjb.gz")))
-        texture = env.unwrapped.model.tex_data
-        texture[:] = 255 - texture
-        begin(monitor)
-        with file_size_limit(200):
-            go(monitor, 4)
-        go(monitor, 4)
-    assert stats_of(tmp_path)["episode_lengths"] == [8, 8]

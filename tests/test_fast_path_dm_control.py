@@ -20,7 +20,6 @@ from recorded_states import (  # noqa: E402  after importorskip
     is_fast,
     trajectories,
 )
-from recordings import stats_of  # noqa: E402  after importorskip
 
 from mjrec import Monitor  # noqa: E402  after importorskip
 
@@ -92,46 +91,6 @@ def test_usual_steps_are_recorded_as_others_are(
     assert_same(usual, other)
 
 
-@pytest.mark.parametrize("max_fps", [None, 40])
-def test_steps_are_usual_from_the_second_one_on(
-    max_fps: int | None, tmp_path: Path
-) -> None:
-    """Until the episode is over; the step after it is a reset."""
-    with monitored(load(), tmp_path, max_fps=max_fps) as monitor:
-        seen = []
-        for _ in range(2):
-            assert monitor.step(np.zeros(6)).first()
-            for _ in range(8):
-                seen.append(is_fast(monitor))
-                last = go(monitor, 1)[0]
-            assert last.last()
-            assert not is_fast(monitor)
-    assert seen == 2 * [False, *7 * [True]]
-    assert stats_of(tmp_path)["episode_lengths"] == [8, 8]
-
-
-def test_a_changed_model_is_noticed_at_the_very_step(tmp_path: Path) -> None:
-    """A colour set before step 4 is that of frame 4."""
-
-    def paint(number: int, monitor: Any) -> None:
-        if number == 4:
-            assert is_fast(monitor)
-            monitor.physics.model.geom_rgba[1, 3] = 0.5
-
-    trajectory = recorded(load(), tmp_path, before=paint)
-    assert [trajectory.model(k).geom_rgba[1, 3] for k in (3, 4, 8)] == [1, 0.5, 0.5]
-
-
-def test_rewards_that_are_shown_are_recorded(tmp_path: Path) -> None:
-    """`visualize_reward` paints the robot anew at every step."""
-    env = load("cartpole", "balance", visualize_reward=True)
-    trajectory = recorded(env, tmp_path)
-    plain = recorded(load("cartpole", "balance"), tmp_path / "plain")
-    np.testing.assert_array_equal(trajectory.states, plain.states)
-    changed = changes_in(tmp_path)
-    assert [step for step in changed if "mat_rgba" in changed[step]] == [*range(1, 9)]
-
-
 def test_the_free_camera_follows_the_model(tmp_path: Path) -> None:
     """physics.render() places it anew for every picture, from the model's fields."""
 
@@ -144,34 +103,6 @@ def test_the_free_camera_follows_the_model(tmp_path: Path) -> None:
     changed = changes_in(tmp_path)
     assert list(changed) == [4, 6]
     assert all("camera.azimuth" in fields for fields in changed.values())
-
-
-def test_other_data_is_recorded_from_its_first_step_on(tmp_path: Path) -> None:
-    """Where the physics goes over to it in mid-episode."""
-    states = []
-
-    def note(monitor: Any) -> None:
-        physics = monitor.physics
-        spec = mujoco.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(mujoco.mj_stateSize(physics.model.ptr, spec))
-        mujoco.mj_getState(physics.model.ptr, physics.data.ptr, state, spec)
-        states.append(state)
-
-    def swap(number: int, monitor: Any) -> None:
-        note(monitor)
-        if number == 4:
-            assert is_fast(monitor)
-            physics = monitor.physics
-            physics._data = physics.copy(share_model=True).data
-            physics._data.qpos[2] += 0.1
-
-    with monitored(load(), tmp_path) as monitor:
-        monitor.reset()
-        go(monitor, 8, before=swap)
-        note(monitor)
-    [trajectory] = trajectories(tmp_path)
-    np.testing.assert_array_equal(trajectory.states, states)
-    assert len(trajectory.snapshots["geom_xpos"]) == 9
 
 
 def test_time_steps_need_no_more_than_dm_envs_ends(tmp_path: Path) -> None:

@@ -115,37 +115,6 @@ def test_failures_are_what_the_environment_calls_so(
     assert selection.is_full == (len(failed) >= most)
 
 
-@given(some_rewards, st.integers(1, 3), st.sampled_from(["best", "worst"]))
-def test_what_fell_out_never_comes_back(
-    rewards: list[float], count: int, kind: str
-) -> None:
-    """So its files may go at once, and no more than N stay."""
-    selection = selection_from(f"{kind}:{count}")
-    dropped: set[int] = set()
-    episodes = with_rewards(rewards)
-    for number, this in enumerate(episodes):
-        selection.add(this)
-        so_far = [each.episode_id for each in episodes[: number + 1]]
-        standing = {each: selection.standing(each) for each in so_far}
-        candidates = [e for e in so_far if standing[e] is Standing.CANDIDATE]
-        assert len(candidates) == selection.undecided == min(count, number + 1)
-        now = {e for e in so_far if standing[e] is Standing.DROPPED}
-        assert dropped <= now
-        dropped = now
-    assert selection.chosen == []
-    selection.close()
-    assert dropped.isdisjoint(selection.chosen)
-
-
-@given(some_rewards, st.sampled_from(["best:2", "worst:2", "failures:2", "median"]))
-def test_an_episode_may_be_told_of_twice(rewards: list[float], rule: str) -> None:
-    """Ctrl-C between the telling and what follows from it has it told again."""
-    episodes = with_rewards(rewards)
-    twice = [each for each in episodes for _ in range(2)]
-    assert told(rule, twice).finished == len(episodes)
-    assert chosen(rule, twice) == chosen(rule, episodes)
-
-
 def test_a_function_gets_the_finished_episodes() -> None:
     """All of them, in their order, once; NumPy's numbers will do."""
     calls = []

@@ -8,11 +8,8 @@ import hashlib
 import io
 import json
 import shutil
-import struct
 import threading
-import tracemalloc
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +20,8 @@ from parts import parametrize
 from PIL import Image
 
 from mjrec.errors import FileNotWritten, UnreadableFile
-from mjrec.simulation import model_store
-from mjrec.simulation.authored_model import AuthoredModel, authored_from_file
-from mjrec.simulation.model_store import (
-    ModelStore,
-    load_model,
-)
+from mjrec.simulation.model_sources import AuthoredModel, authored_from_file
+from mjrec.simulation.model_store import ModelStore, load_model
 
 MAIN = """
 <mujoco>
@@ -51,26 +44,22 @@ TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 
 SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
 
 
-def picture() -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
 @pytest.fixture
 def mjcf(tmp_path: Path) -> Path:
     """A model of five files in three directories."""
-    root = tmp_path / "authors"
+    image = io.BytesIO()
+    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(image, "PNG")
     for name, content in {
         "model/main.xml": MAIN.encode(),
         "model/parts/body.xml": BODY.encode(),
-        "model/tex/t.png": picture(),
+        "model/tex/t.png": image.getvalue(),
         "meshes/m.obj": TETRAHEDRON.encode(),
         "meshes/unused.obj": b"",
     }.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_bytes(content)
-    return root / "model/main.xml"
+        path = tmp_path / "authors" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    return tmp_path / "authors/model/main.xml"
 
 
 @pytest.fixture
@@ -102,6 +91,9 @@ def from_source(directory: Path, facts: Any) -> Any:
     return load_model(directory, {**facts, "mujoco": "3.1.4"})
 
 
+# --- what is stored ------------------------------------------------------------------
+
+
 def test_a_model_comes_back_exactly(directory: Path, mjcf: Path) -> None:
     """The facts say where it is, and what it is."""
     model = mujoco.MjModel.from_xml_path(str(mjcf))
@@ -120,13 +112,17 @@ def test_a_model_comes_back_exactly(directory: Path, mjcf: Path) -> None:
 def test_the_same_content_makes_the_same_files_once(
     directory: Path, tmp_path: Path, mjcf: Path
 ) -> None:
-    """Whoever writes them, and whenever; a file that is there is left alone."""
+    """By all writers, at any time; a file that is there is left alone."""
     authored = authored_from_file(mjcf)
     assert authored is not None
     model = mujoco.MjModel.from_xml_path(str(mjcf))
-    stored(directory, model, authored)
+    facts = stored(directory, model, authored)
     files = {path.name: path.read_bytes() for path in directory.iterdir()}
-    assert sorted(name.rpartition(".")[2] for name in files) == ["gz", "zip"]
+    assert sorted(files) == [facts["mjb"], facts["xml"]]
+    # The time in the header of gzip's format.
+    assert files[facts["mjb"]][4:8] == bytes(4)
+    with zipfile.ZipFile(directory / facts["xml"]) as archive:
+        assert {member.date_time[0] for member in archive.infolist()} == {1980}
     other = tmp_path / "other"
     other.mkdir()
     backwards = dict(reversed(authored.files.items()))
@@ -137,42 +133,25 @@ def test_the_same_content_makes_the_same_files_once(
     assert [path.stat().st_mtime_ns for path in directory.iterdir()] == times
 
 
-def test_no_file_says_when_it_was_made(directory: Path, mjcf: Path) -> None:
-    """So that the same model makes the same file tomorrow."""
-    model = mujoco.MjModel.from_xml_path(str(mjcf))
-    facts = stored(directory, model, authored_from_file(mjcf))
-    # The time in the header of gzip's format.
-    assert (directory / facts["mjb"]).read_bytes()[4:8] == bytes(4)
-    with zipfile.ZipFile(directory / facts["xml"]) as archive:
-        dates = {member.date_time for member in archive.infolist()}
-    assert dates == {(1980, 1, 1, 0, 0, 0)}
-
-
 def test_adding_does_not_write_on_the_callers_thread(
     directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And nothing half-written ever has a final name."""
+    """What changes in the model meanwhile is another model; no half file has a name."""
     threads: set[str] = set()
     rename = Path.replace
 
     def watched(path: Path, target: Path) -> Path:
         threads.add(threading.current_thread().name)
-        assert gzip.decompress(path.read_bytes()) == content_of(sphere())
+        assert gzip.decompress(path.read_bytes())
         return rename(path, target)
 
     monkeypatch.setattr(Path, "replace", watched)
-    stored(directory, sphere())
-    assert threads == {"mjrec-model store"}
-
-
-def test_a_model_that_changes_later_is_stored_as_it_was(directory: Path) -> None:
-    """Also while it is being written."""
-    model = sphere()
-    store = ModelStore(directory)
+    model, store = sphere(), ModelStore(directory)
     facts = store.add(model)
     model.geom_size[0] = 7
     again = store.add(model)
     store.finish()
+    assert threads == {"mjrec-model store"}
     assert load_model(directory, facts).geom_size[0, 0] == 0.1
     assert load_model(directory, again).geom_size[0, 0] == 7
 
@@ -191,274 +170,33 @@ def test_a_full_disk_is_one_error_and_can_be_tried_again(directory: Path) -> Non
     store.finish()
 
 
-def test_a_model_too_many_is_not_kept(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A disk that is full for long does not fill the memory; the error is told once."""
-    monkeypatch.setattr(model_store, "_MOST_KEPT", 0)
-    shutil.rmtree(directory)
-    store = ModelStore(directory)
-    facts = store.add(sphere())
-    with pytest.raises(FileNotWritten, match=facts["mjb"]):
-        store.finish()
-    directory.mkdir()
-    store.finish()
-    store.add(sphere())
-    store.finish()
-    assert load_model(directory, facts).ngeom == 1
+# --- what it was made from -----------------------------------------------------------
 
 
-def test_sources_are_gathered_as_they_lie(mjcf: Path) -> None:
-    """Included, mesh and texture files, `..` in references, and nothing else."""
+def test_another_version_compiles_the_sources(directory: Path, mjcf: Path) -> None:
+    """As they lay, wherever they are now, and what was set by hand in the model."""
     authored = authored_from_file(mjcf)
     assert authored is not None
     assert authored.main == "model/main.xml"
     assert sorted(authored.files) == [
         *("meshes/m.obj", "model/main.xml", "model/parts/body.xml", "model/tex/t.png")
     ]
-
-
-def test_another_version_compiles_the_sources(directory: Path, mjcf: Path) -> None:
-    """To the same model, wherever the authors' files are now."""
     model = mujoco.MjModel.from_xml_path(str(mjcf))
-    facts = stored(directory, model, authored_from_file(mjcf))
+    model.vis.global_.offwidth = 1234
+    model.opt.gravity[:] = [0, 1, 2]
+    model.geom_rgba[0] = [0.1, 0.2, 0.3, 1]
+    model.stat.extent = 3.5
+    facts = stored(directory, model, authored)
     shutil.rmtree(mjcf.parents[1])
     again = from_source(directory, facts)
+    assert (again.vis.global_.offwidth, again.stat.extent) == (1234, 3.5)
+    np.testing.assert_array_equal(again.opt.gravity, [0, 1, 2])
     # `_sizes` and these addresses depend on where the files were.
     names = [n for n in dir(model) if isinstance(getattr(model, n), np.ndarray)]
     for name in names:
         if not name.endswith("pathadr") and name != "_sizes":
             expected = getattr(model, name)
             np.testing.assert_array_equal(getattr(again, name), expected, name)
-
-
-def test_what_was_set_by_hand_comes_back_too(directory: Path, mjcf: Path) -> None:
-    """Gymnasium sets the buffer's size, other environments colours and positions."""
-    model = mujoco.MjModel.from_xml_path(str(mjcf))
-    model.vis.global_.offwidth = 1234
-    model.opt.gravity[:] = [0, 1, 2]
-    model.geom_rgba[0] = [0.1, 0.2, 0.3, 1]
-    model.geom_contype[0] = 5
-    model.stat.extent = 3.5
-    facts = stored(directory, model, authored_from_file(mjcf))
-    again = from_source(directory, facts)
-    assert again.vis.global_.offwidth == 1234
-    assert (again.stat.extent, again.geom_contype[0]) == (3.5, 5)
-    np.testing.assert_array_equal(again.opt.gravity, [0, 1, 2])
-    np.testing.assert_array_equal(again.geom_rgba, model.geom_rgba)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda model: model.geom_type.__setitem__(0, 3),
-        lambda model: mujoco.MjModel.from_xml_string("<mujoco/>"),
-    ],
-    ids=["other kind", "other model"],
-)
-def test_sources_of_another_model_are_not_stored(
-    directory: Path, mjcf: Path, change: Callable[[Any], Any]
-) -> None:
-    """The compiled model is, and the error says what would help."""
-    model = mujoco.MjModel.from_xml_path(str(mjcf))
-    model = change(model) or model
-    facts = stored(directory, model, authored_from_file(mjcf))
-    assert [path.name for path in directory.iterdir()] == [facts["mjb"]]
-    assert content_of(load_model(directory, facts)) == content_of(model)
-    with pytest.raises(UnreadableFile, match=r"written by mujoco 3\.1\.4, this is"):
-        from_source(directory, facts)
-
-
-def test_a_difference_in_words_counts(directory: Path) -> None:
-    """Names and texts are no fields that could be set."""
-    spoken = "<mujoco><custom><text name='t' data='{}'/></custom></mujoco>"
-    authored = AuthoredModel("a.xml", {"a.xml": spoken.format("two").encode()})
-    model = mujoco.MjModel.from_xml_string(spoken.format("one"))
-    facts = stored(directory, model, authored)
-    assert not (directory / facts["xml"]).exists()
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ('file="m.obj"', 'file="/m.obj"'),
-        ('file="m.obj"', 'file="gone.obj"'),
-        ("<asset>", '<extension><plugin plugin="mujoco.pid"/></extension><asset>'),
-        ("<mujoco>", "<mujoco"),
-        ("<mujoco>", '<!DOCTYPE m [<!ENTITY a "b">]><mujoco>'),
-    ],
-    ids=["absolute", "missing", "plugin", "broken", "entities"],
-)
-def test_what_cannot_be_stored_safely_is_left_out(
-    mjcf: Path, old: str, new: str
-) -> None:
-    """None, and the recording goes on without."""
-    mjcf.write_text(MAIN.replace(old, new))
-    assert authored_from_file(mjcf) is None
-
-
-def write_zip(path: Path, members: dict[str, str | bytes]) -> None:
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-
-
-def foreign(directory: Path, members: dict[str, str | bytes]) -> Any:
-    """Load the model of a zip that somebody made to look like one of ours."""
-    facts = stored(directory, sphere())
-    facts["xml"] = facts["mjb"].replace(".mjb.gz", ".zip")
-    contents = {"contents.json": '{"format": 1, "main": "main.xml"}'}
-    write_zip(directory / facts["xml"], {**contents, **members})
-    return from_source(directory, facts)
-
-
-def test_a_plain_foreign_zip_is_compiled(directory: Path) -> None:
-    """What the refusals below are refusals of."""
-    assert foreign(directory, {"source/main.xml": SPHERE}).ngeom == 1
-
-
-SECRET = "<mujoco><include file='{}'/></mujoco>"
-
-
-@parametrize(
-    ("members", "said"),
-    [
-        ({"source/main.xml": SECRET.format("/secret.xml")}, "plain relative"),
-        ({"source/main.xml": SECRET.format("../" * 9 + "secret.xml")}, "outside"),
-        ({"source/main.xml": SECRET.format("../secret.xml")}, "secret.xml"),
-        ({"source/main.xml": SECRET.format("..\\\\secret.xml")}, "plain relative"),
-        (
-            {
-                "source/main.xml": SECRET.format("a/part"),
-                "source/a/part": SECRET.format("/secret.xml"),
-            },
-            "plain relative",
-        ),
-        ({"source/main.xml": SPHERE, "source/../../x": ""}, "called"),
-        ({"source/main.xml": SPHERE, "source//x": ""}, "plain relative"),
-        ({"source/main.xml": "<robot name='r'/>"}, "not MJCF"),
-        (
-            {"source/main.xml": "<mujoco><extension>< plugin/></extension></mujoco>"},
-            "plugin",
-        ),
-        ({"source/main.xml": SPHERE.encode("utf-16")}, "utf-8"),
-        ({"source/other.xml": SPHERE}, "main.xml"),
-        ({"contents.json": "[]", "source/main.xml": SPHERE}, "format"),
-        ({"contents.json": '{"format": 2}'}, "format"),
-    ],
-    default=4,
-)
-def test_a_hostile_zip_reads_and_writes_nothing_elsewhere(
-    directory: Path, members: dict[str, str | bytes], said: str
-) -> None:
-    """One clear error that names the file."""
-    with pytest.raises(UnreadableFile, match=said):
-        foreign(directory, members)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "said"),
-    [
-        ("geom_bodyid", np.array([10**6], np.int32), "not set from"),
-        ("geom_rgba", np.zeros((9, 4), np.float32), "another model"),
-        ("aura", np.zeros(1), "no model field .aura"),
-        ("opt.__class__", np.zeros(()), "no model field"),
-        ("geom_rgba", np.array([[None] * 4]), "Object arrays cannot be loaded"),
-    ],
-)
-def test_hostile_fields_are_refused(
-    directory: Path, name: str, value: Any, said: str
-) -> None:
-    """Indices that MuJoCo would trust, objects, names of anything else."""
-    buffer = io.BytesIO()
-    np.save(buffer, value)
-    members = {"source/main.xml": SPHERE, f"fields/{name}.npy": buffer.getvalue()}
-    with pytest.raises(UnreadableFile, match=said):
-        foreign(directory, members)
-
-
-def test_a_bomb_of_a_zip_is_not_unpacked(directory: Path) -> None:
-    """Its content would be many times what the model needs."""
-    with pytest.raises(UnreadableFile, match="no model needs that"):
-        foreign(directory, {"source/main.xml": SPHERE, "source/x": bytes(80 << 20)})
-
-
-def test_a_zip_that_lies_about_its_size_is_not_unpacked(directory: Path) -> None:
-    """No more of a file is read than it says that it has."""
-    facts = stored(directory, sphere())
-    facts["xml"] = facts["mjb"].replace(".mjb.gz", ".zip")
-    path = directory / facts["xml"]
-    size = 40 << 20
-    write_zip(path, {"source/x": bytes(size)})
-    lie = path.read_bytes().replace(struct.pack("<I", size), struct.pack("<I", 1000))
-    path.write_bytes(lie)
-    tracemalloc.start()
-    with pytest.raises(UnreadableFile, match=path.name):
-        from_source(directory, facts)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < size / 10
-
-
-def test_a_bomb_of_a_compiled_model_is_not_unpacked(directory: Path) -> None:
-    """It is read up to the size that was recorded."""
-    facts = stored(directory, sphere())
-    (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(1 << 20)))
-    with pytest.raises(UnreadableFile, match="it holds more, not the recorded"):
-        load_model(directory, facts)
-    with pytest.raises(UnreadableFile, match="recorded size is"):
-        load_model(directory, {**facts, "bytes": 1 << 50})
-
-
-@pytest.mark.parametrize("kind", ["mjb", "xml"])
-@pytest.mark.parametrize("damage", ["truncated", "changed", "empty"])
-def test_a_damaged_file_is_one_clear_error(
-    directory: Path, mjcf: Path, kind: str, damage: str
-) -> None:
-    """MuJoCo itself never sees it."""
-    model = mujoco.MjModel.from_xml_path(str(mjcf))
-    facts = stored(directory, model, authored_from_file(mjcf))
-    path = directory / facts[kind]
-    content = path.read_bytes()
-    middle = len(content) // 2
-    changed = {
-        "truncated": content[:middle],
-        "changed": content[:middle] + b"\xff\x00\xff" + content[middle + 3 :],
-        "empty": b"",
-    }
-    path.write_bytes(changed[damage])
-    load = load_model if kind == "mjb" else from_source
-    with pytest.raises(UnreadableFile, match=path.name):
-        load(directory, {**facts, "xml": facts["xml"] if kind == "xml" else None})
-
-
-def test_a_damaged_compiled_model_is_compiled_again(
-    directory: Path, mjcf: Path
-) -> None:
-    """Where its sources are there and sound."""
-    model = mujoco.MjModel.from_xml_path(str(mjcf))
-    facts = stored(directory, model, authored_from_file(mjcf))
-    (directory / facts["mjb"]).write_bytes(b"?")
-    assert load_model(directory, facts).nmesh == 1
-
-
-@pytest.mark.parametrize(
-    "name", ["../openaigym.model.0123456789abcdef.zip", "/etc/passwd", 7, "model.zip"]
-)
-def test_facts_cannot_name_a_file_elsewhere(directory: Path, name: object) -> None:
-    """Only a model's name, in the recording's directory."""
-    facts = stored(directory, sphere())
-    for kind in ("mjb", "xml"):
-        with pytest.raises(UnreadableFile, match="which is no name"):
-            load_model(directory, {**facts, kind: name})
-
-
-def test_a_missing_model_says_where_it_belongs(directory: Path) -> None:
-    """The recording was copied without it."""
-    facts = stored(directory, sphere())
-    (directory / facts["mjb"]).unlink()
-    with pytest.raises(UnreadableFile, match="belongs beside the recording"):
-        load_model(directory, facts)
 
 
 @pytest.mark.skipif(
@@ -475,3 +213,163 @@ def test_textures_by_reference_are_stored_with_the_model(
     shutil.rmtree(mjcf.parents[1])
     for again in (load_model(directory, facts), from_source(directory, facts)):
         assert again.ntexdata == 48
+
+
+SPOKEN = "<mujoco><custom><text name='t' data='{}'/></custom></mujoco>"
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        SPHERE.replace("<geom", "<geom type='box'").replace(".1", ".1 .1 .1"),
+        SPOKEN.format("one"),
+    ],
+    ids=["other kind", "other words"],
+)
+def test_sources_of_another_model_are_not_stored(directory: Path, other: str) -> None:
+    """The compiled model is, and the error says what would help."""
+    source = SPOKEN.format("two") if "text" in other else SPHERE
+    model = mujoco.MjModel.from_xml_string(other)
+    authored = AuthoredModel("a.xml", {"a.xml": source.encode()})
+    facts = stored(directory, model, authored)
+    assert [path.name for path in directory.iterdir()] == [facts["mjb"]]
+    assert content_of(load_model(directory, facts)) == content_of(model)
+    with pytest.raises(UnreadableFile, match=r"written by mujoco 3\.1\.4, this is"):
+        from_source(directory, facts)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('file="m.obj"', 'file="/m.obj"'),
+        ('file="m.obj"', 'file="gone.obj"'),
+        ("<asset>", '<extension><plugin plugin="mujoco.pid"/></extension><asset>'),
+        ("<mujoco>", "<mujoco"),
+    ],
+    ids=["absolute", "missing", "plugin", "broken"],
+)
+def test_what_cannot_be_stored_safely_is_left_out(
+    mjcf: Path, old: str, new: str
+) -> None:
+    """None, and the recording goes on without."""
+    mjcf.write_text(MAIN.replace(old, new))
+    assert authored_from_file(mjcf) is None
+
+
+# --- files of strangers --------------------------------------------------------------
+
+
+def foreign(directory: Path, members: dict[str, str | bytes]) -> Any:
+    """Load the model of a zip that somebody made to look like one of ours."""
+    facts = stored(directory, sphere())
+    facts["xml"] = facts["mjb"].replace(".mjb.gz", ".zip")
+    contents = {"contents.json": '{"format": 1, "main": "main.xml"}'}
+    path = directory / facts["xml"]
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in {**contents, **members}.items():
+            archive.writestr(name, content)
+    return from_source(directory, facts)
+
+
+SECRET = "<mujoco><include file='{}'/></mujoco>"
+
+
+@parametrize(
+    ("members", "said"),
+    [
+        ({"source/main.xml": SECRET.format("/secret.xml")}, "plain relative"),
+        (
+            {
+                "source/main.xml": SECRET.format("a/part"),
+                "source/a/part": SECRET.format("/secret.xml"),
+            },
+            "plain relative",
+        ),
+        (
+            {"source/main.xml": "<mujoco><extension>< plugin/></extension></mujoco>"},
+            "plugin",
+        ),
+        ({"source/main.xml": SECRET.format("../" * 9 + "secret.xml")}, "outside"),
+        ({"source/main.xml": SECRET.format("../secret.xml")}, "secret.xml"),
+        ({"source/main.xml": SECRET.format("..\\\\secret.xml")}, "plain relative"),
+        ({"source/main.xml": "<robot name='r'/>"}, "not MJCF"),
+        ({"source/main.xml": SPHERE.encode("utf-16")}, "utf-8"),
+        ({"source/other.xml": SPHERE}, "main.xml"),
+        ({"contents.json": '{"format": 2}'}, "format"),
+    ],
+    default=4,
+)
+def test_a_hostile_zip_reads_and_writes_nothing_elsewhere(
+    directory: Path, members: dict[str, str | bytes], said: str
+) -> None:
+    """One clear error that names the file."""
+    assert foreign(directory, {"source/main.xml": SPHERE}).ngeom == 1
+    with pytest.raises(UnreadableFile, match=said):
+        foreign(directory, members)
+
+
+@parametrize(
+    ("name", "value", "said"),
+    [
+        ("geom_bodyid", np.array([10**6], np.int32), "not set from"),
+        ("opt.__class__", np.zeros(()), "no model field"),
+        ("geom_rgba", np.array([[None] * 4]), "Object arrays cannot be loaded"),
+        ("geom_rgba", np.zeros((9, 4), np.float32), "another model"),
+        ("aura", np.zeros(1), "no model field .aura"),
+    ],
+    default=3,
+)
+def test_hostile_fields_are_refused(
+    directory: Path, name: str, value: Any, said: str
+) -> None:
+    """Indices that MuJoCo would trust, objects, names of anything else."""
+    buffer = io.BytesIO()
+    np.save(buffer, value)
+    members = {"source/main.xml": SPHERE, f"fields/{name}.npy": buffer.getvalue()}
+    with pytest.raises(UnreadableFile, match=said):
+        foreign(directory, members)
+
+
+def test_a_bomb_of_a_compiled_model_is_not_unpacked(directory: Path) -> None:
+    """It is read up to the size that was recorded."""
+    facts = stored(directory, sphere())
+    (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(1 << 20)))
+    with pytest.raises(UnreadableFile, match="it holds more, not the recorded"):
+        load_model(directory, facts)
+    with pytest.raises(UnreadableFile, match="recorded size is"):
+        load_model(directory, {**facts, "bytes": 1 << 50})
+
+
+@pytest.mark.parametrize("kind", ["mjb", "xml"])
+@pytest.mark.parametrize("damage", ["truncated", "changed"])
+def test_a_damaged_file_is_one_clear_error(
+    directory: Path, mjcf: Path, kind: str, damage: str
+) -> None:
+    """Where the sources are sound, a compiled model is compiled again."""
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    facts = stored(directory, model, authored_from_file(mjcf))
+    path = directory / facts[kind]
+    content = path.read_bytes()
+    middle = len(content) // 2
+    end = b"" if damage == "truncated" else b"\xff\x00\xff" + content[middle + 3 :]
+    path.write_bytes(content[:middle] + end)
+    load = load_model if kind == "mjb" else from_source
+    if kind == "mjb":
+        assert load(directory, facts).nmesh == 1
+        facts["xml"] = None
+    with pytest.raises(UnreadableFile, match=path.name):
+        load(directory, facts)
+
+
+@pytest.mark.parametrize(
+    "name", ["../openaigym.model.0123456789abcdef.zip", "/etc/passwd", 7, "model.zip"]
+)
+def test_facts_cannot_name_a_file_elsewhere(directory: Path, name: object) -> None:
+    """Only a model's name, in the recording's directory, where it may be missing."""
+    facts = stored(directory, sphere())
+    (directory / facts["mjb"]).unlink()
+    with pytest.raises(UnreadableFile, match="belongs beside the recording"):
+        load_model(directory, facts)
+    for kind in ("mjb", "xml"):
+        with pytest.raises(UnreadableFile, match="which is no name"):
+            load_model(directory, {**facts, kind: name})

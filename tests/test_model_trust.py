@@ -24,8 +24,9 @@ from sound_files import stored
 import mjrec
 from mjrec import UnreadableFile, UntrustedModel, load_trajectory
 from mjrec.commands import main
-from mjrec.formats.in_flight import recordings_in_flight
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering.engine_jobs import VideoWorker
+from mjrec.simulation import model_trust
 from mjrec.simulation.model_store import load_model
 from mjrec.simulation.model_trust import (
     TRUST_VARIABLE,
@@ -50,7 +51,7 @@ def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     temporary.mkdir(mode=0o1777)
     monkeypatch.setenv("TMPDIR", str(temporary))
     monkeypatch.setattr(tempfile, "tempdir", None)
-    monkeypatch.delenv("MJREC_TRUST_MODELS", raising=False)
+    monkeypatch.delenv(TRUST_VARIABLE, raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home/state"))
     return tmp_path / "home/state"
 
@@ -85,43 +86,30 @@ def digest_of(content: object) -> str:
 # --- the list ------------------------------------------------------------------------
 
 
-def test_the_list_is_the_users_alone(state_home: Path) -> None:
-    """It is made with the first model, and names each once, in order."""
+def test_the_list_is_the_users_alone(
+    state_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Made with the first model, not by looking; each model is in it once, in order."""
+    assert not is_stored(DIGEST)
+    note_models([])
+    assert not state_home.exists()
     note_models([DIGEST])
     note_models([OTHER, DIGEST])
     path = list_in(state_home)
     assert (mode_of(path), mode_of(path.parent)) == (0o600, 0o700)
-    assert path.read_text() == f"{DIGEST}\n{OTHER}\n"
+    assert path.read_text().split() == [DIGEST, OTHER]
     assert is_stored(DIGEST)
-    assert is_stored(OTHER)
-
-
-def test_every_user_has_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What one has stored is a stranger's for the others."""
-    note_models([DIGEST])
+    for said in (None, 7, "", DIGEST[:16], f"{DIGEST}\n", "\n", "\udc80"):
+        assert not is_stored(said)
     become_another_user(monkeypatch, tmp_path)
     assert not is_stored(DIGEST)
 
 
-def test_looking_makes_no_list(state_home: Path) -> None:
-    """Nor does importing; whoever reads recordings leaves nothing behind."""
-    assert not is_stored(DIGEST)
-    note_models([])
-    assert not state_home.exists()
-
-
-@pytest.mark.parametrize("said", [None, 7, "", "x", "\udc80", [], DIGEST[:16], "\n"])
-def test_nothing_else_is_stored(said: object) -> None:
-    """Whatever a file says."""
-    note_models([DIGEST])
-    assert not is_stored(said)
-    assert not is_stored(f"{DIGEST}\n")
-
-
 def test_many_processes_lose_nothing(state_home: Path) -> None:
-    """Of each other's lines, and none is torn."""
+    """Of each other's lines, and none is torn, also after one that was cut off."""
+    note_models([DIGEST])
+    with list_in(state_home).open("a") as file:
+        file.write(OTHER[:30])
     program = (
         "import sys; from hashlib import sha256;"
         "from mjrec.simulation.model_trust import note_models;"
@@ -129,174 +117,71 @@ def test_many_processes_lose_nothing(state_home: Path) -> None:
         " for n in range(100)];"
         "assert 'mujoco' not in sys.modules"
     )
-    names = "abcd"
-    processes = [
-        subprocess.Popen([sys.executable, "-c", program, name]) for name in names
-    ]
+    command = [sys.executable, "-c", program]
+    processes = [subprocess.Popen([*command, name]) for name in "abcd"]
     assert [process.wait() for process in processes] == [0] * 4
-    expected = {digest_of(f"{name} {n}") for name in names for n in range(100)}
-    lines = list_in(state_home).read_text().splitlines()
-    assert (len(lines), set(lines)) == (400, expected)
-    assert all(map(is_stored, expected))
-
-
-def test_the_list_does_not_grow_for_ever(state_home: Path) -> None:
-    """A task may compile a model for each episode; then the oldest are forgotten."""
-    path = list_in(state_home)
-    note_models([DIGEST])
-    note_models(many := list(map(digest_of, range(131_071))))
-    assert path.stat().st_size == 131_072 * 65
-    assert is_stored(DIGEST)
-    note_models([OTHER])
-    kept = path.read_text().splitlines()
-    assert (len(kept), kept[-1], set(kept) <= {OTHER, *many}) == (65_536, OTHER, True)
-    assert mode_of(path) == 0o600
-    assert is_stored(OTHER)
-    assert not is_stored(DIGEST)
-    note_models([DIGEST])
-    assert path.stat().st_size == 65_537 * 65
-
-
-def test_a_line_that_was_cut_off_spoils_no_other(state_home: Path) -> None:
-    """A full disk takes a part of it."""
-    note_models([DIGEST])
-    path = list_in(state_home)
-    with path.open("a") as file:
-        file.write(OTHER[:30])
-    note_models([third := digest_of(3)])
-    assert path.read_text().splitlines() == [DIGEST, OTHER[:30], third]
-    assert is_stored(third)
+    expected = {digest_of(f"{name} {n}") for name in "abcd" for n in range(100)}
+    lines = list_in(state_home).read_text().split()
+    assert set(lines) == {DIGEST, OTHER[:30], *expected}
+    assert len(lines) == 402
     assert not is_stored(OTHER)
 
 
-def test_where_the_home_is_full_the_other_place_has_a_list(
-    tmp_path: Path, state_home: Path
+def test_the_list_does_not_grow_for_ever(
+    state_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And the recording goes on."""
+    """A task may compile a model for each episode; then the oldest are forgotten."""
+    monkeypatch.setattr(model_trust, "_MOST_BYTES", 10 * 66)
+    models = list(map(digest_of, range(35)))
+    for model in models:
+        note_models([model])
+    files = [path.stat().st_size for path in list_in(state_home).parent.iterdir()]
+    assert sum(files) < 20 * 67
+    assert all(map(is_stored, models[-10:]))
+    assert not is_stored(models[0])
+
+
+def test_where_the_home_cannot_be_written_the_other_place_has_a_list(
+    tmp_path: Path,
+    state_home: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Nothing is said; and it is still good when there is room at home later."""
     note_models([DIGEST])
     with file_size_limit(70):
         note_models([OTHER])
-    assert list_in(state_home).stat().st_size == 70
-    assert fallback_in(tmp_path).read_text() == f"{OTHER}\n"
-    assert is_stored(OTHER)
+    path = fallback_in(tmp_path)
+    assert (mode_of(path), mode_of(path.parent)) == (0o600, 0o700)
+    assert path.read_text().split() == [OTHER]
+    monkeypatch.setenv("XDG_STATE_HOME", "/dev/null/state")
+    note_models([third := digest_of(3)])
+    monkeypatch.setenv("XDG_STATE_HOME", str(state_home))
+    assert all(map(is_stored, [DIGEST, OTHER, third]))
+    assert not caplog.records
 
 
-def test_without_variables_the_home_is_that_of_the_password_file(
+def test_the_home_is_that_of_the_password_file_and_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in a cron job; and a home that is only a name is not made."""
+    """Without variables, as in a cron job; it is not made, and no other user's."""
     user = type("User", (), {"pw_dir": str(tmp_path / "home")})
     monkeypatch.setattr("pwd.getpwuid", lambda uid: user)
     monkeypatch.setenv("XDG_STATE_HOME", "relative/is/ignored")
-    for home in (None, "", "relative"):
-        if home is None:
-            monkeypatch.delenv("HOME")
-        else:
-            monkeypatch.setenv("HOME", home)
-        note_models([digest_of(home)])
-        assert is_stored(digest_of(home))
+    monkeypatch.delenv("HOME")
+    note_models([OTHER])
+    assert is_stored(OTHER)
     assert not (tmp_path / "home").exists()
     (tmp_path / "home").mkdir()
     note_models([DIGEST])
     assert list_in(tmp_path / "home/.local/state").exists()
-
-
-# --- other machines ------------------------------------------------------------------
-
-
-def test_a_worker_elsewhere_loads_what_its_user_has_stored(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of the models in the directory; its own home knows none of them."""
-    facts = {**stored(directory), "xml": None}
-    note_models([DIGEST])
-    sent = stored_models([directory, tmp_path / "not there"])
-    assert sent == [facts["sha256"]]
-    become_another_user(monkeypatch, tmp_path)
-    with pytest.raises(UntrustedModel):
-        load_model(directory, facts)
-    assert stored_models([directory]) == []
-    VideoWorker({"models": sent}).close()
-    assert load_model(directory, facts).ngeom == 1
-    assert not is_stored(DIGEST)
-
-
-def test_what_is_stored_in_a_block_is_reported(directory: Path) -> None:
-    """Each block by itself, also what was on the list before."""
-    note_models([OTHER])
-    with noting_models() as first:
-        facts = stored(directory)
-    with noting_models() as second:
-        stored(directory)
-        note_models([OTHER])
-    note_models([DIGEST])
-    noted = [facts["sha256"], directory_digest(directory)]
-    assert first == noted
-    assert second == [*noted, OTHER]
-
-
-# --- where there can be no list ------------------------------------------------------
-
-
-def test_without_a_home_it_is_a_temporary_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Nothing is said; and it is still good when there is a home later."""
-    monkeypatch.setenv("XDG_STATE_HOME", "/dev/null/state")
-    note_models([DIGEST])
-    path = fallback_in(tmp_path)
-    assert (mode_of(path), mode_of(path.parent)) == (0o600, 0o700)
-    assert is_stored(DIGEST)
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "now"))
-    note_models([OTHER])
-    assert is_stored(DIGEST)
-    assert is_stored(OTHER)
-    assert not caplog.records
-
-
-def open_to_others(place: Path, _: Path) -> None:
-    place.mkdir(mode=0o755)
-    place.chmod(0o755)
-
-
-def linked(place: Path, elsewhere: Path) -> None:
-    elsewhere.mkdir(mode=0o700)
-    place.symlink_to(elsewhere)
-
-
-def given_away(place: Path, _: Path) -> None:
-    place.mkdir(mode=0o700)
-    os.chown(place, 65534, -1)
-
-
-@pytest.mark.parametrize(
-    "prepare", [open_to_others, linked, pytest.param(given_away, marks=BY_ROOT)]
-)
-def test_a_temporary_directory_that_others_prepared_is_not_used(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    prepare: Any,
-) -> None:
-    """There is no list then, one warning that says why, and the recording goes on."""
-    place = fallback_in(tmp_path).parent
-    prepare(place, tmp_path / "theirs")
-    monkeypatch.setenv("XDG_STATE_HOME", "/dev/null/state")
-    note_models([DIGEST])
-    note_models([OTHER])
-    assert not is_stored(DIGEST)
-    assert not list(place.iterdir())
-    [warned] = caplog.messages
-    assert str(place) in warned
-    assert "MJREC_TRUST_MODELS=1" in warned
-
-
-def readable(path: Path) -> None:
-    path.chmod(0o640)
-
-
-def in_an_open_directory(path: Path) -> None:
-    path.parent.chmod(0o750)
+    if os.geteuid() == 0:
+        # As with `sudo` and the user's HOME: that user could not write there any more.
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another"))
+        (tmp_path / "another").mkdir()
+        os.chown(tmp_path / "another", 65534, -1)
+        note_models([digest_of(3)])
+        assert not list((tmp_path / "another").iterdir())
 
 
 def a_pipe(path: Path) -> None:
@@ -308,24 +193,22 @@ def a_link(path: Path) -> None:
     path.symlink_to(path.rename(path.parent.parent / "elsewhere"))
 
 
-def somebody_elses(path: Path) -> None:
-    os.chown(path, 65534, -1)
-
-
 @pytest.mark.parametrize(
     "spoil",
     [
-        *(readable, in_an_open_directory, a_pipe, a_link),
-        pytest.param(somebody_elses, marks=BY_ROOT),
+        *(a_pipe, a_link, lambda path: a_link(path.parent)),
+        *(lambda path: path.chmod(0o640), lambda path: path.parent.chmod(0o750)),
+        pytest.param(lambda path: os.chown(path, 65534, -1), marks=BY_ROOT),
     ],
 )
 def test_a_list_that_others_may_have_written_is_not_used(
     state_home: Path,
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
     spoil: Any,
 ) -> None:
-    """It stays for its owner to decide; one warning says what to do."""
+    """It stays for its owner to decide; a warning says what to do."""
     note_models([DIGEST])
     path = list_in(state_home)
     spoil(path)
@@ -334,23 +217,36 @@ def test_a_list_that_others_may_have_written_is_not_used(
     note_models([OTHER])
     assert is_stored(OTHER)
     assert path.lstat().st_ino == left.st_ino
-    assert fallback_in(tmp_path).exists()
     [warned] = caplog.messages
-    assert str(path.parent) in warned
+    assert str(path.parent) in warned or "symbolic links" in warned
     assert "remove it" in warned
+    # Nor the other place; then there is no list, and a model needs a word.
+    spoil(fallback_in(tmp_path))
+    note_models([digest_of(3)])
+    assert not is_stored(digest_of(3))
+    assert f"{TRUST_VARIABLE}=1" in caplog.messages[-1]
 
 
-@BY_ROOT
-def test_root_leaves_nothing_in_the_homes_of_others(
-    state_home: Path, tmp_path: Path
+# --- other machines ------------------------------------------------------------------
+
+
+def test_a_worker_elsewhere_loads_what_its_user_has_stored(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With `sudo` and the user's HOME, the user could not write there any more."""
-    state_home.mkdir(parents=True)
-    os.chown(state_home, 65534, -1)
+    """Of the models in the directory, which its worker has reported."""
+    with noting_models() as noted:
+        facts = {**stored(directory), "xml": None}
     note_models([DIGEST])
-    assert is_stored(DIGEST)
-    assert not list(state_home.iterdir())
-    assert fallback_in(tmp_path).exists()
+    assert noted == [facts["sha256"], directory_digest(directory)]
+    sent = stored_models([directory, tmp_path / "not there"])
+    assert sent == [facts["sha256"]]
+    become_another_user(monkeypatch, tmp_path)
+    with pytest.raises(UntrustedModel):
+        load_model(directory, facts)
+    assert stored_models([directory]) == []
+    VideoWorker({"models": sent}).close()
+    assert load_model(directory, facts).ngeom == 1
+    assert not is_stored(DIGEST)
 
 
 # --- models --------------------------------------------------------------------------
@@ -369,29 +265,26 @@ def forbid_compiled_models(patch: pytest.MonkeyPatch, directory: Path) -> None:
     patch.setattr(mujoco.MjModel, "from_binary_path", loaded)
 
 
-def tampered(directory: Path, facts: dict[str, Any]) -> dict[str, Any]:
-    """Return what somebody says of a crafted model, all of it true."""
+@pytest.mark.parametrize("said", [{}, {"sha256": None}, {"sha256": {"a": 1}}])
+def test_mujoco_never_sees_what_nobody_vouches_for(
+    directory: Path, monkeypatch: pytest.MonkeyPatch, said: dict[str, Any]
+) -> None:
+    """The error names the file and the ways out; the hash of another is no help."""
+    facts = {**stored(directory), "xml": None}
     content = bytearray(gzip.decompress((directory / facts["mjb"]).read_bytes()))
     content[-200:] = bytes(200)
     digest = hashlib.sha256(content).hexdigest()
     path = directory / f"openaigym.model.{digest[:16]}.mjb.gz"
     path.write_bytes(gzip.compress(bytes(content)))
-    return {**facts, "mjb": path.name, "sha256": digest}
-
-
-@pytest.mark.parametrize("said", [{}, {"sha256": None}, {"sha256": {"a": 1}}])
-def test_mujoco_never_sees_what_nobody_vouches_for(
-    directory: Path, monkeypatch: pytest.MonkeyPatch, said: dict[str, Any]
-) -> None:
-    """The error names the file and the ways out."""
-    facts = {**stored(directory), "xml": None}
+    crafted = {**facts, "mjb": path.name, "sha256": digest, **said}
     forbid_compiled_models(monkeypatch, directory)
-    crafted = {**tampered(directory, facts), **said}
     with pytest.raises(UntrustedModel, match="not written by this user") as error:
         load_model(directory, crafted)
-    assert error.value.path == directory / crafted["mjb"]
+    assert error.value.path == path
     for way_out in ("--trust-models", "trust_models=True", "MJREC_TRUST_MODELS=1"):
         assert way_out in str(error.value)
+    with pytest.raises(UnreadableFile, match="not what was recorded"):
+        load_model(directory, {**crafted, "sha256": facts["sha256"]})
 
 
 def test_a_strangers_sources_are_compiled(
@@ -403,63 +296,32 @@ def test_a_strangers_sources_are_compiled(
     forbid_compiled_models(monkeypatch, directory)
     assert load_model(directory, facts).ngeom == 1
     (directory / facts["xml"]).write_bytes(b"no zip")
-    with pytest.raises(UntrustedModel, match="not a zip file") as error:
+    with pytest.raises(UntrustedModel, match=r"not a zip file.*--trust-models"):
         load_model(directory, facts)
-    assert "--trust-models" in str(error.value)
-    assert "move this one away" not in str(error.value)
 
 
-def test_ones_own_model_is_loaded_as_it_was_compiled(directory: Path) -> None:
-    """Sources or not."""
-    facts = stored(directory)
-    (directory / facts["xml"]).write_bytes(b"no zip")
-    assert load_model(directory, facts).ngeom == 1
-
-
-@pytest.mark.parametrize(
-    ("said", "is_loaded"), [("1", True), ("0", False), ("", False)]
-)
-def test_trust_by_environment_variable(
-    directory: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    said: str,
-    is_loaded: bool,
+def test_trust_is_said_by_an_argument_or_a_variable(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For whatever loads a model; the hash is looked at all the same."""
+    """The hash is looked at all the same; one's own needs no word."""
     facts = {**stored(directory), "xml": None}
+    assert load_model(directory, facts).ngeom == 1
     become_another_user(monkeypatch, tmp_path)
-    monkeypatch.setenv("MJREC_TRUST_MODELS", said)
-    if not is_loaded:
+    for said in ("0", "", f"sha256:{OTHER}"):
+        monkeypatch.setenv(TRUST_VARIABLE, said)
         with pytest.raises(UntrustedModel, match="not written by this user"):
             load_model(directory, facts)
-        return
+    assert load_model(directory, facts, trust_models=True).ngeom == 1
+    monkeypatch.setenv(TRUST_VARIABLE, "1")
     assert load_model(directory, facts).ngeom == 1
+    with trusting_models([DIGEST]):
+        assert is_trusted(DIGEST)
+        assert not is_trusted(OTHER)
+        assert not is_trusted(None)
+    assert is_trusted(OTHER)
     (directory / facts["mjb"]).write_bytes(gzip.compress(bytes(facts["bytes"])))
     with pytest.raises(UnreadableFile, match="not what was recorded"):
         load_model(directory, facts)
-
-
-def test_a_crafted_model_does_not_pass_for_a_listed_one(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its facts may name the hash of another."""
-    facts = {**stored(directory), "xml": None}
-    forbid_compiled_models(monkeypatch, directory)
-    crafted = {**tampered(directory, facts), "sha256": facts["sha256"]}
-    with pytest.raises(UnreadableFile, match="not what was recorded"):
-        load_model(directory, crafted)
-
-
-def test_a_model_that_cannot_be_listed_is_stored_all_the_same(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its sources are compiled, or it is trusted."""
-    monkeypatch.setenv("XDG_STATE_HOME", "/dev/null/state")
-    open_to_others(fallback_in(tmp_path).parent, tmp_path)
-    facts = stored(directory)
-    assert load_model(directory, facts).ngeom == 1
-    assert load_model(directory, {**facts, "xml": None}, trust_models=True).ngeom == 1
 
 
 # --- recordings ----------------------------------------------------------------------
@@ -473,7 +335,7 @@ def theirs(directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     return ride
 
 
-def test_pictures_of_a_strangers_recording_need_a_word(theirs: Ride) -> None:
+def test_frames_of_a_strangers_recording_need_a_word(theirs: Ride) -> None:
     """Of the trajectory, which goes to the workers too."""
     trajectory = load_trajectory(theirs.path)
     with pytest.raises(UntrustedModel, match="not written by this user"):
@@ -482,8 +344,7 @@ def test_pictures_of_a_strangers_recording_need_a_word(theirs: Ride) -> None:
         next(mjrec.render(trajectory))
     trusted = load_trajectory(theirs.path, trust_models=True)
     assert trusted.model().ngeom == 3
-    frames = list(mjrec.render(trusted))
-    np.testing.assert_array_equal(frames, theirs.frames)
+    np.testing.assert_array_equal(list(mjrec.render(trusted)), theirs.frames)
 
 
 @pytest.mark.thorough
@@ -496,70 +357,48 @@ def test_the_command_takes_the_word(
     assert "mjrec render --trust-models" in capsys.readouterr().out
     assert main([*again, "--trust-models"]) == 0
     assert (tmp_path / "again.mp4").exists()
-    assert "MJREC_TRUST_MODELS" not in os.environ
+    assert TRUST_VARIABLE not in os.environ
 
 
-def recorded(env: Any, directory: Path) -> list[Any]:
-    """Record two steps, and return what the environment shows of them."""
-    with mjrec.Monitor(env, directory, lambda _: True, workers=0) as monitor:
-        monitor.reset(seed=0)
-        shown = [monitor.render()]
-        for _ in range(2):
-            monitor.step(np.full(env.action_space.shape, 0.5))
-            shown.append(monitor.render())
-        monitor.close(wait=False)
-    return shown
-
-
-def test_sources_show_what_the_environment_showed(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With what was set by hand in the model, before the recording and in it."""
+def cheetah() -> tuple[Any, Any, Any]:
     env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=48)
     model = env.unwrapped.model  # type: ignore[attr-defined]  # it has one
+    # Set by hand before the recording.
     model.vis.quality.shadowsize = 256
     model.geom_rgba[2] = (0, 1, 0, 1)
     model.geom_size[3, 0] *= 2
-    shown = recorded(env, directory)
+    return env, env.render, {}
+
+
+def reach() -> tuple[Any, Any, Any]:
+    manipulation = pytest.importorskip("dm_control.manipulation")
+    env = manipulation.load("reach_site_features", seed=2)
+    size = {"height": 48, "width": 64}
+    options = {**size, "env_id": "dm_control/reach"}
+    return env, lambda: env.physics.render(**size), options
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        cheetah,
+        pytest.param(reach, marks=[pytest.mark.thorough, pytest.mark.dm_control]),
+    ],
+)
+def test_sources_show_what_the_environment_showed(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Any
+) -> None:
+    """With what was set by hand, and what composer has put together."""
+    env, picture, options = make()
+    with mjrec.Monitor(env, directory, lambda _: True, workers=0, **options) as monitor:
+        monitor.reset()
+        shown = [picture()]
+        for _ in range(2):
+            space = getattr(env, "action_space", None) or env.action_spec()
+            monitor.step(np.full(space.shape, 0.1))
+            shown.append(picture())
+        monitor.close(wait=False)
     become_another_user(monkeypatch, tmp_path)
     forbid_compiled_models(monkeypatch, directory)
     [path] = (recording.path for recording in recordings_in_flight(directory))
     np.testing.assert_array_equal(list(mjrec.render(path)), shown)
-    again = load_trajectory(path).model()
-    np.testing.assert_array_equal(again.geom_rgba, model.geom_rgba)
-    np.testing.assert_array_equal(again.geom_size, model.geom_size)
-
-
-@pytest.mark.thorough
-@pytest.mark.dm_control
-def test_composers_sources_show_what_the_task_showed(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They are what composer has put together for the episode."""
-    manipulation = pytest.importorskip("dm_control.manipulation")
-    env = manipulation.load("reach_site_features", seed=2)
-    size = {"height": 48, "width": 64}
-    monitor = mjrec.Monitor(
-        env, directory, lambda _: True, workers=0, env_id="dm_control/reach", **size
-    )
-    monitor.reset()
-    shown = [env.physics.render(**size)]
-    monitor.step(np.full(env.action_spec().shape, 0.1))
-    shown.append(env.physics.render(**size))
-    monitor.close(wait=False)
-    become_another_user(monkeypatch, tmp_path)
-    [path] = (recording.path for recording in recordings_in_flight(directory))
-    np.testing.assert_array_equal(list(mjrec.render(path)), shown)
-
-
-def test_models_are_trusted_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By their hashes, in the block only; what was said before does not count there."""
-    monkeypatch.setenv(TRUST_VARIABLE, "1")
-    one, other = "a" * 64, "b" * 64
-    with trusting_models([one]):
-        assert is_trusted(one)
-        assert not is_trusted(other)
-        assert not is_trusted(None)
-    assert is_trusted(other)
-    with trusting_models([]):
-        assert not is_trusted(one)

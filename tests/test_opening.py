@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +23,6 @@ from mjrec import (
 )
 from mjrec.formats.monitor_directory import (
     Infix,
-    journal_name,
-    lock_name,
-    manifest_name,
 )
 
 ANOTHER = "Ant-v5"
@@ -53,18 +48,6 @@ def record(directory: Path, episodes: int = 2, **options: Any) -> None:
 
 def write_video(directory: Path, infix: str, episode: int) -> None:
     (directory / f"openaigym.video.{infix}.video{episode:06d}.mp4").touch()
-
-
-def test_a_relative_directory_is_fixed_at_opening(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is made with its parents; a later chdir changes nothing."""
-    monkeypatch.chdir(tmp_path)
-    with monitor(Path("a/b")) as env:
-        assert env.episode_id == 0
-        monkeypatch.chdir("/")
-        run_episodes(env, 1)
-    assert len(list((tmp_path / "a" / "b").glob("*.jsonl"))) == 1
 
 
 def test_existing_recordings_need_force_or_resume(tmp_path: Path) -> None:
@@ -121,29 +104,6 @@ def test_resume_never_takes_a_used_name(tmp_path: Path) -> None:
         taken = {str(one.infix), str(other.infix)}
     assert len(taken) == 2
     assert not taken & used
-
-
-def test_open_monitors_do_not_count(tmp_path: Path) -> None:
-    """Monitors that share a directory number independently, until they close."""
-    with monitor(tmp_path) as first:
-        run_episodes(first, 3)
-        with monitor(tmp_path, resume=True) as second:
-            run_episodes(second, 1)
-            assert (first.episode_id, second.episode_id) == (3, 1)
-    assert first_number(tmp_path) == 3
-
-
-def test_a_killed_monitor_counts_as_dead(tmp_path: Path) -> None:
-    """Its lock file stays but is not held; its journal has the numbers."""
-    code = (
-        f"import os, sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        "import pathlib, test_opening as t\n"
-        "env = t.monitor(pathlib.Path(sys.argv[1]))\n"
-        "t.run_episodes(env, 4); os.kill(os.getpid(), 9)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, tmp_path], check=False)
-    assert done.returncode == -9
-    assert first_number(tmp_path) == 4
 
 
 def test_a_torn_line_keeps_its_number(
@@ -210,18 +170,6 @@ def test_joining_looks_at_no_other_files(tmp_path: Path) -> None:
     write_video(tmp_path, "0.elsewhere", 7)
     (tmp_path / "openaigym.manifest.1.elsewhere.manifest.json").write_text("{")
     assert first_number(tmp_path, resume="join", env_id=ANOTHER) == 0
-
-
-def test_joining_takes_no_used_name(tmp_path: Path) -> None:
-    """A manifest, a journal or a lock shows that a name was given before."""
-    with monitor(tmp_path, resume="join", uid="same") as first:
-        number = Infix.parse(str(first.infix)).monitor_id
-        after = [Infix(number + n, "same") for n in (1, 2, 3)]
-        (tmp_path / manifest_name(after[0])).touch()
-        (tmp_path / journal_name(after[1])).touch()
-        (tmp_path / lock_name(after[2])).touch()
-        with monitor(tmp_path, resume="join", uid="same") as second:
-            assert Infix.parse(str(second.infix)).monitor_id > after[2].monitor_id
 
 
 def test_joining_leaves_dead_monitors_as_they_are(

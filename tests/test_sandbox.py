@@ -16,7 +16,7 @@ from waiting import wait_until
 
 from mjrec.sandbox import Sandbox
 
-_COMPILER = "mjrec.simulation.source_compiler"
+_COMPILER = "mjrec.simulation.model_sources"
 _FOR_EVER = (
     '<mujoco><worldbody><replicate count="100000000"><geom size="1"/></replicate>'
     "</worldbody></mujoco>"
@@ -35,7 +35,7 @@ def sources(directory: Path, xml: str = "<mujoco/>") -> Path:
 def test_what_is_found_is_said_and_the_process_ends(tmp_path: Path) -> None:
     """What it writes lies in its place."""
     before = children()
-    request = {"path": str(sources(tmp_path)), "limit": 1 << 20}
+    request = {"path": str(sources(tmp_path))}
     with Sandbox(_COMPILER, request, place=tmp_path) as sandbox:
         assert list(sandbox.said(60)) == [{"compiled": True}]
         assert sandbox.last_words().startswith("ended with status 0")
@@ -55,7 +55,7 @@ def test_a_death_is_told_with_its_last_words(tmp_path: Path) -> None:
 # Takes more than five seconds: MuJoCo is loaded, and two seconds of CPU time are used.
 def test_a_limit_of_cpu_time_ends_it(tmp_path: Path) -> None:
     """In the midst of MuJoCo's code."""
-    request = {"path": str(sources(tmp_path, _FOR_EVER)), "limit": 1 << 20}
+    request = {"path": str(sources(tmp_path, _FOR_EVER))}
     limits = {"RLIMIT_CPU": 2, "RLIMIT_CORE": 0}
     with Sandbox(_COMPILER, request, place=tmp_path, limits=limits) as sandbox:
         assert list(sandbox.said(60)) == []
@@ -68,8 +68,8 @@ def test_it_ends_with_its_parent_whatever_it_is_at(tmp_path: Path) -> None:
     path = sources(tmp_path, _FOR_EVER)
     program = (
         "from pathlib import Path\n"
-        "from mjrec.simulation.source_compiler import compile_within\n"
-        f"compile_within(Path({str(path)!r}), limit=1 << 20, compiled_size=1)\n"
+        "from mjrec.simulation.model_sources import compile_sources\n"
+        f"compile_sources(Path({str(path)!r}), compiled_size=1)\n"
     )
     with subprocess.Popen([sys.executable, "-c", program]) as parent:
         listing = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -115,24 +114,3 @@ def test_a_type_takes_effect_at_the_next_reset(recorder: StatsRecorder) -> None:
     assert recorder.episode_types == ["t", "e"]
     with pytest.raises(InvalidArgument, match="training"):
         recorder.type = "x"
-
-
-def test_autoreset_begins_the_next_episode(tmp_path: Path) -> None:
-    """An environment that resets itself is stepped on and on."""
-    recorder = StatsRecorder(str(tmp_path), "x", autoreset=True)
-    run_episode(recorder, [1.0])
-    recorder.before_step(None)
-    recorder.after_step(None, 2.0, True, {})
-    assert recorder.episode_rewards == [1.0, 2.0]
-
-
-def test_a_relative_directory_is_fixed_at_construction(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Wherever chdir goes later."""
-    (tmp_path / "a").mkdir()
-    monkeypatch.chdir(tmp_path)
-    recorder = StatsRecorder("a", "x")
-    monkeypatch.chdir(os.sep)
-    recorder.close()
-    assert (tmp_path / "a" / "x.stats.json").exists()

@@ -134,18 +134,6 @@ def test_tracker_that_raises_is_dismissed_and_the_rest_goes_on(
     }
 
 
-def test_interruption_in_a_tracker_is_an_interruption(tmp_path: Path) -> None:
-    """Ctrl-C is never taken for a fault of whoever was running."""
-
-    class Slow(Tracker):
-        def episode(self, run: Run, episode: FinishedEpisode) -> None:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        record(tmp_path, "InvertedPendulum-v5", trackers=Slow())
-    assert mjrec.load_results(tmp_path)["episode_lengths"] == [3]
-
-
 def test_videos_of_several_cameras_are_told_apart(tmp_path: Path) -> None:
     """By what their names say; the first camera's by nothing."""
     tracker = Listening()
@@ -157,25 +145,6 @@ def test_videos_of_several_cameras_are_told_apart(tmp_path: Path) -> None:
         trackers=tracker,
     )
     assert sorted(video.view for video in tracker.of("video")) == ["", "-1"]
-
-
-@pytest.mark.parametrize(
-    ("method", "episode_id"),
-    [("begin", None), ("episode", 0), ("video", 0), ("end", None)],
-)
-def test_fault_of_a_tracker_names_what_it_was_told_of(
-    tmp_path: Path, method: str, episode_id: int | None
-) -> None:
-    """The episode, or none where it was told of the run."""
-
-    def fail(*_: Any) -> None:
-        raise ConnectionError("no server")
-
-    tracker = Listening()
-    setattr(tracker, method, fail)
-    record(tmp_path, "InvertedPendulum-v5", trackers=tracker)
-    [fault] = manifest_of(tmp_path)["mjrec"]["faults"]
-    assert fault["episode_id"] == episode_id
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from typing import Any
 
 from dm_control.mujoco import wrapper
 
-from ..simulation.authored_model import AuthoredModel
 from ..simulation.cameras import (
     FREE_CAMERA,
     camera_label,
@@ -19,6 +18,7 @@ from ..simulation.cameras import (
     resolve_camera,
 )
 from ..simulation.capture import Capture
+from ..simulation.model_sources import AuthoredModel
 from ..simulation.view import (
     SceneView,
     option_without_rangefinder,

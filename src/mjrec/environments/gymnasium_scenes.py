@@ -25,8 +25,8 @@ from .scenes import (
 from .wrapping import around_gymnasium
 
 if TYPE_CHECKING:
-    from ..simulation.authored_model import AuthoredModel
     from ..simulation.capture import Capture
+    from ..simulation.model_sources import AuthoredModel
     from .viewer_scene import ViewerScene
 
 _MUJOCO_ENV = ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render")
@@ -175,7 +175,7 @@ def _at_picture(
 
 
 def _authored(simulated: Any) -> AuthoredModel | None:
-    from ..simulation.authored_model import authored_from_file
+    from ..simulation.model_sources import authored_from_file
 
     path = getattr(simulated, "fullpath", None)
     return None if path is None else authored_from_file(Path(path))

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..simulation.authored_model import authored_from_file
 from ..simulation.capture import Capture
+from ..simulation.model_sources import authored_from_file
 from .mjcf_environments import MjcfEnvironment
 from .scenes import Scenes, generator_state, has_own_method, overriding_class
 from .viewer_scene import ViewerScene

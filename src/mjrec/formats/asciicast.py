@@ -115,6 +115,11 @@ class AsciicastWriter:
                 self._file.close()
             self._part.unlink(missing_ok=True)
 
+    def leave(self) -> None:
+        """Let go of the unfinished file, which others finish."""
+        if self._file is not None:
+            self._file.close()
+
     @contextlib.contextmanager
     def _naming_the_file(self) -> Iterator[None]:
         try:

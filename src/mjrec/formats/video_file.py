@@ -12,7 +12,12 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from ..atomic_files import file_sha256
-from ..errors import DirectoryNotWritable, FileNotWritten, FrameCountError
+from ..errors import (
+    DirectoryNotWritable,
+    EncoderError,
+    FileNotWritten,
+    FrameCountError,
+)
 from ..frames import Frame, pad_to_even
 from ..worker_thread import WorkerThread
 from .ffmpeg import FfmpegProcess, as_file, every_frame_arguments, ffmpeg_sha256
@@ -107,7 +112,7 @@ class Encoding:
 
     def __init__(self, file: VideoFile, temporary: Path, hashes: Path | None) -> None:
         self.size = (file.height, file.width)
-        self.is_ending = False
+        self.is_ending = self._is_left = False
         self._file = file
         self.temporary = temporary
         self._parts = {temporary: file.path}
@@ -149,16 +154,13 @@ class Encoding:
             )
             on_failure.pop_all()
 
-    def finish(self) -> VideoFile | None:
+    def finish(self) -> VideoFile:
         """Complete the file, check it and give it its name.
 
-        Each part can be done again, where Ctrl-C came in between. None on the encoder's
-        own thread, which cannot wait for itself.
+        Each part can be done again, where Ctrl-C came in between.
         """
         self.is_ending = True
         self.thread.close()
-        if not self._input_ended:
-            return None
         self._process.wait()
         if not self._file.file_sha256:
             self._file = self._checked()
@@ -188,7 +190,10 @@ class Encoding:
 
     def leave(self) -> None:
         """Let the encoder go on to the end of what it was given, by itself."""
+        self._is_left = True
         self.thread.leave()
+        if self._input_ended:
+            self._wait_and_close()
         self._lock.let_go()
 
     def _encode(self, frame: Frame) -> None:
@@ -204,6 +209,16 @@ class Encoding:
     def _end_input(self) -> None:
         self._process.end_input()
         self._input_ended = True
+        if self._is_left:
+            self._wait_and_close()
+
+    def _wait_and_close(self) -> None:
+        """See ffmpeg out, which has all of its input; its file is somebody else's."""
+        if self._hashes is not None:
+            self._hashes.close()
+        with contextlib.suppress(EncoderError):
+            self._process.wait()
+        self._process.release()
 
     def _checked(self) -> VideoFile:
         """Return the finished file, which has its temporary name, with what it holds.

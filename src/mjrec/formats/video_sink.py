@@ -134,6 +134,10 @@ class VideoSink:
                 path.unlink(missing_ok=True)
         self._forget_note()
 
+    def leave(self) -> None:
+        """Let go of the unfinished file and its note, by which others finish it."""
+        self._writer.leave()
+
     def _facts(self) -> dict[str, Any]:
         if self.file is None:
             return {"encoder_version": {"backend": "TextEncoder", "version": 1}}

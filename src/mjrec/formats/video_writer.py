@@ -190,8 +190,7 @@ class VideoWriter:
         """Finish the file: encode what waits, count the frames again, give the name.
 
         Idempotent. After Ctrl-C has interrupted it no more frames are taken, and
-        another call goes on. On the thread that encodes, where a garbage collection may
-        call it, it leaves the rest to another call.
+        another call goes on.
 
         Raises:
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
@@ -205,8 +204,6 @@ class VideoWriter:
             except Exception:
                 self.abort()
                 raise
-            if self.result is None:
-                return
         self.closed = True
 
     def abort(self) -> None:
@@ -216,6 +213,15 @@ class VideoWriter:
         """
         if not self.closed and self._encoding is not None and not self._was_forked():
             self._encoding.abort()
+        self.closed = True
+
+    def leave(self) -> None:
+        """Take no more frames; the encoder finishes the unfinished file by itself.
+
+        Never waits. Idempotent.
+        """
+        if not self.closed and self._encoding is not None and not self._was_forked():
+            self._encoding.leave()
         self.closed = True
 
     def __enter__(self) -> Self:
@@ -240,7 +246,7 @@ class VideoWriter:
             return
         # Waiting is not for a finaliser. The thread encodes what waits and ffmpeg
         # finishes its file, under the temporary name.
-        self._encoding.leave()
+        self.leave()
         warnings.warn(
             f"The VideoWriter of {self.path} was never closed; its frames are in "
             f"{self.temporary}. Use it in a with statement.",

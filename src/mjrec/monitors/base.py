@@ -13,7 +13,6 @@ from typing import Any, ClassVar, Literal, NoReturn, Self, SupportsIndex
 
 from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
-from ..recorder.deferred_video import DeferredVideo
 from ..recorder.ending_reasons import last_error
 from ..recorder.exit_guard import ExitGuard
 from ..recorder.finishing_process import Finisher
@@ -26,6 +25,7 @@ from ..recorder.options import (
     RenderingChoice,
 )
 from ..recorder.recorder import Recorder
+from ..recorder.recording import DeferredVideo
 from ..recorder.stats_recorder import StatsRecorder
 from ..recorder.subject import Subject
 from ..recorder.video_recorder import VideoRecorder, declared_rate

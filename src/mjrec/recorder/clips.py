@@ -1,48 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos that last so many steps, wherever they begin and whatever ends meanwhile."""
+"""Videos that last so many steps, wherever they begin and whatever ends meanwhile.
+
+A clip may go on across resets, and a recording is of one episode: so there is one for
+each part of it that is of one episode. `clip` in the facts of a part says
+
+- `first_step`: how many steps the monitor had recorded when the video began;
+- `part`: its number, from 0;
+- `steps_before`: of the running episode, before the part begins;
+- `reward_before`: their rewards;
+- `reset_time`: the simulated time of that episode's reset, where it is to be written on
+  the pictures.
+
+The last part ends as an episode's trajectory does, with `complete`; those before say
+`continues`.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
-from typing import Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from .deferred_clip import DeferredClip
-from .live_videos import LiveClip
+from ..formats.monitor_directory import clip_part_name, clip_video_prefix
+from .live_videos import LiveVideos
 from .monitored_run import MonitoredRun
-from .options import DEFERRED
+from .options import DEFERRED, LIVE
+from .recording import Recording
 
-
-class Clip(Protocol):
-    """What records one video that is counted in steps, and lists it at its end."""
-
-    def begin(self) -> None:
-        """Take the picture of this moment."""
-
-    def reset(self, episode_id: int) -> None:
-        """Take the picture of an episode that has just begun.
-
-        Args:
-            episode_id: its number.
-        """
-
-    def step(
-        self, reward: float, *, terminated: bool, truncated: bool, is_there: bool
-    ) -> None:
-        """Take the picture of a step.
-
-        Args:
-            reward: of the step.
-            terminated: the task ended the episode.
-            truncated: a limit from outside the task ended it.
-            is_there: False where the environment has reset itself already.
-        """
-
-    def end(self, facts: Mapping[str, Any]) -> None:
-        """End the video. Where it was interrupted, the next call goes on.
-
-        Args:
-            facts: what is known of its end.
-        """
+if TYPE_CHECKING:
+    from ..simulation.capture import EpisodeStart
 
 
 class Clips:
@@ -62,64 +49,43 @@ class Clips:
         self._run = run
         self._length = run.options.video_length
         self._trigger = run.options.step_trigger
-        self._clip: Clip | None = None
-        self._steps = 0
-        self._reward = 0.0
+        self._clip: _Clip | None = None
         # How the running one has ended, until that is all written down.
         self._ending: Mapping[str, Any] | None = None
 
-    def reset(self, episode_id: int, *, is_chosen: bool) -> None:
+    def reset(self, *, is_chosen: bool) -> None:
         """Take the picture of an episode that has just begun.
 
         Args:
-            episode_id: its number.
             is_chosen: a video begins with it, unless one is running.
         """
         self._settle()
         if self._clip is not None:
-            self._clip.reset(episode_id)
+            self._clip.reset()
         elif is_chosen:
             self._start(None)
 
-    def before_step(self, steps: int) -> None:
-        """Begin a video, if it is its time.
-
-        Args:
-            steps: how many were taken so far.
-        """
-        if self._ending is not None:
-            self._settle()
-        if self._clip is None and self._trigger is not None and self._trigger(steps):
-            self._start(steps)
+    def before_step(self) -> None:
+        """Begin a video, if it is its time."""
+        self._settle()
+        taken = self._run.stats.total_steps
+        if self._clip is None and self._trigger is not None and self._trigger(taken):
+            self._start(taken)
 
     def step(
-        self,
-        reward: float,
-        *,
-        terminated: bool,
-        truncated: bool,
-        is_there: bool,
+        self, reward: float, *, terminated: bool, truncated: bool, has_picture: bool
     ) -> None:
-        """Take the picture of a step.
-
-        Args:
-            reward: of the step.
-            terminated: the task ended the episode.
-            truncated: a limit from outside the task ended it.
-            is_there: False where the environment has reset itself already.
-        """
+        """Take the picture of a step; as `Recording.step`."""
         clip = self._clip
         if clip is None:
             return
-        self._steps += 1
-        self._reward += reward
-        done = terminated or truncated
-        if self._steps == self._length or (self._length is None and done):
+        clip.steps += 1
+        clip.reward += reward
+        is_over = self._length is None and (terminated or truncated)
+        if clip.steps == self._length or is_over:
             self._ending = {"complete": True}
         try:
-            clip.step(
-                reward, terminated=terminated, truncated=truncated, is_there=is_there
-            )
+            clip.step(reward, terminated, truncated, has_picture=has_picture)
         finally:
             self._settle()
 
@@ -129,46 +95,177 @@ class Clips:
         Args:
             facts: why it ends early.
         """
-        if self._clip is not None and self._ending is None:
-            self._ending = {"complete": False, **facts}
+        self._ending = self._ending or {"complete": False, **facts}
         self._settle()
 
+    def leave(self) -> None:
+        """Let go of the files as they are; recovery finishes them."""
+        if self._clip is not None and self._clip.live is not None:
+            self._clip.live.leave()
+
     def _start(self, steps: int | None) -> None:
-        clip = _new_clip(self._run, steps)
-        self._clip = clip
-        self._steps, self._reward = 0, 0.0
-        clip.begin()
+        self._clip, self._ending = _Clip(self._run, steps), None
+        self._clip.begin()
 
     def _settle(self) -> None:
         """End the running video, if it is over."""
         if self._clip is None or self._ending is None:
             return
         try:
-            self._clip.end(
-                {**self._ending, "length": self._steps, "reward": self._reward}
-            )
+            self._clip.end(self._ending)
         except Exception:
-            # There is nothing more to be had of it. After Ctrl-C there is.
-            self._clip = self._ending = None
+            # There is nothing more to be had of it.
+            self._clip = None
             raise
-        self._clip = self._ending = None
+        self._clip = None
 
 
-def _new_clip(run: MonitoredRun, steps: int | None) -> Clip:
-    """Return what records a clip that begins now.
+class _Clip:
+    """One video, drawn live, or recorded in parts of one episode each.
 
     Args:
         run: of which it is.
-        steps: how many were taken when a step began it; None where it begins with an
+        taken: the steps so far, where a step began it; None where it begins with an
             episode.
+
+    Attributes:
+        steps: how many it has.
+        reward: their sum.
+        live: draws it, or not.
     """
-    path = run.clip_path(steps)
-    second_name = run.second_name("episode", run.episode.episode_id)
-    if steps is not None:
-        second_name = run.second_name("step", steps)
-    states = run.subject.clip_states
-    if states is not None and run.subject.rendering.mode == DEFERRED:
+
+    def __init__(self, run: MonitoredRun, taken: int | None) -> None:
+        self.steps, self.reward = 0, 0.0
+        self.live: LiveVideos | None = None
+        self._run = run
+        self._first_step = run.stats.total_steps
+        self._episode_id = self._last_episode_id = run.episode.episode_id
+        path = run.directory / clip_video_prefix(run.infix, self._episode_id, taken)
+        second_name = run.second_name("episode", self._episode_id)
+        if taken is not None:
+            second_name = run.second_name("step", taken)
+        self._part: Recording | None = None
+        self._parts = 0
+        start = None
+        if run.subject.rendering.mode == DEFERRED:
+            assert run.subject.clip_states is not None
+            start = run.subject.clip_states.begin_episode()
+            start = start if run.can_be_deferred(start) else None
+        if start is not None:
+            self._promise = run.promise(path, DEFERRED, second_name=second_name)
+            self._video = path.with_name(f"{path.name}.mp4")
+            self._part = self._new_part(start)
+            self._parts = 1
+        else:
+            self.live = run.live_videos(path, second_name=second_name)
+            self._video = Path(str(self.live.recorders[0].path))
+            self._say(first_step=self._first_step, last_episode_id=self._episode_id)
+
+    def begin(self) -> None:
+        """Take the picture of this moment, where it is drawn live."""
+        if self.live is not None:
+            self.live.begin()
+
+    def reset(self) -> None:
+        """Take the picture of an episode that has just begun."""
+        self._last_episode_id = self._run.episode.episode_id
+        if self.live is not None:
+            self._say(last_episode_id=self._last_episode_id)
+            self.live.begin()
+        part, states = self._part, self._run.subject.clip_states
+        if part is None or part.broken_reason is not None:
+            return
+        assert states is not None
         start = states.begin_episode()
-        if run.can_be_deferred(start):
-            return DeferredClip(run, states, start, path, second_name=second_name)
-    return LiveClip(run, run.live_recorders(path, second_name=second_name))
+        if start.refusal is not None:
+            part.end_frames(start.refusal)
+            return
+        coming = self._new_part(start)
+        part.note(continues=True, end_time=time.time())
+        part.end({})
+        if part.broken_reason is None:
+            self._part = coming
+            self._parts += 1
+
+    def step(
+        self, reward: float, terminated: bool, truncated: bool, *, has_picture: bool
+    ) -> None:
+        """Take the picture of a step."""
+        if self.live is not None:
+            self.live.take(is_there=has_picture, last=False)
+        part = self._part
+        if part is None or part.broken_reason is not None:
+            return
+        if not has_picture:
+            part.note(final_frame="missing")
+        # What was done is of no use to a picture.
+        part.before_step(None)
+        part.step(
+            reward, terminated=terminated, truncated=truncated, has_picture=has_picture
+        )
+
+    def end(self, facts: Mapping[str, Any]) -> None:
+        """Write what is known of the end."""
+        known = {**facts, "length": self.steps, "reward": self.reward}
+        try:
+            if self.live is not None:
+                self._end_live(self.live, known)
+            if self._part is not None:
+                known["last_episode_id"] = self._last_episode_id
+                # It may have been said before that it goes on.
+                self._part.note(**known, end_time=time.time())
+                self._part.end({})
+        finally:
+            self._list()
+
+    def _end_live(self, live: LiveVideos, facts: Mapping[str, Any]) -> None:
+        try:
+            live.take_last()
+        finally:
+            live.end(facts)
+
+    def _list(self) -> None:
+        run, facts = self._run, {"episode_id": self._episode_id}
+        if self.live is not None:
+            video = {**facts, "recording": LIVE, "video": self._video.name}
+            run.journal.note("clip", video)
+            run.trackers.expect(self._video)
+            self.live.name_again()
+        elif self._part is not None and (self._parts > 1 or self._part.is_there):
+            # Else the disk was too full for a single row: there is nothing to promise.
+            first_part = self._name(0)
+            video = {**facts, "clip": first_part, "video": self._video.name}
+            run.journal.note("clip", video)
+            run.trackers.expect(self._video)
+            run.finisher.submit(run.directory / first_part)
+
+    def _new_part(self, start: EpisodeStart) -> Recording:
+        """Return what records the part that begins now. Its rows come later."""
+        run = self._run
+        clip = {
+            "first_step": self._first_step,
+            "part": self._parts,
+            "steps_before": run.stats.steps or 0,
+            "reward_before": run.stats.rewards or 0.0,
+            "reset_time": run.episode.reset_clock,
+        }
+        facts = {"kept": False, "video": self._promise, "clip": clip}
+        return Recording(
+            run,
+            self._name(self._parts),
+            logs=run.clip_logs,
+            what="video",
+            facts={**run.recording_facts(start), **facts},
+            states=run.subject.clip_states,
+            start=start,
+            # Which of the frames are wanted is chosen when they are drawn: they are
+            # counted over all parts. So `max_fps` is not said here.
+        )
+
+    def _name(self, number: int) -> str:
+        return clip_part_name(self._run.infix, self._first_step, number)
+
+    def _say(self, **facts: Any) -> None:
+        assert self.live is not None
+        for recorder in self.live.recorders:
+            recorder.metadata.update(facts)

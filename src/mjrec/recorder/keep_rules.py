@@ -74,6 +74,11 @@ class Selection(ABC):
         # The number of the last one, and how many there were.
         self._counted = (-1, 0)
 
+    def facts(self) -> dict[str, Any]:
+        """Return what a run says of it."""
+        left_open = {"left_open": True} if self.is_left_open else {}
+        return {"rule": self.name, **left_open}
+
     @property
     def finished(self) -> int:
         """How many episodes it was told of."""

@@ -4,15 +4,12 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..errors import Error
 from ..formats.second_names import give_second_names
-from .monitored_run import MonitoredRun
-from .options import LIVE
 from .video_recorder import VideoRecorder
 
 
@@ -24,6 +21,9 @@ class LiveVideos:
         tolerates: tells whether to go on after an error.
         on_picture_error: called with one that is not tolerated while a picture of a
             step is taken: it may be the environment's own.
+
+    Attributes:
+        recorders: as given.
     """
 
     def __init__(
@@ -33,50 +33,52 @@ class LiveVideos:
         tolerates: Callable[[Exception], bool],
         on_picture_error: Callable[[Exception], object] = lambda _: None,
     ) -> None:
-        self._recorders = recorders
+        self.recorders = recorders
         self._tolerates = tolerates
         self._on_picture_error = on_picture_error
 
     def begin(self) -> None:
-        """Take the pictures of a reset."""
-        for recorder in self._recorders:
-            self._try(recorder, recorder.capture_frame)
+        """Take the frames of a reset."""
+        self._each(VideoRecorder.capture_frame)
 
     def take(self, *, is_there: bool, last: bool) -> None:
-        """Take the pictures of a step.
+        """Take the frames of a step.
 
         Args:
             is_there: False where the environment has reset itself already.
             last: the episode is over.
         """
-        for recorder in self._recorders:
-            if not recorder.functional:
-                continue
-            if not is_there:
-                recorder.metadata["final_frame"] = "missing"
-                continue
-            try:
-                self._try(recorder, recorder.capture_frame)
-                if last:
-                    self._try(recorder, recorder.capture_last)
-            except Exception as error:
-                self._on_picture_error(error)
-                raise
+        if not is_there:
+            for recorder in self.recorders:
+                if recorder.functional:
+                    recorder.metadata["final_frame"] = "missing"
+            return
+        try:
+            self._each(VideoRecorder.capture_frame)
+            if last:
+                self.take_last()
+        except Exception as error:
+            self._on_picture_error(error)
+            raise
 
     def take_last(self) -> None:
-        """Take the pictures of the last step, where they were left out."""
-        for recorder in self._recorders:
-            self._try(recorder, recorder.capture_last)
+        """Take the frames of the last step, where they were left out."""
+        self._each(VideoRecorder.capture_last)
 
     def give_up(self, reason: str) -> None:
         """Take no more pictures, and say why; those that were taken stay."""
-        for recorder in self._recorders:
+        for recorder in self.recorders:
             recorder.give_up(reason)
 
     def discard(self) -> None:
         """End without a video and without metadata."""
-        for recorder in self._recorders:
+        for recorder in self.recorders:
             recorder.discard()
+
+    def leave(self) -> None:
+        """Let go of the files as SIGKILL would; recovery finishes them."""
+        for recorder in self.recorders:
+            recorder.leave()
 
     def end(
         self,
@@ -89,11 +91,10 @@ class LiveVideos:
         names the others: it comes last, also where ending another one raises.
 
         Args:
-            facts: what is known of the episode, for the metadata; of its end what the
-                first call says.
+            facts: what is known of the episode, for the metadata.
             on_closed: called with each that is closed.
         """
-        first, *others = self._recorders
+        first, *others = self.recorders
         with contextlib.ExitStack() as ends:
             # Run from the last to the first.
             ends.callback(self._end_one, first, facts, on_closed)
@@ -103,17 +104,18 @@ class LiveVideos:
 
     def name_again(self) -> None:
         """Give the finished videos their second names, if they have any."""
-        first = self._recorders[0]
+        first = self.recorders[0]
         if first.finished and first.path is not None and "also_named" in first.metadata:
             give_second_names(Path(first.path))
 
-    def _try(self, recorder: VideoRecorder, capture: Callable[[], None]) -> None:
-        try:
-            capture()
-        except Exception as error:
-            if not self._tolerates(error):
-                raise
-            recorder.give_up(str(error))
+    def _each(self, capture: Callable[[VideoRecorder], None]) -> None:
+        for recorder in self.recorders:
+            try:
+                capture(recorder)
+            except Exception as error:
+                if not self._tolerates(error):
+                    raise
+                recorder.give_up(str(error))
 
     def _end_one(
         self,
@@ -123,8 +125,7 @@ class LiveVideos:
     ) -> None:
         if recorder.closed:
             return
-        said = _OF_THE_END if "complete" in recorder.metadata else ()
-        recorder.metadata.update({k: v for k, v in facts.items() if k not in said})
+        recorder.metadata.update(facts)
         try:
             recorder.close()
         except Error as error:
@@ -135,67 +136,7 @@ class LiveVideos:
                 on_closed(recorder)
 
 
-# What an end that is taken up again must not say otherwise.
-_OF_THE_END = ("complete", "reason", "exception", "terminated", "truncated")
-
-
 def _name_further_videos(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:
     names = [Path(v.path).name for v in others if v.finished and v.path is not None]
     if names:
         first.metadata["further_videos"] = names
-
-
-class LiveClip:
-    """A video that is counted in steps, drawn while the simulation runs; a `Clip`.
-
-    Args:
-        run: of which it is.
-        recorders: what records it, of one camera or of each.
-    """
-
-    def __init__(self, run: MonitoredRun, recorders: Sequence[VideoRecorder]) -> None:
-        self._run = run
-        self._recorders = recorders
-        self._episode_id = run.episode.episode_id
-        self._videos = LiveVideos(
-            recorders, tolerates=functools.partial(run.tolerates, "video")
-        )
-        for recorder in recorders:
-            recorder.metadata.update(
-                first_step=run.stats.total_steps, last_episode_id=self._episode_id
-            )
-
-    def begin(self) -> None:
-        """Take the picture of this moment."""
-        self._videos.begin()
-
-    def reset(self, episode_id: int) -> None:
-        """Take the picture of an episode that has just begun."""
-        for recorder in self._recorders:
-            recorder.metadata["last_episode_id"] = episode_id
-        self._videos.begin()
-
-    def step(
-        self, reward: float, *, terminated: bool, truncated: bool, is_there: bool
-    ) -> None:
-        """Take the picture of a step."""
-        del reward, terminated, truncated
-        self._videos.take(is_there=is_there, last=False)
-
-    def end(self, facts: Mapping[str, Any]) -> None:
-        """Finish the files. Where it was interrupted, the next call goes on."""
-        try:
-            try:
-                self._videos.take_last()
-            finally:
-                self._videos.end(facts)
-        finally:
-            self._list()
-            self._videos.name_again()
-
-    def _list(self) -> None:
-        path = self._recorders[0].path
-        if path is not None:
-            facts = {"episode_id": self._episode_id, "recording": LIVE}
-            self._run.journal.note("clip", {**facts, "video": Path(path).name})
-            self._run.videos.expect(Path(path))

@@ -3,32 +3,28 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..annotation import Caption
-from ..formats.monitor_directory import (
-    Infix,
-    clip_video_prefix,
-    trajectory_prefix,
-    video_prefix,
-)
+from ..formats.monitor_directory import Infix
 from ..formats.span_writer import SpanLogs
 from ..formats.video_names import second_name_of
 from ..machine import machine_fingerprint
 from ..provenance import versions
 from .finishing_process import Finisher
+from .live_videos import LiveVideos
 from .opening import OpenDirectory
 from .options import LIVE, RecorderOptions
-from .run_journal import Faults, RunJournal, What
+from .run_journal import RunJournal, What
 from .stats_recorder import StatsRecorder
 from .subject import EpisodePictures, Subject, check_refusal
-from .tracking import EpisodeVideos
-from .trajectory_recorder import Pace
+from .tracking import Trackers
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
@@ -70,19 +66,17 @@ class MonitoredRun:
         options: what was asked for.
         stats: counts steps and rewards.
         journal: of the run.
-        faults: what could not be recorded.
         finisher: takes over recordings that have ended.
-        videos: watches for finished videos.
+        trackers: are told of finished videos.
         selection: `selection` of a video that is chosen after its episode's end; empty
             where it is chosen before.
 
     Attributes:
-        subject, options, stats, journal, finisher, videos, selection: as given.
+        subject, options, stats, journal, finisher, trackers, selection: as given.
         directory: the monitor directory.
         infix: what its files have in the middle.
         logs: of the episodes' rows.
         clip_logs: of the clips'.
-        pace: how simulated time becomes frames.
     """
 
     def __init__(
@@ -93,9 +87,8 @@ class MonitoredRun:
         options: RecorderOptions,
         stats: StatsRecorder,
         journal: RunJournal,
-        faults: Faults,
         finisher: Finisher,
-        videos: EpisodeVideos,
+        trackers: Trackers,
         selection: Mapping[str, Any],
     ) -> None:
         self.directory: Path = place.path
@@ -105,7 +98,7 @@ class MonitoredRun:
         self.stats = stats
         self.journal = journal
         self.finisher = finisher
-        self.videos = videos
+        self.trackers = trackers
         self.selection = selection
         numbers = itertools.count()
         self.logs, self.clip_logs = (
@@ -117,10 +110,6 @@ class MonitoredRun:
             )
             for _ in range(2)
         )
-        self.pace = Pace(
-            clock=subject.clock, declared=subject.declared, max_fps=options.max_fps
-        )
-        self._faults = faults
         self._episode: BegunEpisode | None = None
         # Why videos are drawn live, as far as it was said.
         self._said: set[str] = set()
@@ -131,19 +120,14 @@ class MonitoredRun:
         assert self._episode is not None, "there was no reset"
         return self._episode
 
-    @property
-    def has_begun(self) -> bool:
-        """Whether there was an episode yet."""
-        return self._episode is not None
-
     def begin(self, episode: BegunEpisode) -> None:
         """Take note of an episode that begins."""
         self._episode = episode
+        self.journal.begin(episode.episode_id)
 
     def tolerates(self, what: What, error: BaseException) -> bool:
         """Note what of the running episode is lost; tell whether to go on."""
-        number = None if self._episode is None else self._episode.episode_id
-        return self._faults.tolerates(what, error, episode_id=number)
+        return self.journal.tolerates(what, error)
 
     def caption(self) -> Caption:
         """Return what is written on the frame of this moment."""
@@ -173,24 +157,6 @@ class MonitoredRun:
                 "The videos of %s are drawn live: %s.", self.subject.env_id, refusal
             )
         return False
-
-    def trajectory_name(self) -> str:
-        """Return what the running episode's trajectory is called."""
-        return trajectory_prefix(self.infix, self.episode.episode_id)
-
-    def video_path(self, episode_id: int) -> Path:
-        """Return where an episode's video will be, without the ending."""
-        return self.directory / video_prefix(self.infix, episode_id)
-
-    def clip_path(self, steps: int | None) -> Path:
-        """Return where the video of a clip that begins now will be, without the ending.
-
-        Args:
-            steps: how many were taken when a step began it; None where it begins with
-                the episode.
-        """
-        number = self.episode.episode_id
-        return self.directory / clip_video_prefix(self.infix, number, steps)
 
     def promise(
         self, path: Path, recording: str, *, second_name: Mapping[str, str]
@@ -272,42 +238,52 @@ class MonitoredRun:
             **({"selection": self.selection} if self.selection else {}),
         }
 
-    def live_recorders(
-        self, path: Path, *, second_name: Mapping[str, str], enabled: bool = True
-    ) -> tuple[VideoRecorder, ...]:
-        """Return what draws the first camera's video, and the others'.
+    def live_videos(
+        self,
+        path: Path,
+        *,
+        second_name: Mapping[str, str],
+        on_picture_error: Callable[[Exception], object] = lambda _: None,
+    ) -> LiveVideos:
+        """Return what draws videos while the simulation runs, of each camera.
 
         Args:
-            path: of the first one, without its ending.
+            path: of the first camera's, without its ending.
             second_name: as of `second_name`.
-            enabled: False makes one that records nothing.
+            on_picture_error: as of `LiveVideos`.
         """
-        first = self._live_recorder(path, self.subject.pictures, enabled=enabled)
-        if first.path is None:
-            return (first,)
-        first.metadata.update(second_name)
-        others = [
-            self._live_recorder(path.with_name(f"{path.name}.{name}"), pictures)
-            for name, pictures in self.subject.further_pictures.items()
-        ]
-        for other in others:
-            assert other.path is not None
-            first_name, name = Path(first.path).name, Path(other.path).name
-            other.metadata["first_video"] = first_name
-            for second in second_name.values():
-                called = second_name_of(name, second, first=first_name)
-                other.metadata["also_named"] = called
-        return (first, *others)
+        recorders = [self._live_recorder(path, self.subject.pictures)]
+        if recorders[0].path is not None:
+            recorders[0].metadata.update(second_name)
+            for name, pictures in self.subject.further_pictures.items():
+                other_path = path.with_name(f"{path.name}.{name}")
+                other = self._live_recorder(other_path, pictures)
+                other.metadata["first_video"] = Path(recorders[0].path).name
+                for second in second_name.values():
+                    other.metadata["also_named"] = second_name_of(
+                        Path(str(other.path)).name,
+                        second,
+                        first=Path(recorders[0].path).name,
+                    )
+                recorders.append(other)
+        return LiveVideos(
+            recorders,
+            tolerates=functools.partial(self.tolerates, "video"),
+            on_picture_error=on_picture_error,
+        )
+
+    def no_video(self) -> VideoRecorder:
+        """Return what stands for the video of an episode that gets none."""
+        return VideoRecorder(self.subject.pictures, enabled=False)
 
     def _live_recorder(
-        self, base_path: Path, pictures: EpisodePictures, *, enabled: bool = True
+        self, base_path: Path, pictures: EpisodePictures
     ) -> VideoRecorder:
         options = self.options
         return VideoRecorder(
             pictures,
             base_path=base_path,
-            metadata=self.live_facts() if enabled else None,
-            enabled=enabled,
+            metadata=self.live_facts(),
             fps=options.fps,
             max_fps=options.max_fps,
             frame_hashes=True,

@@ -6,11 +6,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import sys
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,10 +25,10 @@ from ..formats.monitor_directory import (
 )
 from ..formats.render_failures import note_failure, reason_of
 from ..formats.spans import FINISHED
+from ..provenance import versions
 from ..results.manifest_and_stats import write_manifest_and_stats
 from .clips import Clips
-from .deferred_video import DeferredVideo
-from .ending_reasons import CLOSE, INTERRUPT, RESET, ending
+from .ending_reasons import CLOSE, RESET, ending
 from .episode_choice import EpisodeChoice
 from .episode_recording import EpisodeRecording
 from .fast_path import FastPath
@@ -36,18 +36,36 @@ from .finishing_process import Finisher, LaterFinisher
 from .keep_rules import Standing
 from .kept_videos import KeptVideos
 from .monitored_run import BegunEpisode, MonitoredRun
-from .opening import OpenDirectory, open_directory
+from .opening import open_directory
 from .options import LIVE, RecorderOptions, type_of_mode
-from .run_journal import Faults, RunJournal, facts_of
+from .recording import DeferredVideo
+from .run_journal import RunJournal
 from .stats_recorder import StatsRecorder, reward_to_float
 from .subject import Subject, check_pictures
-from .tracking import EpisodeVideos, FinishedEpisode, Run, Trackers
+from .tracking import FinishedEpisode, Run, Trackers
 from .video_recorder import VideoRecorder
 
 if TYPE_CHECKING:
     from ..simulation.capture import Capture
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass
+class _End:
+    """How the running episode has ended: decided once, and then written down.
+
+    Attributes:
+        facts: `complete`, and what ended it.
+        standing: whether its video is kept.
+        episode: the episode, where it is complete.
+        is_journaled: the journal has it, or could not be written.
+    """
+
+    facts: Mapping[str, Any]
+    standing: Standing
+    episode: FinishedEpisode | None
+    is_journaled: bool = False
 
 
 class Recorder:
@@ -64,6 +82,13 @@ class Recorder:
         options: what was asked for.
         finisher: makes what finishes recordings, for the directory; None where nothing
             is to be rendered now.
+
+    Attributes:
+        run: what all recordings share.
+        stats_recorder: counts steps and rewards.
+        closed: nothing is recorded any more.
+        fast: what the next step may be recorded with; None where it needs a closer
+            look.
     """
 
     def __init__(
@@ -74,9 +99,9 @@ class Recorder:
         options: RecorderOptions,
         finisher: Callable[[Path], Finisher] | None = None,
     ) -> None:
-        mode = subject.rendering.mode
-        self._choice = EpisodeChoice(options, mode=mode)
-        if mode == LIVE and (self._choice.has_videos or options.has_clips):
+        self._choice = EpisodeChoice(options, mode=subject.rendering.mode)
+        draws = self._choice.has_videos or options.has_clips
+        if subject.rendering.mode == LIVE and draws:
             check_pictures(subject)
         self._subject = subject
         self._options = options
@@ -88,70 +113,75 @@ class Recorder:
         # What the last step said.
         self._flags = {"terminated": False, "truncated": False}
         self._success: bool | None = None
-        # The last one that is over, and the last one that the journal has.
-        self._finished: FinishedEpisode | None = None
-        self._journaled = -1
         self._recording: EpisodeRecording | None = None
+        self._end: _End | None = None
         self.closed = False
         # What the next step may be recorded with; None where it needs a closer look.
         self.fast: FastPath | None = None
 
-        self._place: OpenDirectory = open_directory(
+        selection = self._choice.selection
+        keep = None if selection is None else selection.facts()
+        self._place = open_directory(
             directory,
             force=options.force,
             resume=options.resume,
             uid=options.uid,
             env_info={"gym_version": GYM_VERSION, "env_id": subject.env_id},
-            facts={**facts_of(self._choice), "views": [*subject.further_views]},
+            facts={
+                "schedule": self._choice.schedule_name,
+                "keep": keep,
+                "versions": dict(versions()),
+                "views": [*subject.further_views],
+            },
         )
+        infix = self._place.infix
         self._next_episode_id = self._place.first_episode_id
-        for states in self._all_states():
+        self._states = [
+            each for each in (subject.states, subject.clip_states) if each is not None
+        ]
+        for states in self._states:
             states.open(self.directory)
-        self._finisher = (
-            LaterFinisher() if finisher is None else finisher(self.directory)
-        )
-        self._faults = Faults(
-            options.on_error, lambda fault: self._journal.note("fault", fault)
-        )
-        self._journal = RunJournal(
-            self.directory / journal_name(self._place.infix),
-            facts=self._place.run,
-            options=options,
-            tolerates=lambda error: self._run.tolerates("journal", error),
-        )
         self.stats_recorder = StatsRecorder(
             str(self.directory),
-            stats_prefix(self._place.infix),
+            stats_prefix(infix),
             env_id=subject.env_id,
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
+        self._journal = RunJournal(
+            self.directory / journal_name(infix),
+            facts=self._place.run,
+            options=options,
+        )
         self._trackers = Trackers(
             Run(
                 directory=self.directory,
-                infix=str(self._place.infix),
+                infix=str(infix),
                 env_id=subject.env_id,
                 env_index=subject.env_index,
             ),
             options.all_trackers,
-            on_fault=self._note_tracker_fault,
+            on_fault=lambda name, error, number: self._journal.note_fault(
+                "tracker", f"{name}: {error}", episode_id=number
+            ),
         )
-        selection = self._choice.selection
-        self._run = MonitoredRun(
+        self._finisher = (
+            LaterFinisher() if finisher is None else finisher(self.directory)
+        )
+        self.run = MonitoredRun(
             self._place,
             subject=subject,
             options=options,
             stats=self.stats_recorder,
             journal=self._journal,
-            faults=self._faults,
             finisher=self._finisher,
-            videos=EpisodeVideos(),
-            selection={}
-            if selection is None
-            else {"rule": selection.name, "decided": False},
+            trackers=self._trackers,
+            selection=(
+                {} if selection is None else {"rule": selection.name, "decided": False}
+            ),
         )
-        self._kept = None if selection is None else KeptVideos(self._run, selection)
-        self._clips = Clips(self._run) if options.has_clips else None
+        self._kept = None if selection is None else KeptVideos(selection)
+        self._clips = Clips(self.run) if options.has_clips else None
 
     @property
     def directory(self) -> Path:
@@ -173,6 +203,11 @@ class Recorder:
         """Whether the episode is over; None before the first reset."""
         return self.stats_recorder.done
 
+    @property
+    def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
+        """What records the running episode, or not; None before the first reset."""
+        return None if self._recording is None else self._recording.video
+
     def set_mode(self, mode: str | None) -> None:
         """Set the type of the episodes from the next reset on.
 
@@ -186,12 +221,12 @@ class Recorder:
 
     def model_changed(self) -> None:
         """Note that textures, height fields or meshes were changed in mid-episode."""
-        for states in self._all_states():
+        for states in self._states:
             states.model_changed()
 
     def forget_pictures(self) -> None:
         """Let the next episode's pictures depend on none that was made before."""
-        for states in self._all_states():
+        for states in self._states:
             states.forget_pictures()
 
     def resetting(self) -> AbstractContextManager[None]:
@@ -213,7 +248,7 @@ class Recorder:
         self.fast = None
         self.stats_recorder.before_reset(after_error=self._ending is not None)
         if not self._is_unbegun():
-            self._take_last_picture()
+            self._take_last_frame()
         self._reset_time = time.time()
         self._random_state = None
         if self._choice.may_keep_trajectory(self.stats_recorder.type):
@@ -241,9 +276,10 @@ class Recorder:
                 self._recording.discard()
         else:
             self._end_episode(otherwise=RESET)
-        self._ending = None
+        self._ending = self._end = None
+        self._flags = {"terminated": False, "truncated": False}
         self.stats_recorder.after_reset()
-        self._run.begin(
+        self.run.begin(
             BegunEpisode(
                 episode_id=self._next_episode_id,
                 type=self.stats_recorder.episode_type,
@@ -256,13 +292,11 @@ class Recorder:
         )
         self._next_episode_id += 1
         # That of the episode before is over, whatever the schedule raises.
-        self._recording = EpisodeRecording(
-            self._run, self._kept, on_picture_error=self.note_error
-        )
+        self._recording = EpisodeRecording(self.run, on_picture_error=self.note_error)
         try:
             self._begin_episode(self._recording, observation)
         except Exception as error:
-            if not self._run.tolerates("video", error):
+            if not self.run.tolerates("video", error):
                 raise
             # Where it is only the first frame, states are recorded all the same.
             self._recording.give_up(str(error))
@@ -270,7 +304,7 @@ class Recorder:
             try:
                 self._write_results()
             except FileNotWritten as error:
-                if not self._faults.tolerates("statistics", error, episode_id=None):
+                if not self._journal.tolerates("statistics", error, of_episode=False):
                     raise
 
     def note_error(self, error: BaseException) -> None:
@@ -291,12 +325,11 @@ class Recorder:
             ResetNeeded: before the first reset, or after the end of an episode.
             Error: in a process forked from the one that made the recorder.
         """
-        stats = self.stats_recorder
-        # The usual case first: this is asked at every step.
-        if self._is_forked or stats.done is not False or stats.closed:
-            self._refuse_step()
+        if self._is_forked:
+            self._refuse_process()
+        self.stats_recorder.before_step()
         if self._clips is not None:
-            self._clips.before_step(stats.total_steps)
+            self._clips.before_step()
         if self._recording is not None:
             self._recording.before_step(action)
 
@@ -323,45 +356,42 @@ class Recorder:
                 where it says nothing.
         """
         reward = reward_to_float(reward)
-        done = bool(terminated or truncated)
-        self._ending = None
-        self.fast = None
-        if done:
-            # Before it is counted: an end that is interrupted is taken up again.
-            self._flags = {
-                "terminated": bool(terminated),
-                "truncated": bool(truncated),
-            }
-            self._success = success
-        self.stats_recorder.count(reward, done)
-        try:
-            if done:
-                # First of all, so that no failing video can lose the episode.
-                self._finished = self._finished_episode()
-                self._journal_episode(self._finished)
-        finally:
+        flags = {"terminated": bool(terminated), "truncated": bool(truncated)}
+        done = any(flags.values())
+        self.fast = self._ending = None
+        recording, clips = self._recording, self._clips
+        failures: list[Exception] = []
+        if recording is not None:
             try:
-                if self._recording is not None:
-                    self._recording.step(
-                        reward,
-                        terminated=terminated,
-                        truncated=truncated,
-                        observation=observation,
-                        picture=picture,
+                # First of all: what is counted has a row, if it can have one.
+                with _raising_later(failures, Error):
+                    recording.step(
+                        reward, **flags, observation=observation, has_picture=picture
                     )
-                if self._clips is not None:
-                    self._clips.step(
-                        reward,
-                        terminated=bool(terminated),
-                        truncated=bool(truncated),
-                        is_there=picture,
-                    )
-            finally:
-                if done:
-                    self._end_episode()
-                    self._tell_of_episode()
-                else:
-                    self.fast = self._fast_path()
+            except BaseException as error:
+                # A signal's handler has raised: this step is not recorded.
+                self.note_error(error)
+                raise
+        self._flags, self._success = flags, success
+        self.stats_recorder.count(reward, done)
+        if done:
+            # Before all that is drawn, so that no failing video can lose the episode.
+            with _raising_later(failures):
+                self._journal_end(CLOSE)
+        if recording is not None:
+            with _raising_later(failures):
+                recording.take_pictures(is_last=done, is_there=picture)
+        if clips is not None:
+            with _raising_later(failures):
+                clips.step(reward, **flags, has_picture=picture)
+        if done:
+            with _raising_later(failures):
+                self._end_episode()
+            self._tell_of_episode()
+        elif clips is None and recording is not None:
+            self.fast = recording.fast_path()
+        if failures:
+            raise failures[0]
 
     def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
         """End the running episode, and wait until all videos are rendered.
@@ -378,11 +408,12 @@ class Recorder:
         """
         if self.closed:
             return
-        self._end_by_close()
+        with self._leaving_if_interrupted():
+            self._end_recordings()
         try:
             self._finisher.wait(on_progress)
         except Error as error:
-            if not self._faults.tolerates("trajectory", error, episode_id=None):
+            if not self._journal.tolerates("trajectory", error, of_episode=False):
                 raise
 
     def close(self) -> None:
@@ -390,7 +421,8 @@ class Recorder:
 
         Nothing is rendered any more: what is not rendered yet stays pending. An
         episode that is not over is no part of the statistics; its video is kept,
-        marked incomplete. Where it is interrupted (Ctrl-C), the next call goes on.
+        marked incomplete. Where it is interrupted (Ctrl-C), the recorder is closed
+        all the same: files stay as SIGKILL leaves them, and recovery completes them.
 
         Raises:
             EncoderError: the video could not be finished; the rest is written.
@@ -398,63 +430,15 @@ class Recorder:
         """
         if self.closed:
             return
-        self._finisher.stop()
-        try:
-            self._end_by_close()
-        except Exception:
-            self._let_go()
-            raise
-        self._let_go()
-        logger.info("Finished writing results. They are in %s.", self.directory)
-
-    def _end_by_close(self) -> None:
-        self.fast = None
-        with contextlib.ExitStack() as ends:
-            for logs in (self._run.logs, self._run.clip_logs):
-                ends.callback(self._settle, logs.close)
-            for states in self._all_states():
-                # A trajectory without its model is worth nothing, and what stores it
-                # may end with the process.
-                ends.callback(self._finish_models, states)
-            if self._kept is not None:
-                ends.callback(self._settle, self._kept.decide)
-            ends.callback(self._end_episode)
-            self._take_last_picture()
-            if self._clips is not None:
-                self._clips.close(self._ending or {"reason": CLOSE})
-
-    def _all_states(self) -> list[Capture]:
-        both = (self._subject.states, self._subject.clip_states)
-        return [each for each in both if each is not None]
-
-    def _finish_models(self, states: Capture) -> None:
-        try:
-            states.finish()
-        except Error as error:
-            if not self._faults.tolerates("model", error, episode_id=None):
-                raise
-
-    def add_video(self, video: VideoRecorder) -> None:
-        """Let trackers know of one more video of an episode, which is closed."""
-        if video.path is not None:
-            self._run.videos.expect(Path(video.path))
-
-    def failures(self) -> Mapping[str, str]:
-        """Return why videos could not be rendered, by their names."""
-        return self._finisher.failures
-
-    def _let_go(self) -> None:
-        # Where it fails, all stays open, and the next close tries again. That is an
-        # error in any case: no simulation is disturbed, and nothing else would say it.
-        self._tell_of_videos()
-        self._trackers.end()
-        pending = self._write_last_results()
-        self.closed = True
-        self.stats_recorder.closed = True
-        self._journal.close()
-        self._place.lock.release()
-        is_left_open = self._kept is not None and self._kept.is_left_open
-        if pending and not is_left_open:
+        failures: list[Exception] = []
+        with self._leaving_if_interrupted():
+            self._finisher.stop()
+            with _raising_later(failures):
+                self._end_recordings()
+            self._trackers.end()
+            pending = self._write_last_results()
+        self._leave()
+        if pending and not (self._kept and self._kept.selection.is_left_open):
             # Said aloud: nobody else will render them.
             logger.warning(
                 "%d %s pending: mjrec render %s",
@@ -462,17 +446,13 @@ class Recorder:
                 "video" if pending == 1 else "videos",
                 self.directory,
             )
+        if failures:
+            raise failures[0]
+        logger.info("Finished writing results. They are in %s.", self.directory)
 
-    def _fast_path(self) -> FastPath | None:
-        """Return what the coming steps may be recorded with, if they are usual."""
-        if self._clips is not None or self._recording is None:
-            return None
-        return self._recording.fast_path()
-
-    def _refuse_step(self) -> None:
-        if self._is_forked:
-            self._refuse_process()
-        self.stats_recorder.before_step()
+    def failures(self) -> Mapping[str, str]:
+        """Return why videos could not be rendered, by their names."""
+        return self._finisher.failures
 
     def _refuse_process(self) -> None:
         raise Error(
@@ -486,20 +466,15 @@ class Recorder:
         stats = self.stats_recorder
         return stats.done is False and stats.steps == 0 and self._ending is None
 
-    @property
-    def video_recorder(self) -> VideoRecorder | DeferredVideo | None:
-        """What records the running episode, or not; None before the first reset."""
-        return None if self._recording is None else self._recording.video
-
     def _begin_episode(self, recording: EpisodeRecording, observation: Any) -> None:
-        episode = self._run.episode
+        episode = self.run.episode
         wanted = self._choice.decide(episode.episode_id)
+        if self._clips is not None:
+            self._clips.reset(is_chosen=wanted)
         chosen = wanted and self._kept is None
         self._journal.run.begin(episode.episode_id, chosen=chosen)
-        if self._clips is not None:
-            self._clips.reset(episode.episode_id, is_chosen=wanted)
-            # The episode has no video of its own.
-            wanted = False
+        # With clips the episode has no video of its own.
+        wanted = wanted and self._clips is None
         recording.begin(
             observation,
             wants_video=wanted,
@@ -509,14 +484,55 @@ class Recorder:
             stays=self._choice.keeps_without_video(episode.type),
         )
 
-    def _take_last_picture(self) -> None:
+    def _take_last_frame(self) -> None:
         """Take the frame of the running episode's last step, if it was left out."""
         is_running = self.stats_recorder.done is False and self._ending is None
         if is_running and self._recording is not None:
             self._recording.take_last()
 
+    def _end_episode(self, *, otherwise: str = CLOSE) -> None:
+        """Finish what is recorded of the running episode. Idempotent.
+
+        Args:
+            otherwise: why, where it is not over and nothing was raised.
+        """
+        recording, kept = self._recording, self._kept
+        if recording is None or recording.is_over:
+            return
+        end = self._decided_end(otherwise)
+        failures: list[Exception] = []
+        with _raising_later(failures):
+            self._journal_end(otherwise)
+        with _raising_later(failures):
+            chosen = {} if kept is None else kept.chosen_facts()
+            recording.end(end.facts, end.standing, chosen)
+            if kept is not None and end.standing is Standing.CANDIDATE:
+                kept.hold(recording)
+            else:
+                recording.hand_on()
+        with _raising_later(failures):
+            self._settle(None if kept is None else kept.settle)
+        if failures:
+            raise failures[0]
+
+    def _decided_end(self, otherwise: str) -> _End:
+        """Return how the running episode has ended, which is decided once."""
+        if self._end is None:
+            # Somebody else may have said that it is done.
+            is_complete = self.stats_recorder.done and any(self._flags.values())
+            episode = self._finished_episode() if is_complete else None
+            facts: dict[str, Any] = {"complete": True, **self._flags}
+            if episode is None:
+                facts = {"complete": False, **(self._ending or {"reason": otherwise})}
+            standing = Standing.CHOSEN
+            # What a schedule has said is final.
+            if self._kept is not None and self._choice.is_scheduled:
+                standing = self._kept.judge(self.run.episode.episode_id, episode)
+            self._end = _End(facts, standing, episode)
+        return self._end
+
     def _finished_episode(self) -> FinishedEpisode:
-        stats, episode = self.stats_recorder, self._run.episode
+        stats, episode = self.stats_recorder, self.run.episode
         return FinishedEpisode(
             episode_id=episode.episode_id,
             length=stats.episode_lengths[-1],
@@ -531,103 +547,102 @@ class Recorder:
             **self._flags,
         )
 
-    def _journal_episode(self, episode: FinishedEpisode) -> None:
-        """Write down an episode that is complete."""
-        facts = {**vars(episode), **self._choice_facts(is_complete=True)}
-        del facts["total_steps"]
-        self._journaled = episode.episode_id
-        self._journal.add(JournalEntry(**facts))
-
-    def _journal_cut(self, facts: Mapping[str, Any]) -> None:
-        """Write down an episode that is no part of the statistics."""
-        is_over = self.stats_recorder.done is not False
-        if is_over or self._journaled == self._run.episode.episode_id:
+    def _journal_end(self, otherwise: str) -> None:
+        """Write down an episode that has ended; once, unless that was interrupted."""
+        end, recording = self._decided_end(otherwise), self._recording
+        if end.is_journaled or recording is None:
             return
-        self._journaled = self._run.episode.episode_id
-        cut = {"episode_id": self._journaled, "reason": facts.get("reason")}
-        self._journal.note("cut", {**cut, **self._choice_facts(is_complete=False)})
-
-    def _choice_facts(self, *, is_complete: bool) -> dict[str, Any]:
-        """Return whether the running episode was chosen, and how it is filmed."""
-        assert self._recording is not None
-        standing = self._standing(is_complete=is_complete)
-        is_out = standing is Standing.DROPPED
-        return {
-            "chosen": self._choice.is_scheduled and standing is Standing.CHOSEN,
-            "recording": None if is_out else self._recording.mode,
-        }
+        is_chosen = self._choice.is_scheduled and end.standing is Standing.CHOSEN
+        is_out = end.standing is Standing.DROPPED
+        choice = {"chosen": is_chosen, "recording": None if is_out else recording.mode}
+        failures: list[Exception] = []
+        with _raising_later(failures):
+            if end.episode is not None:
+                facts = {**vars(end.episode), **choice}
+                del facts["total_steps"]
+                self._journal.add(JournalEntry(**facts))
+            else:
+                reason = {"reason": end.facts.get("reason")}
+                number = {"episode_id": recording.episode_id}
+                self._journal.note("cut", {**number, **reason, **choice})
+        end.is_journaled = True
+        if failures:
+            raise failures[0]
 
     def _tell_of_episode(self) -> None:
-        if not self._trackers:
-            return
-        assert self._finished is not None
-        video = self.video_recorder
-        is_out = self._standing(is_complete=True) is Standing.DROPPED
-        has_video = video is not None and video.enabled and not is_out
-        self._trackers.episode(self._finished, has_video=has_video)
-        self._tell_of_videos()
+        end, video = self._end, self.video_recorder
+        if end is not None and end.episode is not None:
+            is_out = end.standing is Standing.DROPPED
+            has_video = video is not None and video.enabled and not is_out
+            self._trackers.episode(end.episode, has_video=has_video)
 
-    def _tell_of_videos(self) -> None:
-        if self._trackers:
-            self._trackers.videos(self._run.videos.news())
+    def _end_recordings(self) -> None:
+        """End whatever runs; what fails stops nothing else. Idempotent."""
+        self.fast = None
+        failures: list[Exception] = []
+        with _raising_later(failures):
+            if self._clips is not None:
+                self._clips.close(self._ending or {"reason": CLOSE})
+        with _raising_later(failures):
+            self._take_last_frame()
+        with _raising_later(failures):
+            self._end_episode()
+        with _raising_later(failures):
+            self._settle(None if self._kept is None else self._kept.decide)
+        for states in self._states:
+            # A trajectory without its model is worth nothing, and what stores it may
+            # end with the process.
+            with _raising_later(failures):
+                self._finish_models(states)
+        for logs in (self.run.logs, self.run.clip_logs):
+            with _raising_later(failures):
+                self._settle(logs.close)
+        if failures:
+            raise failures[0]
 
-    def _note_tracker_fault(
-        self, name: str, error: Exception, episode_id: int | None
-    ) -> None:
-        self._faults.note("tracker", f"{name}: {error}", episode_id=episode_id)
-
-    def _how_it_ended(self, otherwise: str) -> dict[str, Any]:
-        """Return whether the running episode is complete, and what ended it."""
-        if self.stats_recorder.done and self._lacks_last_step():
-            # What the handler raised is on its way through here.
-            return {"complete": False, **ending(sys.exception(), otherwise=INTERRUPT)}
-        if self.stats_recorder.done:
-            return {"complete": True, **self._flags}
-        return {"complete": False, **(self._ending or {"reason": otherwise})}
-
-    def _lacks_last_step(self) -> bool:
-        """Whether a signal's handler raised before the last step's row was written."""
-        steps = self.stats_recorder.steps or 0
-        return self._recording is not None and self._recording.lacks(steps)
-
-    def _standing(self, *, is_complete: bool) -> Standing:
-        """Return how the running episode stands, which is over."""
-        if self._kept is None or not self._choice.is_scheduled:
-            # What the schedule has said is final.
-            return Standing.CHOSEN
-        return self._kept.judge(
-            self._run.episode.episode_id,
-            self._finished_episode() if is_complete else None,
-        )
-
-    def _settle(self, do: Callable[[], None]) -> None:
-        """Do something about recordings that are not decided."""
+    def _finish_models(self, states: Capture) -> None:
         try:
-            do()
-        except (DirectoryNotWritable, FileNotWritten) as error:
-            if not self._run.tolerates("trajectory", error):
+            states.finish()
+        except Error as error:
+            if not self._journal.tolerates("model", error, of_episode=False):
                 raise
 
-    def _end_episode(self, *, otherwise: str = CLOSE) -> None:
-        """Finish the running episode's trajectory and video, if there are any.
-
-        Args:
-            otherwise: why, where it is not over and nothing was raised.
-        """
-        if self._recording is None:
-            return
-        facts = self._how_it_ended(otherwise)
-        standing = self._standing(is_complete=facts["complete"])
+    def _settle(self, do: Callable[[], None] | None) -> None:
+        """Do something about recordings that are not decided."""
         try:
-            self._journal_cut(facts)
-        finally:
-            self._recording.end(facts, standing)
-        if self._kept is not None:
-            self._settle(self._kept.settle)
+            if do is not None:
+                do()
+        except (DirectoryNotWritable, FileNotWritten) as error:
+            if not self.run.tolerates("trajectory", error):
+                raise
 
-    def live_video_facts(self) -> dict[str, Any]:
-        """Return what is known of a live video from its episode's beginning."""
-        return self._run.live_facts()
+    @contextlib.contextmanager
+    def _leaving_if_interrupted(self) -> Iterator[None]:
+        """Let go of everything where it is interrupted; errors are the caller's."""
+        try:
+            yield
+        except Exception:
+            raise
+        except BaseException:
+            self._leave()
+            logger.warning(
+                "The recording was interrupted while it closed. What is there is "
+                "completed by: mjrec recover %s",
+                self.directory,
+            )
+            raise
+
+    def _leave(self) -> None:
+        """Let go of all files as they are, as the end of this process would."""
+        self.closed = self.stats_recorder.closed = True
+        self._finisher.stop()
+        for each in (self._recording, self._clips):
+            if each is not None:
+                each.leave()
+        for logs in (self.run.logs, self.run.clip_logs):
+            logs.release()
+        self._journal.close()
+        self._place.lock.release()
 
     def _write_last_results(self) -> int:
         """Write what the run amounts to; return how many videos are pending."""
@@ -662,6 +677,17 @@ class Recorder:
         )
         assert listing is not None, "nobody else has this monitor's lock"
         return len(listing.pending)
+
+
+@contextlib.contextmanager
+def _raising_later(
+    failures: list[Exception], kind: type[Exception] = Exception
+) -> Iterator[None]:
+    """Go on after an error: whoever has the list raises the first at the end."""
+    try:
+        yield
+    except kind as error:
+        failures.append(error)
 
 
 # Asking the system for the process's number at every step takes as long as counting it.

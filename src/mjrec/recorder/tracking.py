@@ -148,49 +148,53 @@ class Trackers:
         self._run = run
         self._trackers: Sequence[Tracker] = tuple(trackers)
         self._on_fault = on_fault
+        # Of episodes and clips, the first video of each.
+        self._awaited: dict[Path, None] = {}
         # Of episodes whose videos are still to come.
         self._episodes: dict[int, FinishedEpisode] = {}
         self._tell(None, "begin")
 
-    def __bool__(self) -> bool:
-        """Whether anybody listens."""
-        return bool(self._trackers)
+    def expect(self, video: Path) -> None:
+        """Watch for the first video of an episode or a clip, whoever makes it."""
+        if self._trackers:
+            self._awaited[video] = None
 
     def episode(self, episode: FinishedEpisode, *, has_video: bool) -> None:
-        """Tell of an episode that has just ended.
+        """Tell of an episode that has just ended, and of what is finished by now.
 
         Args:
             episode: the episode.
             has_video: whether a video of it may come.
         """
-        if has_video and self._trackers:
-            self._episodes[episode.episode_id] = episode
-        self._tell(episode.episode_id, "episode", episode)
-
-    def videos(self, finished: Iterable[tuple[int, Path, Path]]) -> None:
-        """Tell of videos that are finished.
-
-        Args:
-            finished: the number of the episode, the video and its metadata.
-        """
-        for episode_id, path, about in finished:
-            self._tell(
-                episode_id,
-                "video",
-                FinishedVideo(
-                    path=path,
-                    metadata_path=about,
-                    episode_id=episode_id,
-                    episode=self._episodes.get(episode_id),
-                    view=view_of(path.name),
-                ),
-            )
+        if self._trackers:
+            if has_video:
+                self._episodes[episode.episode_id] = episode
+            self._tell(episode.episode_id, "episode", episode)
+            self._tell_of_videos()
 
     def end(self) -> None:
         """Tell of the end of the run; nobody is called any more after it."""
+        self._tell_of_videos()
         self._tell(None, "end")
         self._trackers = ()
-        self._episodes.clear()
+
+    def _tell_of_videos(self) -> None:
+        # A video counts as soon as its metadata is there, which is written last.
+        done = [video for video in self._awaited if is_done(video)]
+        for video in done:
+            del self._awaited[video]
+            if is_broken(metadata_path(video)):
+                continue
+            for name, about in finished_videos(video):
+                number = episode_of(name) or 0
+                finished = FinishedVideo(
+                    path=video.with_name(name),
+                    metadata_path=video.with_name(about),
+                    episode_id=number,
+                    episode=self._episodes.get(number),
+                    view=view_of(name),
+                )
+                self._tell(number, "video", finished)
 
     def _tell(self, episode_id: int | None, what: str, *facts: Any) -> None:
         for tracker in self._trackers:
@@ -205,32 +209,3 @@ class Trackers:
                 # So that it lets go of what it holds open, as far as it still can.
                 with contextlib.suppress(Exception):
                     tracker.end(self._run)
-
-
-class EpisodeVideos:
-    """Watches for videos, whoever makes them."""
-
-    def __init__(self) -> None:
-        self._awaited: dict[Path, None] = {}
-
-    def expect(self, video: Path) -> None:
-        """Watch for the first video of an episode or a clip."""
-        self._awaited[video] = None
-
-    def news(self) -> list[tuple[int, Path, Path]]:
-        """Return what is finished since the last call.
-
-        A video counts as soon as its metadata is there, which is written last.
-
-        Returns:
-            The number of the episode, the video and its metadata, of each.
-        """
-        done = [video for video in self._awaited if is_done(video)]
-        for video in done:
-            del self._awaited[video]
-        return [
-            (episode_of(name) or 0, video.with_name(name), video.with_name(about))
-            for video in done
-            if not is_broken(metadata_path(video))
-            for name, about in finished_videos(video)
-        ]

@@ -8,8 +8,8 @@
     └── openaigym.model.<16 hex digits>.zip       what it was made from, where known
 
 The digits are the beginning of the sha256 of the compiled model. Only the MuJoCo
-version that compiled a model can load it; the zip is for all others, and for whoever
-is not the user who has stored it (`model_trust`).
+version that compiled a model can load it; the zip is for all others, and for readers
+other than the user who has stored it (`model_trust`).
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ import logging
 import re
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -34,8 +33,9 @@ from ..formats.json_fields import unreadable
 from ..formats.monitor_directory import FILE_PREFIX
 from ..formats.regular_files import open_regular
 from ..worker_thread import WorkerThread
-from .authored_model import (
+from .model_sources import (
     AuthoredModel,
+    compile_sources,
     with_embedded_files,
     write_authored,
 )
@@ -46,7 +46,6 @@ from .model_trust import (
     is_trusted,
     note_models,
 )
-from .source_compiler import compile_within
 
 logger = logging.getLogger(__name__)
 
@@ -58,14 +57,10 @@ _CHUNK = 1 << 20
 # Nothing that was recorded comes near; a file that claims more is made to hurt.
 _LARGEST = 1 << 31
 
-# Of models that could not be written, until there is room for them.
-_MOST_KEPT = 1 << 28
-
 _NAME = re.compile(r"openaigym\.model\.(?P<digits>[0-9a-f]{16})\.(mjb\.gz|zip)")
 
 
-@dataclass(frozen=True)
-class _Job:
+class _Job(NamedTuple):
     stem: str
     compiled: NDArray[np.uint8]
     authored: AuthoredModel | None
@@ -84,8 +79,7 @@ class ModelStore:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._known: set[str] = set()
-        # What could not be written, and the job, unless that is kept no longer.
-        self._failed: dict[str, tuple[FileNotWritten, _Job | None]] = {}
+        self._failed: list[tuple[_Job, FileNotWritten]] = []
         self._writer: WorkerThread[_Job] | None = None
 
     def add(
@@ -107,83 +101,55 @@ class ModelStore:
         compiled = saved_model(model)
         digest = hashlib.sha256(compiled.data).hexdigest()
         stem = f"{FILE_PREFIX}.model.{digest[:16]}"
-        facts = {
+        names = {f"{stem}.mjb.gz", *([] if authored is None else [f"{stem}.zip"])}
+        if not names <= self._known:
+            self._known |= names
+            note_models([digest, directory_digest(self._directory)])
+            if self._writer is None:
+                # Models may be large, and more than one waiting would add up.
+                self._writer = WorkerThread(self._store, capacity=1, name="model store")
+            self._writer.put(_Job(stem, compiled, authored))
+        return {
             "sha256": digest,
             "bytes": len(compiled),
             "mjb": f"{stem}.mjb.gz",
             "xml": None if authored is None else f"{stem}.zip",
             "mujoco": mujoco.__version__,
         }
-        names = {name for name in (facts["mjb"], facts["xml"]) if name is not None}
-        if not names <= self._known:
-            self._known |= names
-            note_models([digest, directory_digest(self._directory)])
-            self._queue(_Job(stem, compiled, authored))
-        return facts
 
     def finish(self) -> None:
         """Wait until every model is stored. More may be added afterwards.
 
         Raises:
-            FileNotWritten: one could not be. It is tried again by the next call, and
-                when it is added again.
+            FileNotWritten: one could not be. It is tried again by the next call.
         """
-        self._wait()
-        failed, self._failed = self._failed, {}
-        for stem, (error, job) in failed.items():
-            if job is None:
-                self._failed[stem] = error, None
-            else:
-                self._queue(job)
-        self._wait()
-        errors = [error for error, _ in self._failed.values()]
-        # What is kept fails again, if it does.
-        self._failed = {k: v for k, v in self._failed.items() if v[1] is not None}
-        if errors:
-            raise errors[0]
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+        failed, self._failed = self._failed, []
+        for job, _ in failed:
+            self._store(job)
+        if self._failed:
+            raise self._failed[0][1]
 
     def leave(self) -> None:
         """Let what waits be stored in the background. Never blocks."""
         if self._writer is not None:
             self._writer.leave()
 
-    def _wait(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-
-    def _queue(self, job: _Job) -> None:
-        if self._writer is None:
-            # Models may be large, and more than one waiting would add up.
-            self._writer = WorkerThread(self._store, capacity=1, name="model store")
-        self._writer.put(job)
-
     def _store(self, job: _Job) -> None:
-        self._write(job, ".mjb.gz", lambda path: _write_gzip(path, job.compiled))
-        authored = job.authored
-        if authored is None:
-            return
-        limit = _source_limit(len(job.compiled))
-        model = _loaded(job.compiled.tobytes())
-        self._write(
-            job, ".zip", lambda path: write_authored(path, authored, model, limit=limit)
-        )
-
-    def _write(self, job: _Job, suffix: str, write: Callable[[Path], None]) -> None:
-        path = self._directory / f"{job.stem}{suffix}"
-        if path.exists():
-            return
+        path = self._directory / f"{job.stem}.mjb.gz"
         try:
-            with replacing(path) as temporary:
-                write(temporary)
+            _write(path, lambda part: _write_gzip(part, job.compiled))
+            if job.authored is not None:
+                authored, model = job.authored, _loaded(job.compiled.tobytes())
+                path = path.with_name(f"{job.stem}.zip")
+                _write(path, lambda part: write_authored(part, authored, model))
         except ValueError as error:
             logger.debug("%s is not stored: %s", path.name, error)
         except OSError as error:
-            self._known.discard(path.name)
-            jobs = [kept for _, kept in self._failed.values() if kept is not None]
-            size = sum(len(kept.compiled) for kept in (*jobs, job))
             failure = FileNotWritten(path, error.strerror or error)
-            self._failed[job.stem] = failure, job if size <= _MOST_KEPT else None
+            self._failed.append((job, failure))
 
 
 def load_model(
@@ -206,77 +172,28 @@ def load_model(
             another MuJoCo version is needed.
         UntrustedModel: there is only a stranger's compiled model.
     """
-    compiled, source = (
-        path if path is not None and path.exists() else None
-        for path in (_path(directory, facts.get(key)) for key in ("mjb", "xml"))
-    )
-    is_same_version = facts.get("mujoco") == mujoco.__version__
-    if compiled is None or not is_same_version:
-        if source is None:
-            raise _not_loadable(directory, facts, is_same_version=is_same_version)
-        return _compile(source, facts)
+    compiled, source = (_path(directory, facts.get(key)) for key in ("mjb", "xml"))
     digest = facts.get("sha256")
-    if not (trust_models or is_stored(digest) or is_trusted(digest)):
-        return _compile_instead_of(compiled, source, facts)
-    try:
-        return _load_compiled(compiled, facts)
-    except UnreadableFile as error:
-        if source is None:
-            raise
-        logger.warning("%s It is compiled from %s again.", error, source.name)
-        return _compile(source, facts)
-
-
-def _compile(source: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:
-    size = _recorded_size(source, facts)
-    return compile_within(source, limit=_source_limit(size), compiled_size=size)
-
-
-def _compile_instead_of(
-    compiled: Path, source: Path | None, facts: Mapping[str, Any]
-) -> mujoco.MjModel:
-    """Return the model from its sources, because a stranger has compiled it."""
+    objection: UnreadableFile
+    if compiled is None or facts.get("mujoco") != mujoco.__version__:
+        objection = _not_loadable(directory, facts)
+    elif not (trust_models or is_stored(digest) or is_trusted(digest)):
+        objection = _untrusted(compiled, "is not there")
+    else:
+        try:
+            return _load_compiled(compiled, facts)
+        except UnreadableFile as error:
+            objection = error
     if source is None:
-        raise _untrusted(compiled, "is not there")
-    logger.info("%s is a stranger's. %s is compiled.", compiled, source.name)
+        raise objection
+    logger.info("%s It is compiled from %s.", objection, source.name)
     try:
-        return _compile(source, facts)
+        return compile_sources(source, compiled_size=_recorded_size(source, facts))
     except UnreadableFile as error:
-        reason = f"cannot be compiled instead ({source.name}: {error.reason})"
-        raise _untrusted(compiled, reason) from error
-
-
-def _untrusted(compiled: Path, what_of_sources: str) -> UntrustedModel:
-    return UntrustedModel(
-        compiled,
-        "it was not written by this user on this machine, and a crafted one can do "
-        f"anything to whoever loads it; and what it was made from {what_of_sources}. "
-        "If you trust whoever recorded it: `mjrec render --trust-models`, "
-        "mjrec.load_trajectory(path, trust_models=True), or the environment variable "
-        f"{TRUST_VARIABLE}=1",
-    )
-
-
-def _not_loadable(
-    directory: Path, facts: Mapping[str, Any], *, is_same_version: bool
-) -> UnreadableFile:
-    name = facts.get("mjb") or facts.get("xml")
-    if not isinstance(name, str):
-        return UnreadableFile(directory, "the recording says nothing of its model")
-    if is_same_version:
-        return UnreadableFile(
-            directory / name,
-            "the model of the recording is missing; it belongs beside the recording, "
-            "and whatever was copied without it needs it too",
-        )
-    source = facts.get("xml")
-    return UnreadableFile(
-        directory / name,
-        f"the model was written by mujoco {facts.get('mujoco')}, this is "
-        f"{mujoco.__version__}, and what it was made from is not there. Install that "
-        f"version: pip install mujoco=={facts.get('mujoco')}"
-        + (f"; or put {source} beside it" if source else ""),
-    )
+        if compiled is not None and isinstance(objection, UntrustedModel):
+            reason = f"cannot be compiled instead ({source.name}: {error.reason})"
+            raise _untrusted(compiled, reason) from error
+        raise
 
 
 def saved_model(model: mujoco.MjModel) -> NDArray[np.uint8]:
@@ -290,6 +207,12 @@ def saved_model(model: mujoco.MjModel) -> NDArray[np.uint8]:
 def model_digest(model: mujoco.MjModel) -> str:
     """Return the sha256 of a saved model, as recordings say it."""
     return hashlib.sha256(saved_model(model).data).hexdigest()
+
+
+def _write(path: Path, write: Callable[[Path], None]) -> None:
+    if not path.exists():
+        with replacing(path) as temporary:
+            write(temporary)
 
 
 def _write_gzip(path: Path, content: NDArray[np.uint8]) -> None:
@@ -306,6 +229,7 @@ def _write_gzip(path: Path, content: NDArray[np.uint8]) -> None:
 
 
 def _path(directory: Path, name: object) -> Path | None:
+    """Return the path of a model's file; None where there is none."""
     if name is None:
         return None
     if not isinstance(name, str) or not _NAME.fullmatch(name):
@@ -313,7 +237,7 @@ def _path(directory: Path, name: object) -> Path | None:
             directory,
             f"a recording in it calls a model {name!r:.200}, which is no name",
         )
-    return directory / name
+    return directory / name if (directory / name).exists() else None
 
 
 def _load_compiled(path: Path, facts: Mapping[str, Any]) -> mujoco.MjModel:
@@ -336,11 +260,6 @@ def _recorded_size(path: Path, facts: Mapping[str, Any]) -> int:
     return size
 
 
-def _source_limit(compiled_size: int) -> int:
-    """Return how many bytes a model that compiles to so many may be made from."""
-    return min((64 << 20) + 8 * compiled_size, _LARGEST)
-
-
 def _read_gzip(path: Path, size: int) -> bytes:
     """Return the `size` bytes that the file holds, and never read more."""
     with unreadable(path), open_regular(path) as file:
@@ -359,3 +278,33 @@ def _read_gzip(path: Path, size: int) -> bytes:
 
 def _loaded(content: bytes) -> mujoco.MjModel:
     return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": content})
+
+
+def _untrusted(compiled: Path, what_of_sources: str) -> UntrustedModel:
+    return UntrustedModel(
+        compiled,
+        "it was not written by this user on this machine, and a crafted one can do "
+        "anything to the process that loads it; and what it was made from "
+        f"{what_of_sources}. If you trust its author: `mjrec render --trust-models`, "
+        "mjrec.load_trajectory(path, trust_models=True), or the environment variable "
+        f"{TRUST_VARIABLE}=1",
+    )
+
+
+def _not_loadable(directory: Path, facts: Mapping[str, Any]) -> UnreadableFile:
+    name, version = facts.get("mjb") or facts.get("xml"), facts.get("mujoco")
+    if name is None:
+        return UnreadableFile(directory, "the recording says nothing of its model")
+    if version == mujoco.__version__:
+        return UnreadableFile(
+            directory / name,
+            "the model of the recording is missing; it belongs beside the recording, "
+            "and whatever was copied without it needs it too",
+        )
+    source = facts.get("xml")
+    return UnreadableFile(
+        directory / name,
+        f"the model was written by mujoco {version}, this is {mujoco.__version__}, and "
+        "what it was made from is not there. Install that version: pip install "
+        f"mujoco=={version}" + (f"; or put {source} beside it" if source else ""),
+    )

@@ -14,8 +14,8 @@ this user can write::
 A list that others can open is neither used nor replaced, because only its owner knows
 what they wrote. Until it is mended, the other place has a list.
 
-The list keeps the newest models: beyond 131,072 the older half is forgotten, and
-counts as a stranger's from then on.
+A list of 65,536 lines becomes `models.old`, and the one before it is forgotten: what
+it names counts as a stranger's from then on.
 
 Workers on other machines, whose homes may be others, are sent the hashes that their
 jobs need and list them as their own; what they store, they report, and the machine
@@ -32,16 +32,13 @@ import functools
 import hashlib
 import logging
 import os
-import pwd
 import re
 import stat
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
-from ..atomic_files import replacing
-from ..formats.locks import wait_for_lock
 from ..formats.monitor_directory import FILE_PREFIX
 
 logger = logging.getLogger(__name__)
@@ -50,12 +47,12 @@ TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 ALL_MODELS = "1"
 
 _ONE_BY_ONE = "sha256:"
-_LIST_NAME = "models"
 _DIGEST = re.compile("[0-9a-f]{64}")
 _DIGITS_IN_NAME = 16
 # A task may compile a model for each episode. So many are 4.3 MB, read in milliseconds.
-_KEPT = 1 << 16
-_OTHERS = stat.S_IRWXG | stat.S_IRWXO
+_MOST_BYTES = 65_536 * 66
+# Nothing is followed, or waited for should it be a pipe.
+_CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
 # What is listed in this context, for a worker's report.
 _noting: ContextVar[list[str] | None] = ContextVar("noting", default=None)
@@ -73,17 +70,16 @@ def note_models(digests: Iterable[str]) -> None:
     noting = _noting.get()
     if noting is not None:
         noting += wanted
+    listed = _listed() if wanted else ""
+    new = [digest for digest in wanted if f"\n{digest}\n" not in listed]
     reasons = []
-    for directory in _directories() if wanted else ():
+    for directory in _directories() if new else ():
         try:
-            _add(directory, wanted)
+            _append(directory, new)
             return
-        except _Refused as error:
-            _warn_once(str(error))
-            reasons.append(str(error))
         except OSError as error:
             reasons.append(f"{directory}: {error.strerror or error}")
-    if wanted:
+    if new:
         _warn_once(
             "The models of these recordings count as a stranger's, because no list of "
             f"this user's models can be kept ({'; '.join(reasons)}). Where it is not "
@@ -110,7 +106,7 @@ def is_stored(digest: object) -> bool:
     """
     if not isinstance(digest, str) or not _DIGEST.fullmatch(digest):
         return False
-    return any(f"\n{digest}\n" in f"\n{content}" for content in _lists())
+    return f"\n{digest}\n" in _listed()
 
 
 def directory_digest(directory: Path) -> str:
@@ -119,10 +115,8 @@ def directory_digest(directory: Path) -> str:
     By its place: what was moved or copied is a stranger's, which costs a moment and
     nothing else.
     """
-    place = os.path.realpath(directory)
-    return hashlib.sha256(
-        f"directory {place}".encode(errors="surrogateescape")
-    ).hexdigest()
+    place = f"directory {os.path.realpath(directory)}"
+    return hashlib.sha256(place.encode(errors="surrogateescape")).hexdigest()
 
 
 def is_own_directory(directory: Path) -> bool:
@@ -139,7 +133,7 @@ def stored_models(directories: Iterable[Path]) -> list[str]:
     pattern = f"{FILE_PREFIX}.model.*.mjb.gz"
     paths = (path for directory in directories for path in directory.glob(pattern))
     found = {path.name.split(".")[2] for path in paths}
-    listed = {digest for content in _lists() for digest in content.split()}
+    listed = set(_listed().split())
     return sorted(digest for digest in listed if digest[:_DIGITS_IN_NAME] in found)
 
 
@@ -180,152 +174,87 @@ def trusting_models(digests: Iterable[str] | None = None) -> Iterator[None]:
             os.environ[TRUST_VARIABLE] = before
 
 
-class _Refused(Exception):
-    """What stands in a list's place is not used."""
-
-    def __init__(self, objection: str) -> None:
-        super().__init__(
-            f"The list of this user's models is not used: {objection}. If nobody else "
-            "has written there, mend that; else remove it: models that were stored "
-            "before then count as a stranger's."
-        )
-
-
 @functools.cache
 def _warn_once(message: str) -> None:
     logger.warning(message)
 
 
-def _lists() -> Iterator[str]:
-    """Yield what this user's lists hold."""
-    # The home directory may have been writable only at one time of two.
-    for directory in _directories():
-        try:
-            with _opened(directory, os.O_RDONLY) as descriptor:
-                yield _content(descriptor)
-        except _Refused as error:
-            _warn_once(str(error))
-        except OSError:
-            continue
-
-
 def _directories() -> Iterator[Path]:
     """Yield where a list may be, the best place first."""
-    state = _state_directory()
-    if state is not None:
-        yield state / "mjrec"
-    with contextlib.suppress(OSError):
-        yield Path(tempfile.gettempdir(), f"mjrec-{os.geteuid()}")
-
-
-def _state_directory() -> Path | None:
-    """Return `$XDG_STATE_HOME`, or what stands for it; None for users without home."""
-    given = os.environ.get("XDG_STATE_HOME", "")
+    state, home = os.environ.get("XDG_STATE_HOME", ""), os.path.expanduser("~")  # noqa: PTH111  `Path.home` raises for users without one
     # Relative ones are to be ignored, says its specification.
-    if given.startswith("/"):
-        return Path(given)
-    home = os.environ.get("HOME", "")
-    if not home.startswith("/"):
-        try:
-            home = pwd.getpwuid(os.geteuid()).pw_dir
-        except KeyError:
-            return None
+    if state.startswith("/"):
+        yield Path(state, "mjrec")
     # Root could make a home directory of what is only a name, such as /nonexistent.
-    return Path(home, ".local", "state") if os.access(home, os.F_OK) else None
+    elif home.startswith("/") and os.access(home, os.F_OK):
+        yield Path(home, ".local", "state", "mjrec")
+    yield Path(tempfile.gettempdir(), f"mjrec-{os.geteuid()}")
 
 
-def _add(directory: Path, digests: Iterable[str]) -> None:
+def _listed() -> str:
+    """Return what this user's lists hold: each hash between ends of lines."""
+    content = ""
+    # The home directory may have been writable only at one time of two.
+    for directory in _directories():
+        for name in ("models.old", "models"):
+            try:
+                with _opened(directory / name, os.O_RDONLY) as descriptor:
+                    size = os.fstat(descriptor).st_size
+                    content += (
+                        f"\n{os.read(descriptor, size).decode('ascii', 'replace')}"
+                    )
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            except OSError as error:
+                _warn_once(
+                    f"The list of this user's models is not used: {error}. If nobody "
+                    "else has written there, mend that; else remove it: models that "
+                    "were stored before then count as a stranger's."
+                )
+    return content
+
+
+def _append(directory: Path, digests: Iterable[str]) -> None:
     """Add to the list in a directory, made where there is none.
 
     Raises:
-        _Refused: something else stands there, or others can open it.
-        OSError: it cannot be written.
+        OSError: it cannot be written, or others can open it.
     """
-    if not directory.exists():
-        _make_directory(directory)
-    path = directory / _LIST_NAME
-    objection = _objection(directory, directory.lstat(), stat.S_ISDIR)
-    if objection is not None and not path.exists():
-        # Some file systems know no owners and no modes.
-        raise PermissionError(objection)
-    if objection is not None:
-        raise _Refused(objection)
-    # Also where appending is atomic: another process may be forgetting the oldest.
-    lock = wait_for_lock(directory / f".{_LIST_NAME}.lock", "")
-    try:
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND
-        with _opened(directory, flags) as descriptor:
-            content = _content(descriptor)
-            listed = content.split()
-            new = sorted(set(digests).difference(listed))
-            if len(listed) + len(new) > 2 * _KEPT:
-                with replacing(path) as temporary:
-                    temporary.touch(0o600)
-                    temporary.write_text(_lines([*listed, *new][-_KEPT:]))
-            elif new:
-                # After a full disk cut a line off.
-                start = "" if content[-1:] in ("", "\n") else "\n"
-                text = start + _lines(new)
-                if os.write(descriptor, text.encode()) < len(text):
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    finally:
-        lock.let_go()
-
-
-def _lines(digests: Iterable[str]) -> str:
-    return "".join(f"{digest}\n" for digest in digests)
-
-
-def _make_directory(directory: Path) -> None:
-    base = next(parent for parent in directory.parents if parent.exists())
+    path = directory / "models"
+    base = next(place for place in (directory, *directory.parents) if place.exists())
     if os.geteuid() == 0 and base.stat().st_uid != 0:
         # With `sudo` and somebody's HOME: it would be in that user's way.
         raise PermissionError(f"{base} is not root's")
-    for path in reversed((directory, *directory.parents)):
-        if not path.exists():
-            path.mkdir(mode=0o700, exist_ok=True)
+    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with _opened(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND) as descriptor:
+        # In one piece, so that processes do not mix their lines; the first end of a
+        # line is for one that a full disk has cut off.
+        text = "".join(f"\n{digest}" for digest in digests).encode() + b"\n"
+        if os.write(descriptor, text) < len(text):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if os.fstat(descriptor).st_size >= _MOST_BYTES:
+            path.replace(path.with_name("models.old"))
 
 
 @contextlib.contextmanager
-def _opened(directory: Path, flags: int) -> Iterator[int]:
-    """Yield the descriptor of the list in a directory.
+def _opened(path: Path, flags: int) -> Iterator[int]:
+    """Yield the descriptor of a list.
 
     Raises:
-        _Refused: something else stands there, or others can open it.
-        OSError: it cannot be opened, or there is none.
+        OSError: it cannot be opened, or others can open it or have made it.
     """
-    path = directory / _LIST_NAME
-    # Not waiting, should it be a pipe.
-    careful = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
+    _check(path.parent, path.parent.lstat(), stat.S_IFDIR, mode=700)
+    descriptor = os.open(path, flags | _CAREFULLY, 0o600)
     try:
-        descriptor = os.open(path, flags | careful, 0o600)
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise _Refused(f"{path} is a link") from error
-        raise
-    try:
-        objection = _objection(directory, directory.lstat(), stat.S_ISDIR)
-        objection = objection or _objection(path, os.fstat(descriptor), stat.S_ISREG)
-        if objection is not None:
-            raise _Refused(objection)
+        _check(path, os.fstat(descriptor), stat.S_IFREG, mode=600)
         yield descriptor
     finally:
         os.close(descriptor)
 
 
-def _objection(
-    path: Path, facts: os.stat_result, is_kind: Callable[[int], bool]
-) -> str | None:
-    """Say why what stands at a path may have been written by others."""
-    if not is_kind(facts.st_mode) or facts.st_uid != os.geteuid():
-        what = "directory" if is_kind is stat.S_ISDIR else "file"
-        return f"{path} is not a {what} of this user's"
-    if facts.st_mode & _OTHERS:
-        mode = 700 if is_kind is stat.S_ISDIR else 600
-        return f"{path} is open to others (chmod {mode} {path})"
-    return None
-
-
-def _content(descriptor: int) -> str:
-    with open(descriptor, encoding="utf-8", errors="replace", closefd=False) as file:
-        return file.read()
+def _check(path: Path, facts: os.stat_result, kind: int, *, mode: int) -> None:
+    """Raise PermissionError where others may have written what stands at a path."""
+    if stat.S_IFMT(facts.st_mode) != kind or facts.st_uid != os.geteuid():
+        raise PermissionError(f"{path} is not this user's, or a link or a pipe")
+    if facts.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise PermissionError(f"{path} is open to others (chmod {mode} {path})")

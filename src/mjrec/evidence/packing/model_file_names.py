@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 from ...json_text import loads
 
-# As `simulation.authored_model` lays the zip out.
+# As `simulation.model_sources` lays the zip out.
 CONTENTS = "contents.json"
 SOURCE = "source/"
 

@@ -10,6 +10,11 @@
                            compiled sources: what an environment set by hand
 
 The same content makes the same bytes. Compiling reads nothing but these files.
+
+A line of MJCF can ask for anything: a body replicated a thousand million times, a
+texture of ten gigabytes, an object that takes days to compile. So a zip is read and
+compiled in a sandbox, which is this module as a program. Half a second is what that
+costs; it is needed only where the compiled model cannot be used.
 """
 
 from __future__ import annotations
@@ -20,21 +25,21 @@ import logging
 import os
 import posixpath
 import re
+import sys
 import tempfile
 import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import UnreadableFile
 from ..formats.regular_files import open_regular
 from ..json_text import loads
+from ..sandbox import LIMITS, Sandbox, enter
 from .fields import apply_fields, differing_fields
 
 logger = logging.getLogger(__name__)
@@ -54,6 +59,13 @@ _XML_ELEMENTS = ("include", "model")
 _MOST_UP = 4
 _EMPTY = PurePosixPath(*["x"] * 8 * _MOST_UP)
 
+_COMPILED = "model.mjb"
+_LONGEST_REASON = 2000
+# The largest robots and rooms of the field compile in seconds.
+_SECONDS = 300.0
+# Python, MuJoCo and what they need for threads, and then some room.
+_BASE_MEMORY = 6 << 30
+_MEMORY_FACTOR = 8
 # What MuJoCo raises where memory does not suffice, as a RuntimeError.
 _MUJOCO_GAVE_UP = "Caught an unknown exception!"
 
@@ -70,11 +82,6 @@ class AuthoredModel:
     main: str
     files: Mapping[str, bytes]
 
-    def plainly_named(self) -> AuthoredModel:
-        """Return the same with names as short as they can be: no `./` in them."""
-        files = {posixpath.normpath(name): self.files[name] for name in self.files}
-        return AuthoredModel(posixpath.normpath(self.main), files)
-
 
 def authored_from_file(path: Path) -> AuthoredModel | None:
     """Return an MJCF file and everything it includes and refers to.
@@ -90,57 +97,91 @@ def authored_from_file(path: Path) -> AuthoredModel | None:
         return None
 
 
-def write_authored(
-    path: Path, authored: AuthoredModel, model: mujoco.MjModel, *, limit: int
-) -> None:
+def write_authored(path: Path, authored: AuthoredModel, model: mujoco.MjModel) -> None:
     """Write what `model` was made from, and what was set in it by hand.
 
     Raises:
         ValueError: that would not give the same model.
     """
-    authored = authored.plainly_named()
-    compiled = compile_authored(authored)
-    fields = differing_fields(compiled, model)
-    members = {
-        _CONTENTS: json.dumps({"format": _FORMAT, "main": authored.main}).encode(),
-        **{_SOURCE + name: content for name, content in authored.files.items()},
-        **{f"{_FIELDS}{name}.npy": _npy(value) for name, value in fields.items()},
-    }
-    if sum(map(len, members.values())) > limit:
-        raise ValueError(f"it is larger than {limit} bytes")
+    # Some have names such as `./meshes/../a.obj`.
+    files = {posixpath.normpath(name): data for name, data in authored.files.items()}
+    authored = AuthoredModel(posixpath.normpath(authored.main), files)
+    fields = differing_fields(_compile(authored), model)
+    contents = {"format": _FORMAT, "main": authored.main}
+    members = {_CONTENTS: json.dumps(contents).encode()}
+    members |= {_SOURCE + name: data for name, data in files.items()}
+    for name, value in fields.items():
+        buffer = io.BytesIO()
+        np.save(buffer, value, allow_pickle=False)
+        members[f"{_FIELDS}{name}.npy"] = buffer.getvalue()
     with zipfile.ZipFile(path, "w") as archive:
         for name in sorted(members):
-            archive.writestr(_member(name), members[name])
+            member = zipfile.ZipInfo(name, _EPOCH)
+            member.compress_type = zipfile.ZIP_DEFLATED
+            member.create_system = 3  # Unix, wherever this runs
+            member.external_attr = 0o644 << 16
+            archive.writestr(member, members[name])
 
 
-def read_authored(path: Path, *, limit: int) -> mujoco.MjModel:
+def compile_sources(
+    path: Path, *, compiled_size: int, seconds: float = _SECONDS
+) -> mujoco.MjModel:
     """Return the model that `write_authored` was given, compiled by this MuJoCo.
-
-    Only for a sandbox, see `source_compiler`: what is in a stranger's file may take any
-    time and memory.
 
     Args:
         path: of the zip.
-        limit: how many bytes its content may have.
+        compiled_size: of the model when it was recorded, by which it is judged how
+            much memory compiling may take.
+        seconds: how long it may take.
+
+    Raises:
+        UnreadableFile: it is damaged or dangerous, this MuJoCo refuses it, or it needs
+            more time or memory than that.
+    """
+    memory = _BASE_MEMORY + _MEMORY_FACTOR * compiled_size
+    limits = {**LIMITS, "RLIMIT_AS": memory, "RLIMIT_DATA": memory}
+    request = {"path": str(path.absolute())}
+    with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
+        place = Path(directory)
+        with Sandbox(__name__, request, place=place, limits=limits) as sandbox:
+            for said in sandbox.said(seconds):
+                if said is None:
+                    reason = f"compiling it takes longer than {seconds:g} seconds"
+                    raise UnreadableFile(path, reason)
+                if "reason" in said:
+                    raise UnreadableFile(path, str(said["reason"]))
+                if "compiled" in said:
+                    return mujoco.MjModel.from_binary_path(str(place / _COMPILED))
+            raise UnreadableFile(
+                path,
+                f"the process that compiled it {sandbox.last_words()} (it may "
+                f"use {memory / 2**30:.1f} GiB of memory)",
+            )
+
+
+def read_authored(path: Path) -> mujoco.MjModel:
+    """Return the model that `write_authored` was given, compiled by this MuJoCo.
+
+    Only for a sandbox: what is in a stranger's file may take any time and memory.
 
     Raises:
         UnreadableFile: it is damaged or dangerous, or this MuJoCo refuses it.
     """
+    sources, fields = {}, {}
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-            total = sum(member.file_size for member in archive.infolist())
-            if total > limit:
-                reason = f"its content is {total} bytes, and no model needs that"
-                raise ValueError(reason)
-            members = {m.filename: _read(archive, m) for m in archive.infolist()}
-        contents = loads(members.pop(_CONTENTS, b"null"))
+            contents = loads(archive.read(_CONTENTS))
+            for name in archive.namelist():
+                if name.startswith(_SOURCE):
+                    sources[name.removeprefix(_SOURCE)] = archive.read(name)
+                elif name.startswith(_FIELDS):
+                    field = name.removeprefix(_FIELDS).removesuffix(".npy")
+                    value = np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
+                    fields[field] = np.asarray(value)
         if not isinstance(contents, dict) or contents.get("format") != _FORMAT:
             raise ValueError("it holds no model of a format that this mjrec knows")
-        sources = _below(_SOURCE, members)
-        model = compile_authored(AuthoredModel(contents["main"], sources))
-        fields = _below(_FIELDS, members)
-        values = {n.removesuffix(".npy"): _array(fields[n]) for n in fields}
-        apply_fields(model, values)
+        model = _compile(AuthoredModel(contents["main"], sources))
+        apply_fields(model, fields)
     # Whatever it is that zipfile, NumPy and MuJoCo raise for such a file.
     except Exception as error:
         reason = " ".join(str(error).split())
@@ -148,28 +189,6 @@ def read_authored(path: Path, *, limit: int) -> mujoco.MjModel:
             reason = "it needs more memory than there is, or than it may have"
         raise UnreadableFile(path, reason.rstrip(".")) from error
     return model
-
-
-def compile_authored(authored: AuthoredModel) -> mujoco.MjModel:
-    """Return the compiled model; no file but those of `authored` is read.
-
-    Raises:
-        ValueError: MuJoCo refuses it, or a name in it leads elsewhere, or it uses a
-            plugin.
-    """
-    for name in authored.files:
-        _check_name(name)
-    if _parsed(authored.main, authored.files[authored.main]).tag != "mujoco":
-        raise ValueError(f"{authored.main} is not MJCF")
-    # References are checked as the documents are read.
-    _check_documents(authored)
-    with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
-        root = Path(directory) / _EMPTY
-        for name, content in authored.files.items():
-            (root / name).parent.mkdir(parents=True, exist_ok=True)
-            (root / name).write_bytes(content)
-        model = mujoco.MjModel.from_xml_path(str(root / authored.main))
-        return with_embedded_files(model)
 
 
 def with_embedded_files(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -180,28 +199,71 @@ def with_embedded_files(model: mujoco.MjModel) -> mujoco.MjModel:
     return mujoco.mj_embedAssets(model)
 
 
-@dataclass(frozen=True)
-class _Document:
-    """What one MJCF file refers to, as it is written there."""
+def main() -> int:
+    """Compile the zip that the parent names."""
+    request, say = enter()
+    try:
+        mujoco.mj_saveModel(read_authored(Path(request["path"])), _COMPILED)
+    except UnreadableFile as error:
+        say(reason=error.reason[:_LONGEST_REASON])
+        return 1
+    say(compiled=True)
+    return 0
 
-    xml: frozenset[str]
-    assets: frozenset[str]
-    directories: frozenset[str]
+
+def _compile(authored: AuthoredModel) -> mujoco.MjModel:
+    """Return the compiled model; no file but those of `authored` is read.
+
+    Raises:
+        ValueError: MuJoCo refuses it, or a name in it leads elsewhere, or it uses a
+            plugin.
+    """
+    by_base_name: dict[str, list[str]] = {}
+    for name in authored.files:
+        _check_reference(name)
+        if any(part in ("", ".", "..") for part in name.split("/")):
+            raise ValueError(f"it holds a file called {name!r}")
+        by_base_name.setdefault(PurePosixPath(name).name, []).append(name)
+    if _parsed(authored.main, authored.files[authored.main]).tag != "mujoco":
+        raise ValueError(f"{authored.main} is not MJCF")
+    # All files that may be read as MJCF are looked at, whatever they are called, and
+    # wherever they are: MuJoCo's rules for that have changed.
+    waiting = [authored.main]
+    while waiting:
+        name = waiting.pop()
+        for reference in _References(name, authored.files[name]).xml:
+            # Taken out, so that nothing is looked at twice, however often it is named.
+            waiting += by_base_name.pop(PurePosixPath(reference).name, [])
+    with tempfile.TemporaryDirectory(prefix="mjrec-model-") as directory:
+        root = Path(directory) / _EMPTY
+        for name, content in authored.files.items():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_bytes(content)
+        model = mujoco.MjModel.from_xml_path(str(root / authored.main))
+        return with_embedded_files(model)
 
 
-def _document(name: str, content: bytes) -> _Document:
-    root = _parsed(name, content)
-    xml: set[str] = set()
-    assets: set[str] = set()
-    directories: set[str] = set()
-    for element in root.iter():
-        for attribute, value in element.attrib.items():
-            if attribute in _DIRECTORIES:
-                directories.add(_checked_reference(value))
-            elif attribute.startswith("file") and value:
-                kind = xml if element.tag in _XML_ELEMENTS else assets
-                kind.add(_checked_reference(value))
-    return _Document(frozenset(xml), frozenset(assets), frozenset(directories))
+class _References:
+    """What one MJCF file refers to, as it is written there.
+
+    Raises:
+        ValueError: it is no plain MJCF, or refers to what is elsewhere.
+    """
+
+    def __init__(self, name: str, content: bytes) -> None:
+        self.xml: set[str] = set()
+        self.assets: set[str] = set()
+        self.directories = {""}
+        for element in _parsed(name, content).iter():
+            for attribute, value in element.attrib.items():
+                if attribute in _DIRECTORIES:
+                    kind = self.directories
+                elif attribute.startswith("file") and value:
+                    kind = self.xml if element.tag in _XML_ELEMENTS else self.assets
+                else:
+                    continue
+                _check_reference(value)
+                kind.add(value)
 
 
 def _parsed(name: str, content: bytes) -> ElementTree.Element:
@@ -220,53 +282,24 @@ def _parsed(name: str, content: bytes) -> ElementTree.Element:
         raise ValueError(f"{name} is no XML: {error}") from error
 
 
-def _checked_reference(value: str) -> str:
+def _check_reference(value: str) -> None:
     # A colon is a drive, or what a resource provider is called by.
     if value.startswith(("/", "~")) or any(c in value for c in "\\:\0"):
         raise ValueError(f"it refers to {value!r}, which is no plain relative path")
     if value.split("/").count("..") > _MOST_UP:
         raise ValueError(f"it refers to {value!r}, which is outside")
-    return value
-
-
-def _check_name(name: str) -> None:
-    _checked_reference(name)
-    if not name or any(part in ("", ".", "..") for part in name.split("/")):
-        raise ValueError(f"it holds a file called {name!r}")
-
-
-def _check_documents(authored: AuthoredModel) -> None:
-    """Check all files that may be read as MJCF, whatever they are called.
-
-    Raises:
-        ValueError: a file elsewhere might be read.
-    """
-    by_base_name: dict[str, list[str]] = {}
-    for name in authored.files:
-        by_base_name.setdefault(PurePosixPath(name).name, []).append(name)
-    waiting = [authored.main]
-    while waiting:
-        name = waiting.pop()
-        # Wherever they are: MuJoCo's rules for it have changed.
-        for reference in _document(name, authored.files[name]).xml:
-            # Taken out, so that nothing is looked at twice, however often it is named.
-            waiting += by_base_name.pop(PurePosixPath(reference).name, [])
-
-
-def _all_directories(documents: Iterable[_Document]) -> frozenset[str]:
-    return frozenset().union({""}, *(d.directories for d in documents))
 
 
 def _gathered(main: Path) -> AuthoredModel:
-    documents: dict[Path, _Document] = {}
+    documents: dict[Path, _References] = {}
     waiting = [main]
     while waiting:
         path = waiting.pop()
         if path not in documents:
-            documents[path] = _document(path.name, path.read_bytes())
+            documents[path] = _References(path.name, path.read_bytes())
             for reference in documents[path].xml:
                 waiting += _existing({path.parent, main.parent}, {""}, reference)
-    directories = _all_directories(documents.values())
+    directories = set().union(*(each.directories for each in documents.values()))
     found = set(documents)
     for path, document in documents.items():
         for reference in document.assets:
@@ -295,33 +328,5 @@ def _existing(
     return found
 
 
-def _npy(value: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, value, allow_pickle=False)
-    return buffer.getvalue()
-
-
-def _array(content: bytes) -> NDArray[Any]:
-    return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
-
-
-def _below(prefix: str, members: Mapping[str, bytes]) -> dict[str, bytes]:
-    return {
-        name.removeprefix(prefix): content
-        for name, content in members.items()
-        if name.startswith(prefix)
-    }
-
-
-def _member(name: str) -> zipfile.ZipInfo:
-    member = zipfile.ZipInfo(name, _EPOCH)
-    member.compress_type = zipfile.ZIP_DEFLATED
-    member.create_system = 3  # Unix, wherever this runs
-    member.external_attr = 0o644 << 16
-    return member
-
-
-def _read(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    with archive.open(member) as stream:
-        # With a number: without one, it unpacks more than the size that is noted.
-        return stream.read(member.file_size)
+if __name__ == "__main__":
+    sys.exit(main())
