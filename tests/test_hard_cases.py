@@ -302,7 +302,6 @@ def test_a_fork_in_mid_episode(tmp_path: Path) -> None:
     assert len(hashes(tmp_path)) == 6
 
 
-# Takes more than five seconds: a monitor in a process of its own, and a renderer.
 def test_two_monitors_of_which_one_never_ends(tmp_path: Path) -> None:
     """What the other recorded is drawn and loaded beside it."""
     program = (
