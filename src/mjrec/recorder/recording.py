@@ -369,23 +369,32 @@ class Recording:
                 what,
             )
 
-    def _measured_pace(self) -> dict[str, Any]:
+    def _measured_pace(self) -> Mapping[str, Any]:
         """Measure the time of a step over the first one, and choose the stride."""
         began, now = self._first_time, self._run.subject.clock()
-        elapsed = None if began is None or now is None else now - began
-        is_known = elapsed is not None and elapsed > 0
-        rate = _rate_of(elapsed) if is_known else self._run.subject.declared()
-        self._stride = _stride_for(rate, self._max_fps)
-        return {
-            "rate": str(rate),
-            "timestep": str(1 / rate) if is_known else None,
-            "stride": self._stride,
-        }
+        if began is None or now is None or now <= began:
+            facts = _pace(self._run.subject.declared(), None, self._max_fps)
+        else:
+            facts = _measured(now - began, self._max_fps)
+        self._stride = facts["stride"]
+        return facts
+
+
+def _pace(
+    rate: Fraction, timestep: Fraction | None, max_fps: float | Fraction | None
+) -> Mapping[str, Any]:
+    return {
+        "rate": str(rate),
+        "timestep": None if timestep is None else str(timestep),
+        "stride": stride_for(rate, max_fps),
+    }
 
 
 # Of the same few steps in each episode; fractions take Python long.
-_rate_of = functools.lru_cache(maxsize=64)(rate_from_timestep)
-_stride_for = functools.lru_cache(maxsize=64)(stride_for)
+@functools.lru_cache(maxsize=64)
+def _measured(seconds: float, max_fps: float | Fraction | None) -> Mapping[str, Any]:
+    rate = rate_from_timestep(seconds)
+    return _pace(rate, 1 / rate, max_fps)
 
 
 def _array_of(array: StepArray | None) -> Array | None:
