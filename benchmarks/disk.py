@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import mjrec
-from mjrec.formats.in_flight import recordings_in_flight
-from mjrec.formats.spans import row_dtype
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 
 from .children import call
@@ -90,8 +89,8 @@ def record_and_finish(name: str, steps: int) -> dict[str, float]:
         else:
             env = _recorded_gymnasium(name, steps, directory)
         [recording] = recordings_in_flight(Path(directory))
-        assert recording.spans.header is not None
-        row = row_dtype(recording.spans.header).itemsize
+        assert recording.spans.dtype is not None
+        row = recording.spans.dtype.itemsize
         with open_trajectory(recording.path) as reader:
             sizes = {"log": reader.row_count * row}
         start = time.perf_counter()

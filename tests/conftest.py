@@ -24,7 +24,7 @@ from processes import children
 from trajectories_by_hand import Painter
 
 from mjrec.formats.ffmpeg import ffmpeg_executable
-from mjrec.rendering import shared_pool
+from mjrec.rendering import pool as shared_pool
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 

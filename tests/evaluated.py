@@ -59,7 +59,7 @@ def run_job(
 def facts_of(path: Path) -> Mapping[str, Any]:
     """Return what a trajectory says of its episode."""
     with open_trajectory(path) as reader:
-        return dict(reader.header.facts)
+        return dict(reader.facts)
 
 
 def states_of(folder: Path, monitor: str | None, episode_id: int | None) -> Any:

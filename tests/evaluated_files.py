@@ -26,7 +26,7 @@ def recorded_in(evaluation: Evaluation) -> dict[tuple[Any, ...], Any]:
         of = (row["task"], row["seed"], row["episode"])
         (folder,) = evaluation.directory.glob(row["task"])
         with open_trajectory(folder / row["trajectory"]) as reader:
-            promised = (reader.header.facts.get("video") or {}).get("selection")
+            promised = (reader.facts.get("video") or {}).get("selection")
         found[*of, "trajectory"] = (datasets_in(folder / row["trajectory"]), promised)
         if row["video"]:
             video = folder / row["video"]

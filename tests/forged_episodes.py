@@ -23,7 +23,7 @@ from mjrec.environments.mjcf_environments import MjcfEnvironment
 from mjrec.evidence.verification import Check, Level, Verdict
 from mjrec.evidence.verifying.physics_checks import check_physics
 from mjrec.evidence.verifying.task import Task
-from mjrec.formats.trajectory import TrajectoryReader
+from mjrec.formats.trajectory import PARTS, TrajectoryReader, row_dtype
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.formats.trajectory_hdf5 import write_hdf5
 
@@ -95,31 +95,28 @@ def forge(path: Path, **arrays: Any) -> None:
     Args:
         path: of its file.
         arrays: fields of `TrajectoryContent`, or functions that change a copy of one
-            in place; and `action` and `snapshot`, of the header.
+            in place; and `action` and `snapshot`, their dtypes.
     """
     with open_trajectory(path) as reader:
         content = content_of(reader)
-    header = content.header
-    facts = {**header.facts, **arrays.pop("facts", {})}
-    action = arrays.pop("action", header.action)
-    snapshot = arrays.pop("snapshot", header.snapshot)
+    facts = {**content.facts, **arrays.pop("facts", {})}
+    kinds = {name: content.dtype[name] for name in content.dtype.names[4:]}
+    kinds |= {name: arrays.pop(name) for name in PARTS if name in arrays}
     changed: dict[str, Any] = {}
     for name, value in arrays.items():
         changed[name] = value
         if callable(value):
             changed[name] = np.array(getattr(content, name))
             value(changed[name])
-    header = dataclasses.replace(header, facts=facts, action=action, snapshot=snapshot)
     path.unlink()
-    write_hdf5(
-        _Forged(path, dataclasses.replace(content, header=header, **changed)), path
-    )
+    forged = dataclasses.replace(content, facts=facts, dtype=row_dtype(**kinds))
+    write_hdf5(_in_memory(path, dataclasses.replace(forged, **changed)), path)
 
 
 def fact(path: Path, name: str) -> Any:
     """Return a fact of an episode."""
     with open_trajectory(path) as reader:
-        return reader.header.facts[name]
+        return reader.facts[name]
 
 
 def swap_model(directory: Path, number: int, old: str, new: str) -> None:
@@ -192,28 +189,28 @@ def copied(directory: Path, to: Path) -> Path:
     return Path(shutil.copytree(directory, to))
 
 
-class _Forged(TrajectoryReader):
-    """A trajectory in memory."""
+def _in_memory(path: Path, content: TrajectoryContent) -> TrajectoryReader:
+    def read(part: str, start: int, stop: int) -> Any:
+        rows = getattr(content, f"{part}s")[start:stop]
+        if part == "state":
+            return np.ascontiguousarray(rows).view(content.dtype[part])[:, 0]
+        return rows
 
-    def __init__(self, path: Path, content: TrajectoryContent) -> None:
-        self.path = path
-        self.header = content.header
-        self.row_count = len(content.states)
-        self.rewards = content.rewards
-        self.terminated = content.terminated
-        self.truncated = content.truncated
-        self.frame_steps = content.frame_steps
-        self.change_count = len(content.model_changes)
-        self.dropped = content.dropped
-        self._content = content
-
-    def close(self) -> None: ...
-
-    def _rows(self, name: str, start: int, stop: int) -> Any:
-        return getattr(self._content, name)[start:stop]
-
-    def _model_change(self, index: int) -> Any:
-        return self._content.model_changes[index]
+    return TrajectoryReader(
+        path=path,
+        facts=content.facts,
+        dtype=content.dtype,
+        row_count=len(content.states),
+        rewards=content.rewards,
+        terminated=content.terminated,
+        truncated=content.truncated,
+        frame_steps=content.frame_steps,
+        change_count=len(content.model_changes),
+        dropped=content.dropped,
+        read=read,
+        read_change=content.model_changes.__getitem__,
+        release=lambda: None,
+    )
 
 
 def _contents(directory: Path) -> dict[str, bytes]:

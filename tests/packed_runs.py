@@ -96,8 +96,7 @@ def edit_trajectory(
     """Change a finished trajectory: its datasets, its facts; its checksum fits."""
     if facts:
         with open_trajectory(path) as reader:
-            header = reader.header
-            object.__setattr__(header, "facts", {**header.facts, **facts})
+            reader.facts = {**reader.facts, **facts}
             write_hdf5(reader, path)
     with h5py.File(path, "r+") as file:
         edit(file)

@@ -10,7 +10,7 @@ from typing import Any
 
 import av
 
-from mjrec.formats.in_flight import recordings_in_flight
+from mjrec.formats.spans import recordings_in_flight
 
 
 def in_flight(directory: Path) -> list[Path]:

@@ -16,9 +16,9 @@ import numpy as np
 from trajectories_by_hand import add_row, new_logs
 
 from mjrec.formats.monitor_directory import Infix
-from mjrec.formats.trajectory import ModelChange, TrajectoryHeader
+from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.simulation.cameras import Camera, resolve_camera
-from mjrec.simulation.captured_arrays import snapshot_layout
+from mjrec.simulation.captured_arrays import snapshot_dtype
 from mjrec.simulation.fields import read_fields
 from mjrec.simulation.model_store import ModelStore
 from mjrec.simulation.renderer import SceneRenderer
@@ -104,7 +104,7 @@ def record(
         width=WIDTH,
         label="rider",
     )
-    layout = snapshot_layout(model, data, option)
+    kind = snapshot_dtype(model, data, option)
     store = ModelStore(directory)
     known = {
         "episode_id": 0,
@@ -117,11 +117,11 @@ def record(
         **(facts or {}),
     }
     store.finish()
-    source = SnapshotSource(model, data, layout)
+    source = SnapshotSource(model, data, kind)
     logs = new_logs(directory, Infix(0, "1"))
     name = "openaigym.trajectory.0.1.episode000000"
-    span = logs.begin(name, TrajectoryHeader(facts=known, snapshot=layout))
-    snapshot = np.empty(layout.size, np.uint8)
+    span = logs.begin(name, known, row_dtype(snapshot=kind))
+    snapshot = np.empty(kind.itemsize // 8, np.uint64)
     seen = []
     with SceneRenderer(
         model,
@@ -140,7 +140,7 @@ def record(
                 add_row(span, step)
             if names:
                 fields = read_fields(model, names)
-                span.add_change(ModelChange(step=2 * number, fields=fields))
+                span.log.add_change(ModelChange(step=2 * number, fields=fields))
             source.take(snapshot)
             add_row(span, 2 * number, snapshot=snapshot, is_step=False)
             renderer.model_changed()

@@ -13,13 +13,13 @@ import mujoco
 import numpy as np
 from trajectories_by_hand import INFIX, add_row, write_log
 
-from mjrec.formats.in_flight import list_paths
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.manifest import Manifest, write_manifest
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.span_writer import SpanLogs
+from mjrec.formats.spans import list_paths
 from mjrec.formats.stats_file import StatsFile, write_stats_file
-from mjrec.formats.trajectory import Array, ModelChange, TrajectoryHeader
+from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.simulation.model_sources import authored_from_file
 from mjrec.simulation.model_store import ModelStore
@@ -96,12 +96,12 @@ def video(directory: Path) -> Path:
 
 def killed(directory: Path) -> Path:
     """Record an episode and be killed; return its list."""
-    header = TrajectoryHeader(facts={}, observation=Array("<f8", (9,)))
+    dtype = row_dtype(observation=np.dtype(("<f8", (9,))))
     logs = SpanLogs(directory, INFIX, numbers=itertools.count(), tail_bytes=1)
-    span = logs.begin(trajectory_prefix(INFIX, 0), header)
+    span = logs.begin(trajectory_prefix(INFIX, 0), {}, dtype)
     for step in range(10):
         if step == 5:
-            span.add_change(ModelChange(step=5, fields={"geom_rgba": np.ones(4)}))
+            span.log.add_change(ModelChange(step=5, fields={"geom_rgba": np.ones(4)}))
         add_row(span, step, observation=step)
     span.note({"rate": "20"})
     logs.release()

@@ -23,17 +23,17 @@ from recordings import frames_of, in_flight
 from trajectories_by_hand import write_log
 from waiting import wait_until
 
-from mjrec import Error, InvalidArgument, Monitor
-from mjrec.formats.in_flight import find_recording, is_in_flight
+from mjrec import Error, Monitor
 from mjrec.formats.monitor_directory import Infix
+from mjrec.formats.spans import find_recording, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.background import Background
-from mjrec.rendering.progress import Progress
+from mjrec.rendering.jobs import Progress
 
 # A program around it, with the directory at argv[1].
 PROGRAM = """
 import pathlib, sys
-from mjrec.formats.in_flight import recordings_in_flight
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering.background import Background
 directory = pathlib.Path(sys.argv[1])
 background = Background(directory, workers=1)
@@ -155,30 +155,6 @@ def test_videos_are_rendered(recorded: Path, start: Start) -> None:
     assert not list(recorded.glob(".*"))
 
 
-def test_a_video_that_is_expected_finds_its_workers(
-    recorded: Path,
-    others: set[int],
-    start: Start,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """They start while its episode runs, stay, and a single one, too, uses one CPU."""
-    monkeypatch.delenv("LP_NUM_THREADS", raising=False)
-    background = start(recorded, workers=1)
-    background.expect()
-    [process] = children() - others
-    wait_until(lambda: workers_of(process))
-    [worker] = workers_of(process)
-    environ = Path(f"/proc/{worker}/environ").read_bytes()
-    assert b"LP_NUM_THREADS=1" in environ.split(b"\0")
-    for log in in_flight(recorded):
-        background.expect()
-        background.submit(log)
-        background.wait()
-        assert workers_of(process) == {worker}
-    assert background.failures == {}
-    assert len(list(recorded.glob("*.mp4"))) == 2
-
-
 def test_submitting_never_waits(others: set[int], tmp_path: Path, start: Start) -> None:
     """Not even while nobody reads, with more names than a pipe holds."""
     log = write_log(tmp_path, video=None)
@@ -215,9 +191,7 @@ def test_a_model_that_is_still_being_written_is_waited_for(
     [model] = recorded.glob("*.mjb.gz")
     hidden = model.rename(model.with_name("hidden"))
     first, second = in_flight(recorded)
-    later = write_log(recorded, video=None)
-    background = start(recorded, first, later)
-    wait_until(lambda: is_finished(later))
+    background = start(recorded, first)
     assert not list(recorded.glob("*.mp4"))
     hidden.rename(model)
     background.wait()
@@ -250,13 +224,6 @@ def test_several_monitors_share_one(tmp_path: Path, start: Start) -> None:
         assert background.waiting
     for number, share in shares.items():
         assert list(share.failures) == [f"openaigym.video.{number}.7.video000000.mp4"]
-
-
-@pytest.mark.parametrize("workers", [0, -1, True, 1.5, "2"])
-def test_workers_are_a_number_of_processes(workers: Any, tmp_path: Path) -> None:
-    """At least one."""
-    with pytest.raises(InvalidArgument, match="workers"):
-        Background(tmp_path, workers=workers)
 
 
 # How it ends
@@ -348,25 +315,6 @@ def test_the_second_death_is_one_clear_failure(
     assert children() == others
 
 
-@pytest.mark.parametrize(
-    ("python", "reason"),
-    [("/bin/false", "ended with status 1"), ("/no/python", "could not be started")],
-)
-def test_one_that_cannot_start_says_why(
-    python: str,
-    reason: str,
-    tmp_path: Path,
-    start: Start,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Its last words are part of the failure."""
-    monkeypatch.setattr(sys, "executable", python)
-    log = write_log(tmp_path)
-    background = start(tmp_path, log)
-    background.wait()
-    assert reason in background.failures[log.name]
-
-
 HANGING = """
 import subprocess, threading
 def wait_for_a_disk_that_does_not_answer(*a, **k):
@@ -437,24 +385,6 @@ def tell(*a, **k):
     return add(*a, **k)
 f.Finisher.add = tell
 """
-
-
-def test_what_libraries_print_disturbs_nobody(
-    tmp_path: Path,
-    start: Start,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Before it has begun or in the midst of its work; warnings are logged here."""
-    patched(tmp_path, monkeypatch, LOUD)
-    log = write_log(tmp_path, video=None)
-    background = start(tmp_path, log)
-    background.wait()
-    assert background.failures == {}
-    assert is_finished(log)
-    assert "early words" in caplog.text
-    assert "late words" not in caplog.text
-    assert "100% slow" in caplog.text
 
 
 def test_a_forked_child_leaves_it_alone(tmp_path: Path, start: Start) -> None:

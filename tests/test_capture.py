@@ -81,17 +81,22 @@ class Simulation:
 
     def begin(self) -> EpisodeStart:
         self.start = self.states.begin_episode()
-        self.row = np.zeros(self.start.snapshot.size, np.uint8)
+        kind = self.start.snapshot
+        self.words = np.zeros(0 if kind is None else kind.itemsize // 8, np.uint64)
         return self.start
+
+    @property
+    def row(self) -> Any:
+        return self.words.view(self.start.snapshot)[0]
 
     def begin_scene(self) -> Any:
         return self.begin().scene
 
     def capture(self) -> Any:
-        return self.states.capture_snapshot(self.row)
+        return self.states.capture_snapshot(self.words)
 
     def captured(self, name: str) -> Any:
-        return self.start.snapshot.unpack(self.row)[name]
+        return self.row[name]
 
     def shown(self, flag: str) -> int:
         """Show what a flag is for; return its number."""
@@ -142,7 +147,7 @@ def test_rows_can_be_gathered_while_only_the_state_changes(
         assert start.is_current()
         assert still.capture() is None
         state = read_state(still.model, still.data).tobytes()
-        assert WORDS.take(start.words).tobytes() == state + still.row.tobytes()
+        assert WORDS.take(start.words).tobytes() == state + still.words.tobytes()
     still.model.geom_rgba[0] = (1, 0, 0, 1)
     assert not start.is_current()
     assert list(still.capture()) == ["geom_rgba"]
@@ -189,7 +194,7 @@ def test_changes_of_model_and_view_are_told_once(simulation: Simulation) -> None
     view = view_from_facts(start.scene)
     apply_fields(model, changed, camera=view.camera, option=view.option)
     data = mujoco.MjData(model)
-    restore_snapshot(start.snapshot.unpack(simulation.row), model, data)
+    restore_snapshot(simulation.row, model, data)
     live = mujoco.MjvScene(simulation.model, maxgeom=100)
     update(live, simulation.model, simulation.data, simulation.view())
     again = mujoco.MjvScene(model, maxgeom=100)
@@ -287,7 +292,7 @@ def test_what_only_constraints_tell_is_refused(
     index = simulation.shown(flag)
     start = simulation.begin()
     assert f"mjVIS_{flag} of the visual options" in (start.refusal or "")
-    assert (start.scene, start.snapshot.fields) == (None, ())
+    assert (start.scene, start.snapshot) == (None, None)
     assert start.state
     assert simulation.states.changed_fields() is None
     simulation.model.geom_rgba[0] = 0.5
@@ -379,7 +384,7 @@ def check_scenes_that_stay(simulation: Simulation, frames: int) -> None:
         changed = simulation.capture() or {}
         update(live, simulation.model, simulation.data, live_view)
         apply_fields(model, changed, camera=view.camera, option=view.option)
-        restore_snapshot(simulation.start.snapshot.unpack(simulation.row), model, data)
+        restore_snapshot(simulation.row, model, data)
         update(again, model, data, view)
         assert list(differences(live, again, view.option)) == []
     left = [camera.pos.tolist() for camera in live.camera]
@@ -506,7 +511,7 @@ def test_calls_out_of_turn_are_errors(simulation: Simulation) -> None:
         with pytest.raises(ClosedError, match="begin_episode"):
             states.changed_fields()
         with pytest.raises(ClosedError, match="begin_episode"):
-            states.capture_snapshot(np.zeros(8, np.uint8))
+            states.capture_snapshot(np.zeros(8, np.uint64))
         simulation.begin()
         states.close()
     states.close()

@@ -157,8 +157,8 @@ def render_all(directory: Path) -> bool:
     It ends when it notices that its parent is gone, and until then is left alone.
     """
     found = list(finish(directory, workers=1))
-    assert not [each for each in found if each.failure]
-    return not any(each.is_elsewhere for each in found)
+    assert not any(each.failures for each in found)
+    return not any(each.elsewhere for each in found)
 
 
 # Takes more than five seconds: a process is killed, and all of its videos are drawn.

@@ -21,9 +21,10 @@ from recordings import in_flight, manifest_of
 
 import mjrec
 from mjrec.commands import main
-from mjrec.formats.in_flight import add_facts
+from mjrec.formats.spans import add_facts
 from mjrec.rendering import finish as module
-from mjrec.rendering.recordings import key_of, recordings
+from mjrec.rendering.jobs import key_of
+from mjrec.rendering.recordings import recordings
 
 
 class Blinking(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -331,8 +332,7 @@ def test_a_full_disk_ends_a_clip_and_not_the_simulation(tmp_path: Path) -> None:
     details = manifest_of(tmp_path)["mjrec"]
     assert "video" in {fault["what"] for fault in details["faults"]}
     [outcome] = finish(tmp_path)
-    assert (outcome.name, outcome.failure) == (details["pending"][0]["video"], None)
-    assert outcome.frame_count == 4
+    assert outcome.videos == {details["pending"][0]["video"]: 4}
     [about] = metadata_in(tmp_path)
     assert "states" in about["broken_reason"]
 
@@ -355,7 +355,7 @@ def test_no_other_video_is_written_over(name: str, tmp_path: Path) -> None:
     add_facts(log, {"video": {"recording": "deferred", "name": named}})
     before = set(tmp_path.iterdir())
     [outcome] = finish(tmp_path)
-    assert "not that of its own" in str(outcome.failure)
+    assert "not that of its own" in str(outcome.failures)
     [new] = set(tmp_path.iterdir()) - before
     assert new.match("openaigym.clip.*.failed.json")
 
@@ -363,6 +363,6 @@ def test_no_other_video_is_written_over(name: str, tmp_path: Path) -> None:
 def test_a_clip_is_written_at_the_rate_that_was_asked_for(tmp_path: Path) -> None:
     """`fps` is that of the file, whichever frames `max_fps` leaves."""
     record(tmp_path, hopper(), 9, **CLIP, video_length=6, fps=12, max_fps=62.5)
-    assert not finish(tmp_path)[0].failure
+    assert not finish(tmp_path)[0].failures
     [about] = metadata_in(tmp_path)
     assert (about["frame_count"], about["fps"]) == (5, "12")

@@ -76,7 +76,9 @@ def test_free_camera_moves_with_the_model(tmp_path: Path) -> None:
     assert scenes.states is not None
     scenes.states.open(tmp_path)
     env.reset()
-    row = np.empty(scenes.states.begin_episode().snapshot.size, np.uint8)
+    kind = scenes.states.begin_episode().snapshot
+    assert kind is not None
+    row = np.empty(kind.itemsize // 8, np.uint64)
     env.physics.model.vis.global_.azimuth += 30
     changed = scenes.states.capture_snapshot(row)
     assert changed is not None

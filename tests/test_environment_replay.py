@@ -30,7 +30,6 @@ from mjrec.environments.made_again import make_again, recorded_environment
 from mjrec.evidence.verification import Verdict
 from mjrec.evidence.verifying.environment_replay import action_kinds
 from mjrec.evidence.verifying.step_checks import follow_steps
-from mjrec.formats.trajectory import Array
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.simulation.replay import StateSteps
 
@@ -183,7 +182,7 @@ def test_actions_that_the_environment_refuses_are_a_failure(tmp_path: Path) -> N
     with open_trajectory(episode(directory)) as reader:
         count = reader.step_count
     two = np.zeros((count, 2))
-    forge(episode(directory), actions=two, action=Array("<f8", (2,)))
+    forge(episode(directory), actions=two, action=np.dtype(("<f8", (2,))))
     checks = physics_of(directory)
     assert "ends" in failed(checks)
     assert any("step 1 cannot be made: ValueError" in c.reason for c in checks)
@@ -209,15 +208,11 @@ def test_steps_made_again_one_by_one_are_those_of_a_rollout(tmp_path: Path) -> N
     env = gymnasium.make("Hopper-v5")
     directory = record_gymnasium(tmp_path / "run", env, episodes=1, steps=8)
     with open_trajectory(episode(directory)) as reader:
-        made = make_again(recorded_environment(reader.header.facts))
+        made = make_again(recorded_environment(reader.facts))
         model, _ = made.simulation()
         followed = follow_steps(reader, model, is_exact=True)
         rows = reader.states(0, reader.row_count)
-        parts = {part.name: part for part in reader.header.state}
-    columns = {
-        name: rows[:, part.offset : part.offset + part.length]
-        for name, part in parts.items()
-    }
+        columns = {name: rows[:, where] for name, where in reader.columns.items()}
     controls = np.repeat(columns["ctrl"][1:, np.newaxis], followed.substeps, axis=1)
     starts = np.hstack([columns[name][:-1] for name in ("time", "qpos", "qvel")])
     found, _ = rollout.rollout(
@@ -238,8 +233,8 @@ def test_errors_do_not_add_up_on_another_machine(tmp_path: Path) -> None:
     env = gymnasium.make("HalfCheetah-v5")
     directory = record_gymnasium(tmp_path / "run", env, episodes=1, steps=40)
     with open_trajectory(episode(directory)) as reader:
-        made = make_again(recorded_environment(reader.header.facts))
-        steps = StateSteps(made.simulation()[0], reader.header.state)
+        made = make_again(recorded_environment(reader.facts))
+        steps = StateSteps(made.simulation()[0], reader.columns)
         rows = reader.states(0, reader.row_count)
     made.close()
     other = rows.copy()

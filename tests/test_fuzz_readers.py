@@ -30,13 +30,12 @@ from trajectory_contents import content_of
 from mjrec import UnreadableFile
 from mjrec.formats.journal import JournalWriter, read_journal
 from mjrec.formats.manifest import read_manifest, write_manifest
-from mjrec.formats.model_changes import pack_change
 from mjrec.formats.monitor_directory import states_name, trajectory_prefix
 from mjrec.formats.row_log import TAIL_HEAD
-from mjrec.formats.span_writer import LOOK_PREFIX
 from mjrec.formats.stats_file import read_stats_file, write_stats_file
 from mjrec.formats.trajectory import ModelChange
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
+from mjrec.formats.trajectory_log import pack_change
 from mjrec.formats.video_metadata import is_broken
 from mjrec.json_text import dumps, loads
 from mjrec.rendering.recorded_facts import open_for_rendering
@@ -259,8 +258,8 @@ def sound_log(tmp_path_factory: pytest.TempPathFactory) -> Files:
     directory = tmp_path_factory.mktemp("log")
     write_log(directory)
     spans = directory / SPANS
-    packed = pack_change(ModelChange(step=1, fields={"geom_rgba": np.ones((2, 2))}))
-    spans.with_suffix(".looks").write_bytes(LOOK_PREFIX.pack(1, len(packed)) + packed)
+    packed = pack_change(1, ModelChange(step=1, fields={"geom_rgba": np.ones((2, 2))}))
+    spans.with_suffix(".looks").write_bytes(packed)
     return {part: spans.with_suffix(part).read_bytes() for part in PARTS}
 
 
@@ -372,7 +371,7 @@ def test_any_log_that_is_read_is_finished(tmp_path: Path, sound_log: Files) -> N
             continue
         with open_trajectory(finish_trajectory(path)) as reader:
             after = content_of(reader)
-        assert dumps(after.header.facts) == dumps(before.header.facts)
+        assert dumps(after.facts) == dumps(before.facts)
         assert np.array_equal(after.snapshots, before.snapshots)
 
 

@@ -121,7 +121,7 @@ def test_finish_completes_what_ctrl_c_has_cut_short(
     assert sorted(tmp_path.iterdir()) == before
     wait_until(lambda: not mjrec.recover(tmp_path).open_monitors)
     wait_until(lambda: not mjrec.recover(tmp_path).failures)
-    assert [each.failure for each in finish(tmp_path, workers=1) if each.failure] == []
+    assert not any(each.failures for each in finish(tmp_path, workers=1))
     assert stats_of(tmp_path)["episode_lengths"] == [4, 4]
     assert videos_in(tmp_path) == [0, 1, 2]
     assert [len(frames_in(tmp_path, number)) for number in range(3)] == [5, 5, 3]

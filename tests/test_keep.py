@@ -103,13 +103,13 @@ def facts_of(directory: Path, episode: int) -> dict[str, Any]:
     found = {*directory.glob("*.h5"), *in_flight(directory)}
     [path] = [p for p in found if p.name.endswith(f".episode{episode:06d}.h5")]
     with open_trajectory(path) as reader:
-        return dict(reader.header.facts)
+        return dict(reader.facts)
 
 
 def render(directory: Path) -> None:
     """Render what is pending."""
     outcomes = finish(directory, workers=1)
-    assert [each.failure for each in outcomes if each.failure] == []
+    assert not any(each.failures for each in outcomes)
 
 
 class Listener(Tracker):

@@ -24,7 +24,7 @@ from sound_files import stored
 import mjrec
 from mjrec import UnreadableFile, UntrustedModel, load_trajectory
 from mjrec.commands import main
-from mjrec.formats.in_flight import recordings_in_flight
+from mjrec.formats.spans import recordings_in_flight
 from mjrec.rendering.engine_jobs import VideoWorker
 from mjrec.simulation import model_trust
 from mjrec.simulation.model_store import load_model

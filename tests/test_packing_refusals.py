@@ -20,7 +20,7 @@ import mjrec
 from mjrec.evidence.packing.bag import make_bag
 from mjrec.evidence.packing.sizes import byte_count
 from mjrec.evidence.packing.statements import state
-from mjrec.rendering.progress import Progress
+from mjrec.rendering.jobs import Progress
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from trajectories_by_hand import write_log
 
 import mjrec
 from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
-from mjrec.rendering.recorded_frames import chosen_frames
+from mjrec.rendering.recorded_facts import chosen_frames
 
 SPEC = mujoco.mjtState.mjSTATE_FULLPHYSICS
 SIZE: dict[str, Any] = {"height": HEIGHT, "width": WIDTH}
@@ -194,42 +194,6 @@ def test_states_are_drawn_as_mujoco_would(temporary: Path) -> None:
         )
         assert np.array_equal(list(pictures), shown)
     assert model.vis.global_.offwidth == before
-    assert list(temporary.iterdir()) == []
-
-
-def test_a_state_leaves_nothing_behind() -> None:
-    """What a row leaves out is as in new data, whatever was drawn before."""
-    model, data = start()
-    mujoco.mj_forward(model, data)
-    spec = mujoco.mjtState.mjSTATE_QPOS
-    [at_start, *rest] = mjrec.render_states(
-        model, [[0.0], [5.0], [0.0]], spec, camera="side", **SIZE
-    )
-    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
-        renderer.update_scene(data, "side")
-        assert np.array_equal(renderer.render(), at_start)
-    assert not np.array_equal(at_start, rest[0])
-
-
-@pytest.mark.parametrize(
-    ("states", "spec", "message"),
-    [
-        (np.zeros((4, 5)), SPEC, r"\(n, 3\).*mj_stateSize.*\(4, 5\)"),
-        (np.zeros(3), SPEC, r"\(n, 3\).*\(3,\)"),
-        (np.zeros((2, 3, 3)), SPEC, r"\(n, 3\).*\(2, 3, 3\).*rollout"),
-        (np.array([["a", "b", "c"]]), SPEC, "numbers"),
-        (np.zeros((4, 3)), 1 << 30, "mjtState"),
-        (np.zeros((4, 3)), "full", "mjtState"),
-    ],
-)
-def test_states_that_are_none_of_the_models(
-    temporary: Path, states: Any, spec: Any, message: str
-) -> None:
-    """Before anything is started or written. No states are no frames."""
-    model, _ = start()
-    with pytest.raises(InvalidArgument, match=message):
-        mjrec.render_states(model, states, spec, **SIZE)
-    assert list(mjrec.render_states(model, np.zeros((0, 3)), SPEC, **SIZE)) == []
     assert list(temporary.iterdir()) == []
 
 

@@ -36,11 +36,8 @@ from mjrec import (
 )
 from mjrec.engines.work import Job, JobOutcome, Work
 from mjrec.rendering.engine_jobs import VideoWorker
-from mjrec.rendering.jobs import Outcome, Variant, VideoJob
-from mjrec.rendering.progress import Progress
-from mjrec.rendering.recordings import RecordingKey, claim
-from mjrec.rendering.render_videos import RenderedVideos
-from mjrec.rendering.views import View
+from mjrec.rendering.jobs import Progress, RecordingKey, RenderedVideos
+from mjrec.rendering.recordings import claim
 from mjrec.simulation.model_trust import note_models
 
 VIDEO = "openaigym.video.0.7.video000000"
@@ -144,25 +141,6 @@ def test_every_engine_makes_them(tmp_path: Path, given: Any) -> None:
     other = render_videos(run, episode=1, **view, out=out, engine=given)
     assert (list(other.videos), other.directory) == (["other.mp4"], tmp_path)
     assert frames_of(out)[0].shape == (24, 24, 3)
-
-
-def test_a_camera_without_a_name_is_a_short_part_of_one(
-    tmp_path: Path, painter: Painter
-) -> None:
-    """One that is otherwise has another."""
-    write_finished(tmp_path)
-    near, far = (
-        {"type": 0, "distance": distance, "lookat": [0.0, 0.0, 1.0], "elevation": -5}
-        for distance in (2, 9)
-    )
-    names = [*render_videos(tmp_path, camera=near).videos]
-    names += render_videos(tmp_path, camera=far).videos
-    assert len(set(names)) == 2
-    assert all(name.startswith(f"{VIDEO}.camera-") for name in names)
-    assert painter.asked[-1][2] == View(camera={**far, "distance": 9.0})
-    given = Variant(view=View(camera=dict(reversed(near.items()))))
-    trajectory = "openaigym.trajectory.0.7.episode000000.h5"
-    assert given.name_for(trajectory) == names[0]
 
 
 @pytest.mark.parametrize("options", [{}, {"fps": 30}], ids=["pending", "another way"])
@@ -330,29 +308,6 @@ def test_two_workers_make_the_files_that_this_process_makes(
     assert content_of(there) == content_of(here)
 
 
-@pytest.mark.parametrize(
-    "variant",
-    [
-        None,
-        Variant(),
-        Variant(view=View(camera=-1, height=2), max_fps=29.97, annotate=False),
-        Variant(view=View(camera={"lookat": [0, 0, 1]}), fps=Fraction(24000, 1001)),
-    ],
-)
-def test_jobs_and_outcomes_survive_the_way(
-    variant: Variant | None, tmp_path: Path
-) -> None:
-    """Exactly."""
-    video = variant and tmp_path / "v.mp4"
-    job = VideoJob(directory=tmp_path, recording="r", variant=variant, video=video)
-    said = json.loads(json.dumps(job.as_json()))
-    assert VideoJob.from_json(said).as_json() == said
-    outcome = Outcome(
-        name="v.mp4", directory=tmp_path, is_video=True, further_videos=("v.side.mp4",)
-    )
-    assert Outcome.from_json(json.loads(json.dumps(outcome.as_json()))) == outcome
-
-
 def test_progress_counts_videos_as_they_come(tmp_path: Path, painter: Painter) -> None:
     """Each recording is taken for a video until it is over; frames are not known."""
     write_finished(tmp_path, 0)
@@ -377,49 +332,6 @@ def test_a_job_whose_workers_die_is_that_videos_failure(
     assert len(rendered.videos) == 1
     [pending] = json.loads(manifest.read_text())["mjrec"]["pending"]
     assert pending["reason"] == DIED
-
-
-def test_what_is_done_is_no_job(tmp_path: Path, painter: Painter) -> None:
-    """Without a look into any trajectory; and without a job there is no run."""
-    write_finished(tmp_path)
-    render_videos(tmp_path, engine=Here())
-    next(tmp_path.glob("*.h5")).write_bytes(b"torn")
-    engine = Here()
-    assert render_videos(tmp_path, engine=engine).is_empty
-    assert engine.works == []
-
-
-@pytest.mark.parametrize("variant", [None, Variant(fps=30)])
-def test_a_job_done_twice_is_done_once(
-    tmp_path: Path, painter: Painter, variant: Variant | None
-) -> None:
-    """The second time there is nothing to do, or the same file comes in its place."""
-    path = write_finished(tmp_path)
-    job = VideoJob(
-        directory=tmp_path,
-        recording=path.name,
-        variant=variant,
-        video=variant and tmp_path / "x.mp4",
-    )
-    assert VideoWorker()(job.as_json())["outcome"]["is_video"]
-    before = content_of(tmp_path)
-    again = VideoWorker()(job.as_json())["outcome"]
-    assert (again is None) == (variant is None)
-    assert content_of(tmp_path) == before
-
-
-def test_one_worker_serves_several_directories(
-    tmp_path: Path, painter: Painter
-) -> None:
-    """One after the other, and back."""
-    worker = VideoWorker()
-    for name, number in (("a", 0), ("b", 0), ("a", 1)):
-        (tmp_path / name).mkdir(exist_ok=True)
-        write_finished(tmp_path / name, number)
-        job = VideoJob.finishing(tmp_path / name, RecordingKey(INFIX, number))
-        assert worker(job.as_json())["outcome"]["is_video"]
-    worker.close()
-    assert len(list(tmp_path.glob("*/*.mp4"))) == 3
 
 
 def test_workers_get_what_rendering_needs(

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import random
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,13 +10,12 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from parts import parametrize
 from rides import FRAMES, HEIGHT, WIDTH, Ride, move, record, start
 from trajectories_by_hand import INFIX, add_row, new_logs, write_log
 
-from mjrec.errors import InvalidArgument, NoPictures, UnknownName, UnreadableFile
+from mjrec.errors import InvalidArgument, NoPictures, UnreadableFile
 from mjrec.formats.monitor_directory import trajectory_prefix
-from mjrec.formats.trajectory import Array, RowLayout, TrajectoryHeader
+from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.drawing import Drawing, trajectory_drawing
 from mjrec.rendering.pool import WorkerPool
@@ -100,30 +98,6 @@ def test_the_plane_depends_on_the_picture_before(ride: Ride, tmp_path: Path) -> 
     drawing.close()
 
 
-def test_the_first_picture_comes_after_those_of_episodes_before(
-    ride: Ride, tmp_path: Path
-) -> None:
-    """A viewer keeps its scene over resets; the recording says where it stood."""
-    positions = [[41.0, 17.0, 1.5], [41.0, 17.0, 1.5]]
-    scene = {**scene_of(ride), "previous_cameras": positions}
-    after = record(tmp_path, facts={"scene": scene})
-    model, data = start()
-    move(model, data, 0)
-    with SceneRenderer(
-        model, height=HEIGHT, width=WIDTH, camera="rider", scene_option=inertia_shown()
-    ) as renderer:
-        renderer.camera_positions = positions
-        expected = renderer.render(data)
-    assert not np.array_equal(expected, ride.frames[0])
-
-    drawing = trajectory_drawing(after.path, View())
-
-    for number in (0, 1, 0):
-        shown = expected if number == 0 else ride.frames[number]
-        assert np.array_equal(drawing.draw(number), shown)
-    drawing.close()
-
-
 def test_the_context_is_kept_from_drawing_to_drawing(ride: Ride) -> None:
     """The first has changed its terrain, a texture and a plane; the next sees none."""
     other = View(height=30, quality="draft")
@@ -172,20 +146,6 @@ def test_another_view_takes_the_place_of_the_recorded_one(
     assert np.array_equal(drawn, [expected[2], expected[0], expected[1]])
 
 
-def test_the_recorded_quality_is_the_default(ride: Ride, tmp_path: Path) -> None:
-    """A draft stays one until asked otherwise."""
-    draft = record(tmp_path, facts={"video": {"quality": "draft"}})
-    pictures = {}
-    for quality in (None, "draft", "full"):
-        drawing = trajectory_drawing(draft.path, View(quality=quality))
-        pictures[quality] = drawing.draw(1)
-        drawing.close()
-
-    assert np.array_equal(pictures[None], pictures["draft"])
-    assert not np.array_equal(pictures[None], pictures["full"])
-    assert np.array_equal(pictures["full"], ride.frames[1])
-
-
 @pytest.mark.parametrize(
     ("camera", "message"),
     [
@@ -202,26 +162,6 @@ def test_a_camera_that_the_model_lacks(ride: Ride, camera: Any, message: str) ->
         trajectory_drawing(ride.path, View(camera=camera))
 
 
-@pytest.mark.parametrize(
-    "facts",
-    [
-        {"scene": {"camera": 3}},
-        {"model": None},
-        {"model": {"sha256": "0", "mjb": "../../etc/passwd"}},
-        {},
-    ],
-)
-def test_what_cannot_be_drawn_is_one_clear_error(
-    tmp_path: Path, facts: dict[str, Any]
-) -> None:
-    """A file may be hostile; its model may have been left behind."""
-    ride = record(tmp_path, facts=facts)
-    if not facts:
-        next(tmp_path.glob("openaigym.model.*")).unlink()
-    with pytest.raises(UnreadableFile, match=r"Cannot read.*(h5|model\.)"):
-        trajectory_drawing(ride.path, View())
-
-
 def test_a_trajectory_without_snapshots(tmp_path: Path) -> None:
     """The reason of the recording is told, and another way."""
     path = write_log(tmp_path, frames=False, scene=None, refusal="a plugin draws")
@@ -229,38 +169,12 @@ def test_a_trajectory_without_snapshots(tmp_path: Path) -> None:
         trajectory_drawing(path, View())
 
 
-@parametrize(
-    "members",
-    [
-        {"type": 1, "trackbodyid": 10**6},
-        {"type": 2, "fixedcamid": -7},
-        {"type": 77},
-        {"type": 2**40},
-        {"type": float("nan")},
-    ],
-)
-def test_a_recorded_camera_that_the_model_lacks(
-    ride: Ride, tmp_path: Path, members: dict[str, Any]
-) -> None:
-    """Also that is told of the file, and no worker falls over it."""
-    scene = scene_of(ride)
-    scene["camera"] = {**scene["camera"], **members}
-    path = record(tmp_path, facts={"scene": scene}).path
-
-    with (
-        pytest.raises(UnreadableFile, match="camera"),
-        contextlib.closing(trajectory_drawing(path, View())) as drawing,
-    ):
-        drawing.draw(0)
-
-
 def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:
     """The arrays do not fit."""
-    header = header_of(ride)
-    layout = RowLayout.packed([("geom_xpos", Array("<f8", (1, 3)))])
+    dtype = row_dtype(snapshot=packed([("geom_xpos", ("<f8", (1, 3)))]))
     logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
     path = logs.path_of(name)
-    span = logs.begin(name, dataclasses.replace(header, snapshot=layout))
+    span = logs.begin(name, facts_of(ride), dtype)
     add_row(span, 0, snapshot=0)
     logs.close()
     [model] = ride.path.parent.glob("openaigym.model.*")
@@ -272,25 +186,13 @@ def test_snapshots_of_another_model(ride: Ride, tmp_path: Path) -> None:
     drawing.close()
 
 
-def test_a_view_is_checked_when_it_is_made() -> None:
-    """Before any process or file is asked for."""
-    with pytest.raises(UnknownName, match="quality"):
-        View(quality="best")
-    with pytest.raises(InvalidArgument, match="height"):
-        View(height=0)
-    with pytest.raises(UnknownName, match="lookt"):
-        View(camera={"lookt": [0, 0, 0]})
-    with pytest.raises(InvalidArgument, match="three numbers"):
-        View(camera={"lookat": [0, 0]})
-
-
-def header_of(ride: Ride) -> TrajectoryHeader:
+def facts_of(ride: Ride) -> dict[str, Any]:
     with open_trajectory(ride.path) as reader:
-        return reader.header
+        return dict(reader.facts)
 
 
 def scene_of(ride: Ride) -> dict[str, Any]:
-    return dict(header_of(ride).facts["scene"])
+    return dict(facts_of(ride)["scene"])
 
 
 def inertia_shown() -> mujoco.MjvOption:

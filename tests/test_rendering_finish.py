@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import json
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,37 +23,34 @@ from trajectories_by_hand import (
 )
 
 from mjrec import UnreadableFile, load_results
-from mjrec.formats.in_flight import add_facts, is_in_flight
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import (
-    Infix,
     lock_name,
     trajectory_prefix,
     video_lock_name,
 )
+from mjrec.formats.spans import add_facts, is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
-from mjrec.rendering.finish import Finisher, note_failure
-from mjrec.rendering.jobs import Outcome, VideoJob
+from mjrec.rendering.finish import Finisher
+from mjrec.rendering.jobs import RecordingKey, RenderedVideos, VideoJob
 from mjrec.rendering.recorded_facts import open_for_rendering
 from mjrec.rendering.recordings import (
-    RecordingKey,
     claim,
-    key_of,
     look_at,
     may_be_left,
-    recorded_episodes,
 )
-from mjrec.results.manifest_and_stats import update_manifests, write_manifest_and_stats
+from mjrec.results.manifest_and_stats import write_manifest_and_stats
 
 pytestmark = pytest.mark.usefixtures("painter")
 
 KEY = RecordingKey(INFIX, 0)
 VIDEO = "openaigym.video.0.7.video000000"
+SECOND = "openaigym.video.0.7.video000001.mp4"
 ENDS = ("framehash", "meta.json", "mp4")
 
 
-def finish(directory: Path, **options: Any) -> list[Outcome]:
+def finish(directory: Path, **options: Any) -> list[RenderedVideos]:
     options = {"workers": 1, **options}
     return list(module.finish(directory, **options))
 
@@ -68,39 +64,20 @@ def manifest_in(directory: Path) -> dict[str, Any]:
 # What is pending
 
 
-def test_episodes_are_in_their_order(tmp_path: Path) -> None:
-    """By the monitors' numbers, and then by their own; each once."""
-    for infix in (Infix(10, "a"), Infix(2, "a")):
-        for episode_id in (1, 0):
-            write_log(tmp_path, episode_id, infix=infix)
-    write_log(tmp_path, 5, infix=Infix(2, "a")).write_bytes(b"")
-    found = [(key.infix.monitor_id, key.number) for key in recorded_episodes(tmp_path)]
-    assert found == [(2, 0), (2, 1), (2, 5), (10, 0), (10, 1)]
-
-
-@pytest.mark.parametrize(
-    "key",
-    [RecordingKey(INFIX, 12), RecordingKey(Infix(3, "a.b"), 4000, is_clip=True)],
-)
-def test_a_recording_is_told_by_a_name(key: RecordingKey) -> None:
-    """Which says all of it."""
-    assert key_of(key.told_name) == key
-
-
 @pytest.mark.parametrize("write", [write_log, write_finished])
 def test_a_deferred_video_is_pending_until_it_and_its_metadata_are_there(
     write: Callable[..., Path], tmp_path: Path
 ) -> None:
     """Whether or not the trajectory has its final form."""
     trajectory = write(tmp_path)
-    pending = look_at(tmp_path, KEY)
-    assert pending is not None
-    assert pending.parts == (trajectory,)
-    assert pending.video == tmp_path / f"{VIDEO}.mp4"
-    assert pending.frame_count == 5
+    plan = look_at(tmp_path, KEY)
+    assert plan is not None
+    assert plan.parts == (trajectory,)
+    assert plan.videos == (tmp_path / f"{VIDEO}.mp4",)
+    assert plan.frame_count == 5
     for _ in range(2):
-        [outcome] = finish(tmp_path)
-        assert outcome.is_video
+        [result] = finish(tmp_path)
+        assert result.videos == {f"{VIDEO}.mp4": 5}
         assert look_at(tmp_path, KEY) is None
         assert not may_be_left(tmp_path, KEY)
         (tmp_path / f"{VIDEO}.meta.json").unlink()
@@ -115,8 +92,8 @@ def test_a_log_without_a_deferred_video_gets_its_final_form_only(
 ) -> None:
     """What was drawn live, or not wanted, is not drawn."""
     log = write_log(tmp_path, video=video)
-    [outcome] = finish(tmp_path)
-    assert (outcome.is_trajectory, outcome.name) == (True, log.name)
+    [result] = finish(tmp_path)
+    assert result == RenderedVideos(directory=tmp_path, trajectories=(log.name,))
     assert names(tmp_path) == [log.name]
     assert painter.asked == []
     assert finish(tmp_path) == []
@@ -131,15 +108,15 @@ def test_what_an_open_monitor_has_not_ended_is_its_own(
     write_log(tmp_path, 1)
     lock = Lock(tmp_path / lock_name(INFIX), "")
     # What has ended is not its own.
-    assert [outcome.name[-5:] for outcome in finish(tmp_path)] == ["1.mp4"]
+    assert [list(each.videos) for each in finish(tmp_path)] == [[SECOND]]
     assert is_in_flight(log)
     if ended:
         add_facts(log, {"candidate": False})
         assert look_at(tmp_path, KEY) is not None
         add_facts(log, {"candidate": True})
     lock.release()
-    [outcome] = finish(tmp_path)
-    assert outcome.is_video
+    [result] = finish(tmp_path)
+    assert result.videos
 
 
 def test_a_trajectory_that_is_not_kept_goes_with_its_video_only(
@@ -148,7 +125,7 @@ def test_a_trajectory_that_is_not_kept_goes_with_its_video_only(
     """While that fails it stays: nobody could ever render it."""
     write_log(tmp_path, kept=False)
     log = write_log(tmp_path, 1, kept=False, frames=False)
-    assert [bool(outcome.failure) for outcome in finish(tmp_path)] == [False, True]
+    assert [bool(each.failures) for each in finish(tmp_path)] == [False, True]
     assert is_in_flight(log)
     others = ("states", "failed")
     assert [n for n in names(tmp_path) if not any(o in n for o in others)] == [
@@ -167,29 +144,16 @@ def test_what_another_process_has_is_left_to_it(
     lock = claim(tmp_path, KEY)
     assert lock is not None
     assert claim(tmp_path, KEY) is None
-    [outcome] = finish(tmp_path)
-    assert outcome.is_elsewhere
+    [result] = finish(tmp_path)
+    assert result.elsewhere == (f"{VIDEO}.mp4",)
     assert painter.asked == []
     lock.release()
     (tmp_path / video_lock_name(INFIX, 0)).write_text("4711")
     write_pending_manifest(tmp_path, 0)
-    [outcome] = finish(tmp_path, workers=None)
-    assert outcome.is_video
+    [result] = finish(tmp_path, workers=None)
+    assert result.videos
     # No lock stays: of the episode, of the manifest, of the CPUs.
     assert not list(tmp_path.glob(".*"))
-
-
-def test_what_was_done_meanwhile_is_not_done_again(
-    tmp_path: Path, painter: Painter
-) -> None:
-    """Two look at the same directory; the slower finds nothing left."""
-    write_finished(tmp_path)
-    with Finisher(tmp_path, workers=1) as slower:
-        slower.add(VideoJob.finishing(tmp_path, KEY))
-        finish(tmp_path)
-        _, outcome = slower.do_next()
-    assert outcome.is_trajectory
-    assert len(painter.asked) == 1
 
 
 def test_what_a_killed_renderer_left_goes_with_the_next_try(tmp_path: Path) -> None:
@@ -202,35 +166,17 @@ def test_what_a_killed_renderer_left_goes_with_the_next_try(tmp_path: Path) -> N
     left = [f".{VIDEO}.{end}.0123abcd.part" for end in ENDS]
     for name in [*others, *left]:
         (tmp_path / name).touch()
-    assert [outcome.failure for outcome in finish(tmp_path)] == [None]
+    assert not [each for each in finish(tmp_path) if each.failures]
     assert all((tmp_path / name).exists() for name in others)
     assert not any((tmp_path / name).exists() for name in left)
 
 
-def test_a_log_beside_its_finished_trajectory_goes(tmp_path: Path) -> None:
-    """A process died between making one and removing the other."""
-    log = write_log(tmp_path)
-    rows = {path: path.read_bytes() for path in tmp_path.glob("*.states.*")}
-    finish(tmp_path)
-    for path, content in rows.items():
-        path.write_bytes(content)
-    assert finish(tmp_path) == []
-    assert not any(path.exists() for path in rows)
-    with open_trajectory(log) as reader:
-        assert reader.step_count == 4
-
-
 def test_one_whose_model_is_still_being_written_waits(tmp_path: Path) -> None:
-    """Another one comes first."""
-    jobs = [VideoJob.finishing(tmp_path, RecordingKey(INFIX, n)) for n in (0, 1)]
+    """And no other comes before it."""
     write_finished(tmp_path, 0, model={"mjb": "m.mjb.gz", "xml": None})
-    write_finished(tmp_path, 1)
-    with Finisher(tmp_path, workers=1) as finisher:
-        finisher.add(jobs[0])
+    with contextlib.closing(Finisher(tmp_path, workers=1)) as finisher:
+        finisher.add(VideoJob.finishing(tmp_path, KEY))
         assert not finisher.is_ready()
-        finisher.add(jobs[1])
-        assert finisher.is_ready()
-        assert finisher.do_next()[0] == jobs[1]
         (tmp_path / "m.mjb.gz").write_bytes(b"")
         assert finisher.is_ready()
 
@@ -247,12 +193,15 @@ def test_what_cannot_be_rendered_stops_nothing_else(
     write_finished(tmp_path, 2)
     write_finished(tmp_path, 3)
     painter.breaks_at = lambda path, *_: [][1] if "000002" in path.name else None
-    first, second, third, fourth = finish(tmp_path)
-    assert "Cannot read" in str(first.failure)
-    assert "a plugin draws" in str(second.failure)
-    assert str(third.failure).startswith("IndexError: ")
+    *failed, last = finish(tmp_path)
+    assert last.videos
+    first, second, third = (
+        reason for each in failed for reason in each.failures.values()
+    )
+    assert "Cannot read" in first
+    assert "a plugin draws" in second
+    assert third.startswith("IndexError: ")
     assert "Traceback" in caplog.text
-    assert fourth.is_video
     assert len(finish(tmp_path)) == 3
 
 
@@ -297,18 +246,6 @@ def test_the_manifest_of_an_open_monitor_is_left_to_it(tmp_path: Path) -> None:
     assert len(manifest_in(tmp_path)["videos"]) == 1
 
 
-def test_other_manifests_are_not_rewritten(tmp_path: Path) -> None:
-    """Neither gym's own, nor one in which nothing is new."""
-    gyms = tmp_path / "openaigym.manifest.0.1.manifest.json"
-    gyms.write_text('{"stats": "s.json", "videos": [], "env_info": {}, "more": 1}')
-    write_log(tmp_path, 3)
-    paths = (gyms, write_pending_manifest(tmp_path, 3))
-    update_manifests(tmp_path)
-    before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in paths]
-    update_manifests(tmp_path)
-    assert [(path.read_bytes(), path.stat().st_mtime_ns) for path in paths] == before
-
-
 @pytest.mark.parametrize("name", ["../elsewhere/x.mp4", "/x.mp4", "", 7, None])
 def test_a_manifest_names_no_video_elsewhere(name: Any, tmp_path: Path) -> None:
     """Such an entry is dropped."""
@@ -326,27 +263,13 @@ def test_the_manifest_says_why_a_video_is_still_pending(tmp_path: Path) -> None:
     write_pending_manifest(tmp_path, 0)
     [rows] = tmp_path.glob("*.log")
     hidden = rows.rename(tmp_path / "hidden")
-    [outcome] = finish(tmp_path)
+    [result] = finish(tmp_path)
     [entry] = manifest_in(tmp_path)["mjrec"]["pending"]
-    assert entry["reason"] == outcome.failure
+    assert [entry["reason"]] == list(result.failures.values())
     assert "Cannot read" in entry["reason"]
     hidden.rename(rows)
-    assert [outcome.failure for outcome in finish(tmp_path)] == [None]
+    assert not [each for each in finish(tmp_path) if each.failures]
     assert manifest_in(tmp_path)["mjrec"]["pending"] == []
-
-
-def test_a_long_reason_is_cut_in_its_middle(tmp_path: Path) -> None:
-    """Where it begins and ends is what matters."""
-    write_log(tmp_path, 0)
-    write_pending_manifest(tmp_path, 0)
-    reason = "It failed. " + 10**4 * "x" + " No space left."
-    note_failure(tmp_path, f"{VIDEO}.mp4", reason)
-    write_manifest_and_stats(tmp_path, INFIX)
-    [entry] = manifest_in(tmp_path)["mjrec"]["pending"]
-    assert len(entry["reason"]) <= 1000
-    assert re.fullmatch(
-        r"It failed\. x+ \[\.\.\.\] x+ No space left\.", entry["reason"]
-    )
 
 
 # Facts, which may be anybody's
@@ -358,11 +281,10 @@ def write_saying(directory: Path, **facts: Any) -> Path:
     """Write a log of two frames that says these facts, of any kind."""
     usual = write_finished(directory, 1)
     with open_trajectory(usual) as reader:
-        header = reader.header
+        known, dtype = {**reader.facts, **facts}, reader.dtype
     usual.unlink()
-    header = dataclasses.replace(header, facts={**header.facts, **facts})
     logs = new_logs(directory)
-    span = logs.begin(trajectory_prefix(INFIX, 1), header)
+    span = logs.begin(trajectory_prefix(INFIX, 1), known, dtype)
     for step in range(2):
         add_row(span, step, snapshot=grey(step))
     logs.close()
@@ -402,8 +324,8 @@ def test_a_fact_that_cannot_be_is_named(key: str, value: Any, tmp_path: Path) ->
     assert caught.value.path == path
     assert time.monotonic() - start < 5
     first, second = finish(tmp_path)
-    assert key in str(first.failure)
-    assert second.is_video
+    assert key in str(first.failures)
+    assert second.videos
 
 
 @pytest.mark.parametrize(

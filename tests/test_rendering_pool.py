@@ -5,12 +5,13 @@ import contextlib
 import gc
 import logging
 import os
-import re
 import select
 import signal
 import subprocess
 import sys
 import textwrap
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,22 +24,19 @@ from processes import children
 from rides import FRAMES, HEIGHT, WIDTH, Ride, record
 
 from mjrec import child_python
-from mjrec.child_python import Child, carried, environment_of_child, unpacked
+from mjrec.child_python import Child
 from mjrec.errors import (
-    ClosedError,
-    DirectoryNotWritable,
     Error,
     GLError,
     InvalidArgument,
     UnknownName,
     UnreadableFile,
 )
-from mjrec.formats.locks import Lock, try_lock
+from mjrec.formats.locks import try_lock
 from mjrec.formats.monitor_directory import render_lock_name
 from mjrec.gl import Probe, choice
-from mjrec.rendering import shared_pool
-from mjrec.rendering.pool import WorkerPool, _environment
-from mjrec.rendering.shared_pool import SharedPool
+from mjrec.rendering import pool as pool_module
+from mjrec.rendering.pool import SharedPool, WorkerPool
 from mjrec.rendering.views import View
 
 
@@ -148,14 +146,6 @@ def test_workers_stay_and_go_over_to_other_views(ride: Ride, three: WorkerPool) 
     assert np.array_equal(list(three.frames(ride.path, [5])), [ride.frames[5]])
 
 
-def test_no_pictures_are_no_work() -> None:
-    """No process is started."""
-    with new_children() as new, WorkerPool(2) as pool:
-        assert list(pool.frames(Path("nothing.h5"), [])) == []
-        assert pids(pool) == []
-    assert new == []
-
-
 # What goes wrong
 
 
@@ -172,20 +162,6 @@ def test_errors_come_at_their_place(ride: Ride, three: WorkerPool) -> None:
     with pytest.raises(InvalidArgument, match="no picture 99"):
         next(frames)
     assert np.array_equal(list(three.frames(ride.path, [3])), [ride.frames[3]])
-
-
-@pytest.mark.parametrize(
-    ("error", "message"),
-    [
-        ({"type": "Path", "message": "no"}, "^no$"),
-        (carried(KeyError("qpos")), r"nobody foresaw.\nKeyError: 'qpos'"),
-    ],
-)
-def test_errors_are_carried_without_pickle(error: Any, message: str) -> None:
-    """A class that there is not is just an error, and ours to mend."""
-    told = unpacked(error)
-    assert type(told) is Error
-    assert re.search(message, str(told))
 
 
 def test_a_killed_worker_is_replaced(
@@ -223,22 +199,6 @@ def be_impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[WorkerPool], None
     return shorten
 
 
-def test_a_worker_that_always_hangs_is_not_waited_for(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Two are ended. Where nothing was ever drawn, OpenGL is to blame."""
-    monkeypatch.setenv("MJREC_PATIENCE", "0.2")
-    use_process(monkeypatch, "import time; time.sleep(100)")
-    with (
-        new_children() as new,
-        WorkerPool(1) as pool,
-        pytest.raises(GLError, match=r"frame 0 of .* nothing for 0.2 seconds"),
-    ):
-        pool.frames(ride.path, range(FRAMES))
-    assert new == []
-    assert caplog.text.count("A drawing worker hangs") == 2
-
-
 def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
     ride: Ride,
     tmp_path: Path,
@@ -264,19 +224,6 @@ def test_a_worker_that_hangs_is_replaced_and_the_log_says_where(
         assert np.array_equal(list(frames), ride.frames)
     assert "it has drawn nothing for 0.5 seconds" in caplog.text
     assert "in draw_otherwise" in caplog.text
-
-
-@pytest.mark.thorough
-def test_a_slow_worker_does_not_hang(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """However long all takes: the time counts from picture to picture."""
-    draw_otherwise(monkeypatch, "time.sleep(0.3); return draw(self, index, **rest)")
-    with WorkerPool(1) as pool:
-        frames = pool.frames(ride.path, range(FRAMES))
-        pool._workers[0].patience.seconds = 2
-        assert np.array_equal(list(frames), ride.frames)
-    assert not caplog.records
 
 
 def test_a_worker_that_dies_twice_is_an_error(
@@ -315,15 +262,6 @@ def test_what_a_worker_says_is_heard(
     assert levels == {"no GPU": logging.ERROR}
 
 
-def test_a_worker_that_cannot_be_started(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The error names the program."""
-    monkeypatch.setattr(sys, "executable", "/nonexistent/python")
-    with WorkerPool(1) as pool, pytest.raises(Error, match="/nonexistent/python"):
-        pool.frames(ride.path, range(FRAMES))
-
-
 @pytest.mark.parametrize("count", [0, -1, 1.5, True, "2"])
 def test_a_number_of_workers_that_cannot_be(count: Any) -> None:
     """One error before anything is started."""
@@ -332,32 +270,6 @@ def test_a_number_of_workers_that_cannot_be(count: Any) -> None:
 
 
 # Their life
-
-
-def test_a_later_call_takes_the_workers_over(ride: Ride, three: WorkerPool) -> None:
-    """The iterator before says so."""
-    first = three.frames(ride.path, range(FRAMES))
-    next(first)
-    second = three.frames(ride.path, range(FRAMES))
-    with pytest.raises(ClosedError, match="taken"):
-        list(first)
-    assert np.array_equal(list(second), ride.frames)
-
-
-@pytest.mark.thorough
-def test_closed_workers_say_so(ride: Ride) -> None:
-    """Closing twice is allowed, and leaves no process."""
-    with new_children() as new:
-        pool = WorkerPool(2)
-        frames = pool.frames(ride.path, range(FRAMES))
-        assert len(pids(pool)) == 2
-        pool.close()
-        pool.close()
-        with pytest.raises(ClosedError):
-            list(frames)
-        with pytest.raises(ClosedError):
-            pool.frames(ride.path, [0])
-    assert new == []
 
 
 def test_forgotten_workers_end(ride: Ride) -> None:
@@ -543,22 +455,6 @@ def test_a_backend_that_is_named_is_used(
     assert b"PYOPENGL_PLATFORM=osmesa" in environment
 
 
-def test_a_backend_that_there_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error before anything is started."""
-    monkeypatch.setenv("MUJOCO_GL", "vulkan")
-    with pytest.raises(UnknownName, match="MUJOCO_GL"):
-        WorkerPool(1)
-
-
-def test_a_backend_that_does_not_work(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The error has the way out."""
-    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
-    with WorkerPool(2) as pool, pytest.raises(GLError, match="mjrec doctor"):
-        pool.frames(ride.path, range(FRAMES))
-
-
 # Takes more than five seconds: both backends are tried by processes of their own.
 def test_where_egl_does_not_work_another_backend_draws(
     ride: Ride, monkeypatch: pytest.MonkeyPatch
@@ -588,117 +484,28 @@ def test_no_backend_works(ride: Ride, monkeypatch: pytest.MonkeyPatch) -> None:
                 pool.frames(ride.path, range(FRAMES))
 
 
-def test_workers_beside_each_other_use_one_cpu_each(
-    ride: Ride, three: WorkerPool
-) -> None:
-    """And one alone uses all; the caller's own setting is left alone."""
-    list(three.frames(ride.path, range(6)))
-    for pid in pids(three):
-        assert b"LP_NUM_THREADS=1\0" in Path(f"/proc/{pid}/environ").read_bytes()
-    assert "LP_NUM_THREADS" not in _environment({}, alone=True)
-    asked = _environment({"LP_NUM_THREADS": "2"}, alone=False)
-    assert asked["LP_NUM_THREADS"] == "2"
-
-
-def test_a_setting_that_crashes_mesa_is_left_out(
-    ride: Ride, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """And the log says so."""
-    monkeypatch.setenv("LP_NATIVE_VECTOR_WIDTH", "512")
-    with WorkerPool(1) as pool:
-        assert np.array_equal(list(pool.frames(ride.path, [2])), [ride.frames[2]])
-    assert "LP_NATIVE_VECTOR_WIDTH" in caplog.text
-
-
-def test_workers_find_what_their_parent_finds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The main script's directory last, everything else in its order."""
-    main = sys.modules["__main__"]
-    monkeypatch.setattr(main, "__file__", "/scripts/train.py", raising=False)
-    monkeypatch.setattr(sys, "path", ["/scripts", "/b", "relative", "/with:colon"])
-    found = environment_of_child({"A": "1"})
-    relative = Path("relative").absolute()
-    assert found == {"A": "1", "PYTHONPATH": f"/b:{relative}:/scripts"}
-
-
 # CPUs, shared by all that render into a directory
 
 # Takes what is free of the two CPUs of argv[1], says how many, and waits.
 HOLDER = """
 import pathlib, sys
-from mjrec.rendering import shared_pool
-shared_pool.usable_cpus = lambda: 2
-shared = shared_pool.SharedPool(pathlib.Path(sys.argv[1]), workers=None)
+from mjrec.rendering import pool
+pool.usable_cpus = lambda: 2
+shared = pool.SharedPool(pathlib.Path(sys.argv[1]), workers=None)
 print(shared.at_work().limit, flush=True)
 sys.stdin.read()
 """
 
 
-class Waited(Exception):
-    """Stands for a wait without an end."""
-
-
-def raise_waited(seconds: float) -> None:
-    raise Waited
-
-
 @pytest.fixture
 def two_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the machine have two CPUs."""
-    monkeypatch.setattr(shared_pool, "usable_cpus", lambda: 2)
-
-
-def pool_of(
-    directory: Path, wait: Callable[[float], object] = raise_waited
-) -> SharedPool:
-    return SharedPool(directory, workers=None, wait=wait)
-
-
-def hold_one(directory: Path) -> Lock:
-    """Take a CPU, as somebody else does on a machine with one."""
-    lock = try_lock(directory / render_lock_name(0), "1\n")
-    assert lock is not None
-    return lock
+    monkeypatch.setattr(pool_module, "usable_cpus", lambda: 2)
 
 
 @pytest.mark.usefixtures("two_cpus")
-def test_all_that_is_free_is_taken(
-    tmp_path: Path, names: Callable[[Path], list[str]]
-) -> None:
-    """By the first comer, and given back; a number of workers waits for nobody."""
-    other = hold_one(tmp_path)
-    first, second = pool_of(tmp_path), pool_of(tmp_path)
-    assert first.at_work().limit == 1
-    other.release()
-    assert first.at_work().limit == 2
-    assert names(tmp_path) == [f".openaigym.render.{k}.lock" for k in (0, 1)]
-    with pytest.raises(Waited):
-        second.at_work()
-    assert SharedPool(tmp_path, workers=3, wait=raise_waited).at_work().limit == 3
-    first.rest()
-    assert second.at_work().limit == 2
-    second.close()
-    assert names(tmp_path) == []
-
-
-@pytest.mark.usefixtures("two_cpus")
-def test_one_who_has_none_waits_for_the_first(tmp_path: Path) -> None:
-    """However long it takes."""
-    first = pool_of(tmp_path)
-    first.at_work()
-    waits: list[float] = []
-
-    def wait(seconds: float) -> None:
-        waits.append(seconds)
-        if len(waits) == 3:
-            first.rest()
-
-    assert pool_of(tmp_path, wait).at_work().limit == 2
-    assert len(waits) == 3
-
-
-@pytest.mark.usefixtures("two_cpus")
-def test_the_cpus_of_a_dead_process_are_free(tmp_path: Path) -> None:
-    """Though its files are still there."""
+def test_the_cpus_of_another_process_are_waited_for(tmp_path: Path) -> None:
+    """Until it rests or dies; the files of a dead one do not count."""
     with subprocess.Popen(
         [sys.executable, "-c", HOLDER, str(tmp_path)],
         stdin=subprocess.PIPE,
@@ -706,24 +513,12 @@ def test_the_cpus_of_a_dead_process_are_free(tmp_path: Path) -> None:
     ) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"2\n"
-        with pytest.raises(Waited):
-            pool_of(tmp_path).at_work()
-        holder.kill()
-    assert pool_of(tmp_path).at_work().limit == 2
-
-
-@pytest.mark.usefixtures("two_cpus")
-def test_workers_can_be_started_before_there_is_work(tmp_path: Path) -> None:
-    """As many as CPUs are free, which others may use until there is work."""
-    before = children()
-    pool = pool_of(tmp_path)
-    pool.start()
-    pool.start()
-    started = children() - before
-    assert len(started) == 2
-    assert pool_of(tmp_path).at_work().limit == 2
-    pool.close()
-    assert children() == before
+        threading.Timer(0.3, holder.kill).start()
+        began = time.monotonic()
+        shared = SharedPool(tmp_path, workers=None)
+        shared.at_work()
+    assert time.monotonic() - began >= 0.3
+    assert shared.at_work().limit == 2
 
 
 @pytest.mark.usefixtures("two_cpus")
@@ -731,12 +526,13 @@ def test_workers_stay_while_cpus_come_and_go(tmp_path: Path) -> None:
     """Others take one between two videos; nobody starts the workers anew."""
     ride = record(tmp_path)
     before = children()
-    shared = pool_of(tmp_path)
+    shared = SharedPool(tmp_path, workers=None)
     list(shared.at_work().frames(ride.path, range(4)))
     both = children() - before
     assert len(both) == 2
     shared.rest()
-    other = hold_one(tmp_path)
+    other = try_lock(tmp_path / render_lock_name(0), "1\n")
+    assert other is not None
     alone = list(shared.at_work().frames(ride.path, range(4)))
     other.release()
     together = list(shared.at_work().frames(ride.path, range(4)))
@@ -744,9 +540,3 @@ def test_workers_stay_while_cpus_come_and_go(tmp_path: Path) -> None:
     assert np.array_equal(alone, together)
     shared.close()
     assert children() == before
-
-
-def test_a_directory_that_is_gone(tmp_path: Path) -> None:
-    """It is one clear error."""
-    with pytest.raises(DirectoryNotWritable):
-        pool_of(tmp_path / "gone").at_work()

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import hashlib
 import json
 from collections.abc import Callable
@@ -27,8 +27,6 @@ from trajectories_by_hand import (
 )
 
 from mjrec import (
-    BlankVideo,
-    InvalidFrame,
     Monitor,
     NoPictures,
     UnreadableFile,
@@ -38,17 +36,15 @@ from mjrec import (
 from mjrec.annotation import Caption, annotated
 from mjrec.formats.frame_hashes import frame_hash_path
 from mjrec.formats.monitor_directory import trajectory_prefix
-from mjrec.formats.trajectory import StateComponent
+from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.formats.video_file import VideoFile
 from mjrec.formats.video_metadata import is_done, metadata_path
 from mjrec.rendering.finish import Finisher, bring_up_to_date, finish
-from mjrec.rendering.jobs import Variant, VideoJob
-from mjrec.rendering.recorded_facts import video_path
-from mjrec.rendering.recorded_frames import captions
-from mjrec.rendering.recordings import RecordingKey, look_at
+from mjrec.rendering.jobs import RecordingKey, VideoJob
+from mjrec.rendering.recorded_facts import captions, video_path
+from mjrec.rendering.recordings import look_at
 from mjrec.rendering.render_video import render_video
-from mjrec.rendering.views import View
+from mjrec.rendering.views import Variant, View
 
 STEM = "openaigym.video.0.7.video000000"
 ENDS = ("framehash", "meta.json", "mp4")
@@ -64,9 +60,8 @@ def render(
 ) -> Path:
     """Render the video of an episode, and return it."""
     workers = painter or Painter()
-    file = render_video([trajectory], variant, workers=workers, **options)
-    assert isinstance(file, VideoFile)
-    return file.path
+    done = render_video([trajectory], variant, workers=workers, **options)
+    return done.directory / next(iter(done.videos))
 
 
 def metadata_of(video: Path) -> dict[str, Any]:
@@ -205,7 +200,7 @@ def test_without_a_frame_there_is_metadata_or_an_error(
 ) -> None:
     """Where the recording says that it broke, there is nothing to wait for any more."""
     broken = write_log(tmp_path, frames=False, broken_reason="a marker")
-    assert render_video([broken], workers=Painter()) is None
+    assert not render_video([broken], workers=Painter()).videos
     metadata = metadata_of(tmp_path / f"{STEM}.mp4")
     assert (metadata["empty"], metadata["broken"]) == (True, True)
     refused = write_log(tmp_path, 1, frames=False, refusal="a plugin draws")
@@ -229,36 +224,15 @@ def test_a_trajectory_writes_no_video_but_its_own(name: Any, tmp_path: Path) -> 
         video_path(trajectory, {"video": {"name": name}})
 
 
-def test_a_failure_leaves_what_was_there(tmp_path: Path) -> None:
-    """The video of before stays, with its metadata, and nothing half-done."""
-    trajectory = write_finished(tmp_path)
-    render(trajectory)
-    files = {path: path.read_bytes() for path in tmp_path.iterdir()}
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    class Failing(Painter):
-        def frames(self, *arguments: Any, **more: Any) -> Any:
-            yield from list(super().frames(*arguments, **more))[:2]
-            yield None
-
-    with pytest.raises(KeyboardInterrupt):
-        render(trajectory, on_frame=interrupt)
-    with pytest.raises(InvalidFrame):
-        render(trajectory, Failing())
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == files
-
-
 def test_a_video_that_shows_nothing_says_so(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """In its metadata and in the log; with `strict` it is an error, and is kept."""
+    """In its metadata and in the log; with `strict` in the result, and it is kept."""
     trajectory, plain = write_finished(tmp_path), Painter(plain=True)
     assert metadata_of(render(trajectory, plain))["suspect_constant"] is True
     assert f"{STEM}.mp4 may show nothing: all 5 frames are of a single" in caplog.text
-    with pytest.raises(BlankVideo, match="single colour"):
-        render(trajectory, plain, strict=True)
+    done = render_video([trajectory], workers=plain, strict=True)
+    assert "single colour" in done.blank[f"{STEM}.mp4"]
     assert len(frames_of(tmp_path / f"{STEM}.mp4")) == 5
     sound = metadata_of(render(trajectory, strict=True))
     assert not {"suspect_black", "suspect_constant"} & set(sound)
@@ -280,15 +254,17 @@ def facts_of_the_video(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `write_log` write what a recorder says of several cameras."""
     import trajectories_by_hand
 
-    usual = trajectories_by_hand.TrajectoryHeader
+    usual = trajectories_by_hand.SpanLogs.begin
     keys = ("cameras", "tiled", "annotate", "also_named", "selection")
 
-    def header(*, facts: dict[str, Any], **rest: Any) -> Any:
+    def begin(
+        self: Any, name: str, facts: dict[str, Any], *rest: Any, **more: Any
+    ) -> Any:
         own = {key: facts.pop(key) for key in keys if key in facts}
         video = facts["video"] and {**facts["video"], **own}
-        return usual(facts={**facts, "video": video}, **rest)
+        return usual(self, name, {**facts, "video": video}, *rest, **more)
 
-    monkeypatch.setattr(trajectories_by_hand, "TrajectoryHeader", header)
+    monkeypatch.setattr(trajectories_by_hand.SpanLogs, "begin", begin)
 
 
 def test_each_camera_has_a_video(
@@ -337,19 +313,15 @@ def test_an_interruption_leaves_no_cameras_video(
     assert names(tmp_path) == [trajectory.name]
 
 
-def test_blank_videos_stop_no_other(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """With `strict`, the first is an error when all are there."""
+def test_blank_videos_stop_no_other(tmp_path: Path) -> None:
+    """With `strict`, all are named when all are there."""
     trajectory = write_with_cameras(tmp_path, annotate=True)
-    with pytest.raises(BlankVideo) as caught:
-        render(trajectory, Painter(plain=True), strict=True)
-    assert caught.value.path.name == SIDE
+    done = render_video([trajectory], workers=Painter(plain=True), strict=True)
+    assert set(done.blank) == set(done.videos) == {FIRST, SIDE, SECOND}
     assert is_done(tmp_path / FIRST)
     # However much is written on them.
     for name in (FIRST, SIDE, SECOND):
         assert metadata_of(tmp_path / name)["suspect_constant"] is True
-    assert f"{FIRST} may show nothing" in caplog.text
 
 
 def test_second_names_are_given_at_the_end(tmp_path: Path) -> None:
@@ -368,16 +340,6 @@ def test_second_names_are_given_at_the_end(tmp_path: Path) -> None:
         assert metadata_of(tmp_path / SIDE)["also_named"] == second.name
 
 
-def test_the_rule_of_the_choice_is_told(tmp_path: Path) -> None:
-    """Also of a video that is rendered another way: it is no typical episode."""
-    trajectory = write_with_cameras(tmp_path, selection={"rule": "worst:3"})
-    out = tmp_path / "x.mp4"
-    render(trajectory)
-    render(trajectory, variant=Variant(view=View(camera="top")), out=out)
-    for video in (tmp_path / FIRST, tmp_path / SIDE, out):
-        assert metadata_of(video)["selection"] == {"rule": "worst:3"}
-
-
 def test_all_videos_of_an_episode_are_counted_and_listed(
     tmp_path: Path, painter: Painter
 ) -> None:
@@ -385,11 +347,13 @@ def test_all_videos_of_an_episode_are_counted_and_listed(
     write_with_cameras(tmp_path)
     manifest, seen = write_pending_manifest(tmp_path, 0), []
     job = VideoJob.finishing(tmp_path, KEY)
-    with Finisher(tmp_path, workers=1, on_progress=seen.append) as finisher:
+    with contextlib.closing(
+        Finisher(tmp_path, workers=1, on_progress=seen.append)
+    ) as finisher:
         assert finisher.add(job)
         assert (finisher.progress.videos, finisher.progress.frames) == (3, 15)
-        _, outcome = finisher.do_next()
-    assert outcome.further_videos == (SIDE, SECOND)
+        _, result = finisher.do_next()
+    assert list(result.videos) == [FIRST, SIDE, SECOND]
     assert [progress.frames_done for progress in seen] == [0, *range(1, 16), 15]
     assert seen[-1].videos_done == 3
     assert look_at(tmp_path, KEY) is None
@@ -481,11 +445,10 @@ def test_captions_tell_time_by_what_is_known(tmp_path: Path) -> None:
     with open_trajectory(write_log(tmp_path, 1, steps=3, stride=2)) as reader:
         said = [(c.step, c.time) for c in captions(reader, [0, 1, 2])]
         assert said == [(0, 0.0), (2, 0.1), (3, 0.15)]
-        clock = dataclasses.replace(
-            reader.header, state=(StateComponent("time", 0, 1),)
-        )
+        facts, shown = reader.facts, reader.kind("snapshot")
+        clock = row_dtype(state=packed([("time", ("<f8", (1,)))]), snapshot=shown)
     logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
-    span = logs.begin(name, clock)
+    span = logs.begin(name, facts, clock)
     for step, (time, reward) in enumerate([(7.0, 0), (7.5, 0.25), (9.0, -1)]):
         add_row(span, step, reward=reward, state=time, snapshot=grey(step))
     logs.close()

@@ -179,7 +179,7 @@ def test_the_videos_are_rendered_of_what_was_chosen(folder: Path) -> None:
     """Manifest and metadata say so, and nothing is pending any more."""
     best = settle_best(folder)
     outcomes = list(finish(folder, workers=1))
-    assert [outcome.failure for outcome in outcomes] == [None]
+    assert [outcome.failures for outcome in outcomes] == [{}]
     assert videos_in(folder) == [best.episode_id]
     assert all(not each["pending"] for each in manifests_of(folder).values())
     [metadata] = folder.glob("*.meta.json")

@@ -17,7 +17,7 @@ from trajectory_contents import content_of
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment
 from mjrec.evidence.verification import Check, Verdict
-from mjrec.formats.trajectory import ModelChange, RowLayout
+from mjrec.formats.trajectory import ModelChange, packed
 from mjrec.formats.trajectory_file import open_trajectory
 
 needs_dm_control = pytest.mark.skipif(
@@ -85,29 +85,15 @@ def changed(field: str, rows: slice | int, by: float) -> Any:
 
     def edit(directory: Path) -> None:
         path = episode(directory)
-        with open_trajectory(path) as reader:
-            layout = reader.header.snapshot
 
-        def add(packed: Any) -> None:
-            values = column(layout, packed, field)
+        def add(snapshots: Any) -> None:
+            values = snapshots[field].reshape(len(snapshots), -1)
             values[rows, -1] += by
-            put(layout, packed, field, values)
+            snapshots[field] = values.reshape(snapshots[field].shape)
 
         forge(path, snapshots=add)
 
     return edit
-
-
-def column(layout: RowLayout, packed: Any, name: str) -> Any:
-    """Return the numbers of a field of packed snapshots."""
-    return layout.unpack(packed)[name].reshape(len(packed), -1)
-
-
-def put(layout: RowLayout, packed: Any, name: str, values: Any) -> None:
-    """Write the numbers of a field into packed snapshots."""
-    [field] = [field for field in layout.fields if field.name == name]
-    raw = np.ascontiguousarray(values).view(np.uint8).reshape(len(packed), -1)
-    packed[:, field.offset : field.offset + field.array.size] = raw
 
 
 @parametrize("name", ["HalfCheetah-v5", "Hopper-v5", "Ant-v5"])
@@ -211,12 +197,13 @@ def test_snapshots_that_are_not_of_the_model_fail(pusher: Path, tmp_path: Path) 
     path = episode(directory)
     with open_trajectory(path) as reader:
         content = content_of(reader)
-    kept = [f for f in content.header.snapshot.fields if f.name != "geom_xpos"]
-    layout = RowLayout.packed((field.name, field.array) for field in kept)
-    rows = np.concatenate(
-        [content.snapshots[:, f.offset : f.offset + f.array.size] for f in kept], axis=1
-    )
-    forge(path, snapshots=rows, snapshot=layout)
+    kinds = content.snapshots.dtype
+    kept = [name for name in kinds.names if name != "geom_xpos"]
+    snapshot = packed((name, kinds[name]) for name in kept)
+    rows = np.zeros(len(content.snapshots), snapshot)
+    for name in kept:
+        rows[name] = content.snapshots[name]
+    forge(path, snapshots=rows, snapshot=snapshot)
     check = of_pictures(directory)
     assert check.verdict is Verdict.FAIL
     assert "hold no geom_xpos" in check.reason

@@ -18,9 +18,9 @@ from trajectories_by_hand import INFIX, add_row, new_logs
 import mjrec
 from mjrec.errors import InvalidArgument, UnknownName, UnreadableFile
 from mjrec.formats.monitor_directory import trajectory_prefix
-from mjrec.formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
+from mjrec.formats.trajectory import ModelChange, packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.simulation.captured_arrays import STATE_SPEC, state_components
+from mjrec.simulation.captured_arrays import STATE_SPEC, state_dtype
 from mjrec.simulation.model_store import ModelStore
 
 HALF_CHEETAH = (
@@ -45,7 +45,7 @@ HEAP = """
 MODELS = {"half_cheetah": HALF_CHEETAH, "heap": HEAP}
 
 SUBSTEPS = 5
-SNAPSHOT = RowLayout.packed([("geom_xpos", Array("<f8", (2, 3)))])
+SNAPSHOT = packed([("geom_xpos", ("<f8", (2, 3)))])
 
 
 def state(model: Any, data: Any) -> Any:
@@ -72,18 +72,18 @@ class Recording:
         self.states: list[Any] = []
         self.actions = np.random.default_rng(5).uniform(-1, 1, (steps, model.nu))
         store = ModelStore(directory)
-        header = TrajectoryHeader(
-            facts={"model": store.add(model), "env_id": "Heap-v0", **facts},
-            state=state_components(model),
+        known = {"model": store.add(model), "env_id": "Heap-v0", **facts}
+        dtype = row_dtype(
+            state=state_dtype(model),
             snapshot=SNAPSHOT,
-            action=Array("<f8", (model.nu,)),
-            observation=Array("<f4", (3,)),
+            action=np.dtype(("<f8", (model.nu,))),
+            observation=np.dtype(("<f4", (3,))),
         )
         store.finish()
         logs = new_logs(directory)
         name = trajectory_prefix(INFIX, 3)
         self.path = logs.path_of(name)
-        self._span = logs.begin(name, header)
+        self._span = logs.begin(name, known, dtype)
         self._changes = changes or {}
         self._simulate(model, steps)
         self._span.end({"complete": True})
@@ -102,11 +102,11 @@ class Recording:
     def _add(self, model: Any, data: Any, step: int) -> None:
         if step in self._changes:
             fields = {k: np.asarray(v) for k, v in self._changes[step].items()}
-            self._span.add_change(ModelChange(step=step, fields=fields))
+            self._span.log.add_change(ModelChange(step=step, fields=fields))
         self.states.append(state(model, data))
         values = {"state": self.states[-1], "action": self.actions[max(step - 1, 0)]}
         if step % 2 == 0:
-            values["snapshot"] = np.full(6, step, np.float64).view(np.uint8)
+            values["snapshot"] = np.full(6, step, np.float64).view(np.uint64)
         ending = {"reward": 0.5 * step, "terminated": step == 12}
         add_row(self._span, step, observation=step, **values, **ending)
 
@@ -279,7 +279,7 @@ def test_a_log_that_was_finished_meanwhile_goes_on(tmp_path: Path) -> None:
 def test_a_recording_without_a_simulation_has_no_model(tmp_path: Path) -> None:
     """Its rewards are there all the same."""
     logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
-    span = logs.begin(name, TrajectoryHeader(facts={"model": None}))
+    span = logs.begin(name, {"model": None}, row_dtype())
     add_row(span, 0)
     add_row(span, 1, reward=2.5, terminated=True)
     trajectory = mjrec.load_trajectory(logs.path_of(name))

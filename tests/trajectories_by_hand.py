@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from mjrec.formats.in_flight import list_paths
 from mjrec.formats.manifest import Manifest, write_manifest
 from mjrec.formats.monitor_directory import (
     Infix,
@@ -23,12 +22,17 @@ from mjrec.formats.monitor_directory import (
     video_prefix,
 )
 from mjrec.formats.span_writer import SpanLogs, SpanWriter
-from mjrec.formats.trajectory import Array, RowLayout, StateComponent, TrajectoryHeader
+from mjrec.formats.spans import list_paths
+from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.rendering.views import View
 from mjrec.simulation.model_trust import directory_digest, note_models
 
 INFIX = Infix(0, "7")
+GREY_ROWS = row_dtype(
+    state=packed([("qpos", ("<f8", (1,)))]),
+    snapshot=packed([("geom_rgba", ("|u1", (1,)))]),
+)
 
 
 def grey(frame: int) -> int:
@@ -74,7 +78,9 @@ class Painter:
         self.asked.append((trajectory, list(indices), view))
         self.tiles.append(cameras)
         with open_trajectory(trajectory) as reader:
-            shown = [int(reader.snapshots(i, i + 1)[0, 0]) for i in indices]
+            shown = [
+                int(reader.snapshots(i, i + 1)["geom_rgba"][0, 0]) for i in indices
+            ]
         for index, brightness in enumerate(shown):
             self.breaks_at(trajectory, view, index)
             brighter = 0 if view.camera is None else 5
@@ -123,8 +129,11 @@ def write_log(
     **facts: Any,
 ) -> Path:
     """Record an episode at 20 steps a second; return the file that it would become."""
-    header = TrajectoryHeader(
-        facts={
+    logs = new_logs(directory, infix)
+    name = trajectory_prefix(infix, episode_id)
+    span = logs.begin(
+        name,
+        {
             "episode_id": episode_id,
             "infix": str(infix),
             "env_id": "Grey-v0",
@@ -146,17 +155,13 @@ def write_log(
             "stride": stride,
             **facts,
         },
-        state=(StateComponent("qpos", 0, 1),),
-        snapshot=RowLayout.packed([("geom_rgba", Array("|u1", (1,)))]),
+        GREY_ROWS,
     )
-    logs = new_logs(directory, infix)
-    name = trajectory_prefix(infix, episode_id)
-    span = logs.begin(name, header)
     taken = 0
     for step in range(steps + 1):
         values: dict[str, Any] = {}
         if frames and (step % stride == 0 or step == steps):
-            values["snapshot"] = [grey(taken), *[0] * 7]
+            values["snapshot"] = grey(taken)
             taken += 1
         last = ended and step == steps
         add_row(span, step, reward=0.5 * bool(step), truncated=last, **values)

@@ -6,12 +6,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from mjrec.formats.trajectory import ModelChange, TrajectoryHeader, TrajectoryReader
+from mjrec.formats.trajectory import ModelChange, TrajectoryReader
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrajectoryContent:
-    header: TrajectoryHeader
+    facts: dict[str, Any]
+    dtype: Any
     states: Any
     actions: Any
     rewards: Any
@@ -26,7 +27,8 @@ class TrajectoryContent:
 
 def content_of(reader: TrajectoryReader) -> TrajectoryContent:
     return TrajectoryContent(
-        header=reader.header,
+        facts=dict(reader.facts),
+        dtype=reader.dtype,
         states=reader.states(0, reader.row_count),
         actions=reader.actions(0, reader.step_count),
         rewards=reader.rewards,

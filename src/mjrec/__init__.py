@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from .monitors.vector_monitor import VectorMonitor as VectorMonitor
     from .recorder.stats_recorder import StatsRecorder as StatsRecorder
     from .recorder.video_recorder import VideoRecorder as VideoRecorder
+    from .rendering.jobs import RenderedVideos as RenderedVideos
     from .rendering.recovery import Recovery as Recovery
     from .rendering.recovery import recover as recover
     from .rendering.render_frames import render as render
     from .rendering.render_frames import render_states as render_states
-    from .rendering.render_videos import RenderedVideos as RenderedVideos
     from .rendering.render_videos import render_videos as render_videos
     from .reporting.film_strips import film_strip as film_strip
     from .reporting.report_folder import write_report as write_report
@@ -82,7 +82,8 @@ _NAMES = {
     "recorder.video_recorder": "VideoRecorder",
     "rendering.recovery": "Recovery recover",
     "rendering.render_frames": "render render_states",
-    "rendering.render_videos": "RenderedVideos render_videos",
+    "rendering.jobs": "RenderedVideos",
+    "rendering.render_videos": "render_videos",
     "reporting.film_strips": "film_strip",
     "reporting.report_folder": "write_report",
     "results": (

@@ -15,9 +15,9 @@ from .. import json_text
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
 from ..monitors.progress import render_progress
-from ..rendering.jobs import Outcome, Variant
-from ..rendering.render_videos import RenderedVideos, iter_rendered_videos
-from ..rendering.views import View
+from ..rendering.jobs import RenderedVideos
+from ..rendering.render_videos import iter_rendered_videos
+from ..rendering.views import Variant, View
 from .counted import counted
 from .engine_options import NO_ENGINE, EngineOptions
 from .help_text import flowing_help
@@ -103,7 +103,7 @@ def render(
     engine = engine_options.chosen(workers)
     console = rich.console.Console(quiet=as_json)
     with render_progress(console) as on_progress:
-        outcomes = iter_rendered_videos(
+        results = iter_rendered_videos(
             target,
             variant,
             episode=episode,
@@ -114,8 +114,8 @@ def render(
             engine=engine,
             on_progress=on_progress,
         )
-        done, is_interrupted = _collect(outcomes, console)
-    report = RenderedVideos.of(done, target if target.is_dir() else target.parent)
+        done, is_interrupted = _collect(results, console)
+    report = RenderedVideos.joined(done, target if target.is_dir() else target.parent)
     nothing = report.is_empty and not is_interrupted
     if nothing and (episode is not None or not target.is_dir()):
         raise InvalidArgument(
@@ -133,21 +133,19 @@ def render(
 
 
 def _collect(
-    outcomes: Iterable[Outcome], console: rich.console.Console
-) -> tuple[list[Outcome], bool]:
-    """Say of each video that it is there; return what became of all.
+    results: Iterable[RenderedVideos], console: rich.console.Console
+) -> tuple[list[RenderedVideos], bool]:
+    """Say of each video that it is there; return all results.
 
     Returns:
         That, and whether Ctrl-C came before the end.
     """
     done = []
     try:
-        for outcome in outcomes:
-            done.append(outcome)
-            if outcome.is_video:
-                frames = counted(outcome.frame_count, "frame")
-                for name in (outcome.name, *outcome.further_videos):
-                    _print(console, f"{name}: {frames}")
+        for result in results:
+            done.append(result)
+            for name, count in result.videos.items():
+                _print(console, f"{name}: {counted(count, 'frame')}")
     except KeyboardInterrupt:
         return done, True
     return done, False

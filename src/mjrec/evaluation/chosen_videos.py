@@ -9,10 +9,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..rendering.finish import bring_up_to_date, finish
-from ..rendering.progress import Progress
-from ..rendering.recordings import RecordingKey
+from ..rendering.jobs import Progress, RecordingKey
 from .evaluation import EvaluationProgress
-from .following import TaskRun
+from .following import TaskRun, not_drawn
 
 logger = logging.getLogger(__name__)
 
@@ -99,12 +98,9 @@ def _render(
     show: Callable[[Progress], object],
 ) -> dict[str, str]:
     """Return why videos are not there, or show nothing, by their names."""
-    outcomes = finish(folder, keys, workers=workers, on_progress=show)
-    reasons = {
-        outcome.name: outcome.failure or "Another process is drawing it."
-        for outcome in outcomes
-        if outcome.failure is not None or outcome.is_elsewhere
-    }
+    reasons: dict[str, str] = {}
+    for result in finish(folder, keys, workers=workers, on_progress=show):
+        reasons |= not_drawn(result)
     return _told(folder, reasons)
 
 

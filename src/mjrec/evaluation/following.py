@@ -20,9 +20,9 @@ from ..child_python import unpacked
 from ..engines.work import Job, JobOutcome, Run
 from ..errors import EnvironmentNotMade, PicturesDiffer
 from ..formats.monitor_directory import Infix
-from ..rendering.engine_jobs import outcome_of
-from ..rendering.jobs import VideoJob
-from ..rendering.recordings import RecordingKey, may_be_left
+from ..rendering.engine_jobs import result_of
+from ..rendering.jobs import RecordingKey, RenderedVideos, VideoJob
+from ..rendering.recordings import may_be_left
 from ..simulation.model_trust import note_models
 from .episode_results import EpisodeResult
 from .evaluation import EvaluationProgress
@@ -333,12 +333,7 @@ class _Runner:
         key = self._recordings[outcome.key]
         folder = self._directory / of.task.folder
         of.videos_done += 1
-        drawn = outcome_of(outcome, VideoJob.finishing(folder, key))
-        if drawn is None:
-            return
-        reason = "Another process is drawing it." if drawn.is_elsewhere else None
-        if (reason := drawn.failure or reason) is not None:
-            of.not_drawn[drawn.name] = reason
+        of.not_drawn |= not_drawn(result_of(outcome, VideoJob.finishing(folder, key)))
 
     def _progress(self) -> EvaluationProgress:
         plan = self._plan
@@ -354,6 +349,12 @@ class _Runner:
             videos_done=sum(of.videos_done for of in self._settled),
             videos=sum(of.videos for of in self._settled),
         )
+
+
+def not_drawn(result: RenderedVideos) -> dict[str, str]:
+    """Return why videos are not there, or show nothing, by their names."""
+    elsewhere = dict.fromkeys(result.elsewhere, "Another process is drawing it.")
+    return {**result.failures, **result.blank, **elsewhere}
 
 
 def _in_short(failure: str) -> str:

@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Container
 from pathlib import Path
 
-from ..formats.in_flight import recordings_in_flight
 from ..formats.json_fields import field, read_object, text
 from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
+from ..formats.spans import recordings_in_flight
 from ..formats.video_metadata import metadata_path
 from .episode_results import EpisodeResult
 from .result_columns import ResultVideo

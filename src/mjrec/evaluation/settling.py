@@ -16,12 +16,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..errors import Error, FileNotWritten
-from ..formats.in_flight import add_facts, is_in_flight
 from ..formats.journal import JournalWriter
 from ..formats.locks import is_locked
 from ..formats.manifest import Manifest, read_manifest
@@ -32,15 +31,16 @@ from ..formats.monitor_directory import (
     manifest_name,
     video_prefix,
 )
-from ..formats.spans import FINISHED
+from ..formats.spans import FINISHED, add_facts, is_in_flight
 from ..formats.trajectory_file import (
     amend_trajectory,
     find_trajectory,
     finish_trajectory,
 )
 from ..formats.video_metadata import is_done
+from ..rendering.jobs import RecordingKey
 from ..rendering.recorded_facts import open_for_rendering
-from ..rendering.recordings import RecordingKey, claim, recorded_episodes
+from ..rendering.recordings import claim, recorded_episodes
 from ..results.manifest_and_stats import manifest_lock, write_manifest_and_stats
 from ..results.run import Run
 
@@ -203,12 +203,13 @@ def _settle_episode(folder: Path, key: RecordingKey, verdicts: _Verdicts) -> boo
     """Settle an episode, and return whether it has a video, or will have."""
     path = folder / f"{key.name}{FINISHED}"
     with open_for_rendering(path) as reader:
-        facts = dict(reader.header.facts)
+        facts = dict(reader.facts)
     if facts.get("candidate") is True:
         verdict = verdicts.facts(key.number, facts.get("video") or {})
-        amend: Callable[[Path, Mapping[str, Any]], None]
-        amend = amend_trajectory if path.exists() else add_facts
-        amend(path, verdict)
+        if path.exists():
+            amend_trajectory(path, lambda known: {**known, **verdict})
+        else:
+            add_facts(path, verdict)
         facts.update(verdict)
     if is_in_flight(path):
         finish_trajectory(path)

@@ -97,13 +97,8 @@ class RowLog:
         Raises:
             FileNotWritten: the disk is full; all rows so far are kept.
         """
-        self._write()
+        self.write()
         self.limit = self.count + (self.capacity if self._is_mapped else 0)
-
-    def commit(self) -> None:
-        """Count the row that was filled, and have it survive this process."""
-        self.counter[0] = self.count = self.count + 1
-        self.settle()
 
     def settle(self) -> None:
         """Write the counted rows where no tail keeps them.
@@ -112,7 +107,7 @@ class RowLog:
             FileNotWritten: the disk is full; they stay in memory.
         """
         if not self._is_mapped:
-            self._write()
+            self.write()
 
     @property
     def is_open(self) -> bool:
@@ -127,7 +122,7 @@ class RowLog:
         """
         if not self.is_open:
             return
-        self._write()
+        self.write()
         self.release()
         with contextlib.suppress(OSError):
             # Where it stays it does no harm: it says nothing that the log does not.
@@ -139,7 +134,12 @@ class RowLog:
             os.close(self._log)
             self._log = -1
 
-    def _write(self) -> None:
+    def write(self) -> None:
+        """Write the rows that the log lacks.
+
+        Raises:
+            FileNotWritten: the disk is full; they stay in memory.
+        """
         with self._naming_errors():
             while self._written < self.count:
                 first = self._written % self.capacity

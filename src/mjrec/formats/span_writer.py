@@ -17,33 +17,35 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
-from .in_flight import remove_if_done, remove_list
-from .model_changes import pack_change
+from ..errors import DirectoryNotWritable, FileNotWritten
 from .monitor_directory import Infix, states_name
 from .row_log import TAIL_BYTES, RowLog
 from .spans import (
     FINISHED,
-    FRAME,
-    HEAD_WORDS,
+    FORMAT,
     LOG,
     LOOKS,
+    append_line,
+    remove_if_done,
+    remove_list,
+)
+from .trajectory import (
+    FORMAT_VERSION,
+    FRAME,
+    HEAD_WORDS,
     STEP,
     TERMINATED,
     TRUNCATED,
-    append_line,
-    first_line,
-    row_dtype,
+    ModelChange,
 )
-from .trajectory import ModelChange, TrajectoryHeader
+from .trajectory_log import pack_change
 
 # A new log begins with the next recording then.
 _LONG = 64 << 20
 
-# How a change of the model begins: the row that it holds from, and its length.
-LOOK_PREFIX = struct.Struct("<QQ")
 ROW_HEAD = struct.Struct("=qqdQ")
 
 
@@ -76,25 +78,30 @@ class SpanLogs:
         return self.directory / f"{name}{FINISHED}"
 
     def begin(
-        self, name: str, header: TrajectoryHeader, *, alone: bool = False
+        self,
+        name: str,
+        facts: Mapping[str, Any],
+        dtype: np.dtype[Any],
+        *,
+        alone: bool = False,
     ) -> SpanWriter:
         """Begin a recording.
 
         Args:
             name: of its file, without suffix.
-            header: what is known of it, and what its rows look like.
+            facts: what is known of it.
+            dtype: of its rows, from `row_dtype`.
             alone: it gets a log of its own, to be removed with it.
 
         Raises:
-            InvalidArgument: no file could hold such rows.
             FileNotWritten: the disk is full, or the directory is gone.
         """
-        if self._log is not None and (alone or not self._log.suits(header)):
+        if self._log is not None and (alone or not self._log.suits(dtype)):
             self.close()
         if self._log is None:
             path = self.directory / states_name(self._infix, next(self._numbers))
-            self._log = OpenLog(path, header, tail_bytes=self._tail_bytes)
-        span = SpanWriter(self._log, name, header.facts)
+            self._log = OpenLog(path, facts, dtype, tail_bytes=self._tail_bytes)
+        span = SpanWriter(self._log, name, facts)
         if alone:
             self._log.is_alone = True
         return span
@@ -111,7 +118,7 @@ class SpanLogs:
         try:
             log.close()
         finally:
-            if log.is_released:
+            if not log.rows.is_open:
                 self._log = None
 
     def release(self) -> None:
@@ -126,27 +133,32 @@ class OpenLog:
 
     Attributes:
         path: of the list.
+        facts: of the first recording.
         rows: the log itself.
-        columns: what the slots of its tail hold, by the names of `row_dtype`.
+        columns: what the slots of its tail hold: `state` as float64, `snapshot` in
+            words, `action` and `observation`; what rows do not have is not there.
         bodies: for each slot all words behind its head.
         is_alone: it is one recording's only.
-        is_released: nothing is written any more.
+        look_size: the bytes of all changes of the model so far.
     """
 
     def __init__(
-        self, path: Path, header: TrajectoryHeader, *, tail_bytes: int
+        self,
+        path: Path,
+        facts: Mapping[str, Any],
+        dtype: np.dtype[Any],
+        *,
+        tail_bytes: int,
     ) -> None:
-        try:
-            line = first_line(header)
-        except ValueError as error:
-            raise InvalidArgument(f"A trajectory cannot be written: {error}.") from None
         self.path = path
-        self.is_alone = self.is_released = False
-        self.facts = header.facts
-        self._described = _described(header)
-        dtype = row_dtype(header)
+        self.facts = facts
+        self.is_alone = False
+        self.look_size = 0
+        self._dtype = dtype
+        self._looks: int | None = None
+        line = {"format": FORMAT, "version": FORMAT_VERSION, "rows": dtype.descr}
         # First of all, so that whatever a killed process leaves is found.
-        append_line(path, line, is_first=True)
+        append_line(path, {**line, "facts": dict(facts)}, is_first=True)
         try:
             self.rows = RowLog(
                 path.with_suffix(LOG), dtype.itemsize // 8, tail_bytes=tail_bytes
@@ -155,30 +167,18 @@ class OpenLog:
             remove_list(path)
             raise
         slots = self.rows.slots
-        rows = slots.view(dtype)[:, 0]
-        self.columns: dict[str, NDArray[Any]] = {n: rows[n] for n in dtype.names or ()}
         self.bodies = [slots[k, HEAD_WORDS:] for k in range(self.rows.capacity)]
-        self._looks: int | None = None
-        self._look_size = 0
+        self.columns: dict[str, NDArray[Any]] = {}
+        for name, (kind, offset, *_) in (dtype.fields or {}).items():
+            words = slots[:, offset // 8 : (offset + kind.itemsize) // 8]
+            whole = {"state": words.view(np.float64), "snapshot": words}
+            self.columns[name] = whole.get(name, slots.view(dtype)[:, 0][name])
 
-    @property
-    def look_size(self) -> int:
-        """The bytes of all changes of the model so far."""
-        return self._look_size
-
-    def suits(self, header: TrajectoryHeader) -> bool:
+    def suits(self, dtype: np.dtype[Any]) -> bool:
         """Tell whether a recording with such rows can go on in this log."""
-        is_short = self.rows.size + self._look_size < _LONG
+        is_short = self.rows.size + self.look_size < _LONG
         is_free = self.rows.is_open and not self.is_alone
-        return is_short and is_free and self._described == _described(header)
-
-    def say(self, **values: Any) -> None:
-        """Add a line to the list.
-
-        Raises:
-            FileNotWritten: the disk is full; nothing was added.
-        """
-        append_line(self.path, values)
+        return is_short and is_free and self._dtype == dtype
 
     def add_change(self, change: ModelChange) -> None:
         """Add a change of the model that holds from the next row on.
@@ -187,18 +187,17 @@ class OpenLog:
             InvalidArgument: it cannot be written down.
             FileNotWritten: the disk is full; nothing was added.
         """
-        packed = pack_change(change)
-        record = LOOK_PREFIX.pack(self.rows.count, len(packed)) + packed
+        record = pack_change(self.rows.count, change)
         path = self.path.with_suffix(LOOKS)
         try:
             if self._looks is None:
                 self._looks = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-            if os.pwrite(self._looks, record, self._look_size) != len(record):
-                os.ftruncate(self._looks, self._look_size)
+            if os.pwrite(self._looks, record, self.look_size) != len(record):
+                os.ftruncate(self._looks, self.look_size)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise FileNotWritten(path, error.strerror or error) from error
-        self._look_size += len(record)
+        self.look_size += len(record)
 
     def close(self) -> None:
         """Write the last rows, and remove the files if nothing is in flight.
@@ -207,13 +206,14 @@ class OpenLog:
             FileNotWritten: the disk is full; the next call tries again.
         """
         try:
-            self.rows.close()
-            self.say(closed=True)
+            self.rows.write()
+            append_line(self.path, {"closed": True})
         except FileNotWritten:
             if not self.path.exists():
                 # The directory was removed; there is nothing to try again.
                 self.release()
             raise
+        self.rows.close()
         self.release()
         with contextlib.suppress(DirectoryNotWritable):
             # The next one that finishes a recording tries again.
@@ -221,7 +221,6 @@ class OpenLog:
 
     def release(self) -> None:
         """Let go of the files as they are. Idempotent."""
-        self.is_released = True
         self.rows.release()
         if self._looks is not None:
             os.close(self._looks)
@@ -253,19 +252,15 @@ class SpanWriter:
         self._name = name
         self._first_row = log.rows.count
         self._unsaid: dict[str, Any] = {}
-        self._ending: Mapping[str, Any] | None = None
+        self._ending: dict[str, Any] | None = None
         self._has_ended = self._is_dropped = False
         own = {
             k: v for k, v in facts.items() if k not in log.facts or log.facts[k] != v
         }
         without = [key for key in log.facts if key not in facts]
-        log.say(
-            begin=name,
-            row=self._first_row,
-            look=log.look_size,
-            facts=own,
-            **({"without": without} if without else {}),
-        )
+        line = {"begin": name, "row": self._first_row, "look": log.look_size}
+        line |= {"facts": own, **({"without": without} if without else {})}
+        append_line(log.path, line)
 
     @property
     def size(self) -> int:
@@ -322,20 +317,11 @@ class SpanWriter:
             self.frame_count += 1
         rows.settle()
 
-    def add_change(self, change: ModelChange) -> None:
-        """Add a change of the model, before the row that shows it.
-
-        Raises:
-            InvalidArgument: it cannot be written down.
-            FileNotWritten: the disk is full; nothing was added.
-        """
-        self.log.add_change(change)
-
     def note(self, facts: Mapping[str, Any]) -> None:
         """Add to the facts; on a full disk they wait for the next note or the end."""
         self._unsaid.update(facts)
         with contextlib.suppress(FileNotWritten):
-            self.log.say(note=self._name, facts=self._unsaid)
+            append_line(self.log.path, {"note": self._name, "facts": self._unsaid})
             self._unsaid = {}
 
     def end(self, facts: Mapping[str, Any]) -> None:
@@ -346,11 +332,10 @@ class SpanWriter:
         """
         if self._ending is None:
             # Others may follow before it can be said.
-            self._stop = self.log.rows.count
-            self._ending = dict(facts)
+            ending = {"end": self._name, "row": self.log.rows.count}
+            self._ending = {**ending, "facts": {**self._unsaid, **facts}}
         if not self._has_ended:
-            said = {**self._unsaid, **self._ending}
-            self.log.say(end=self._name, row=self._stop, facts=said)
+            append_line(self.log.path, self._ending)
             self._has_ended = True
 
     def drop(self) -> None:
@@ -360,12 +345,5 @@ class SpanWriter:
             FileNotWritten: the disk is full.
         """
         if not self._is_dropped:
-            self.log.say(drop=self._name)
+            append_line(self.log.path, {"drop": self._name})
             self._is_dropped = True
-
-
-_Described = tuple[Any, ...]
-
-
-def _described(header: TrajectoryHeader) -> _Described:
-    return header.state, header.snapshot, header.action, header.observation

@@ -5,7 +5,7 @@ A recording in flight is a span of rows: an episode, or a clip's part that is of
 episode. `openaigym.states.<infix>.<number>.spans` lists those of one row log, a line of
 JSON each time something happens::
 
-    {"format": "mjrec spans", "version": 1, "rows": {...}, "facts": {...}}
+    {"format": "mjrec spans", "version": 1, "rows": [["row", "<i8"], ...], "facts": {}}
     {"begin": "openaigym.trajectory.0.7.episode000027", "row": 54, "look": 0,
      "facts": {...}, "without": [...]}
     {"note": "openaigym.trajectory.0.7.episode000027", "facts": {...}}
@@ -17,6 +17,8 @@ The facts of the first line are those of every recording, as far as `begin` does
 otherwise. A span without an end goes on to the last row. The `.log` beside it has the
 rows, the `.looks` the changes of the model. When all recordings are dropped, or have
 become files of their own, all of these are removed.
+
+A recording is called by the path of the file that it will become.
 """
 
 from __future__ import annotations
@@ -24,74 +26,35 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
-from dataclasses import field as attribute
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..errors import FileNotWritten
+from ..errors import DirectoryNotWritable, FileNotWritten, UnreadableFile
 from ..json_text import dumps
-from .json_fields import (
-    base_name,
-    field,
-    integer,
-    json_object,
-    list_of,
-    mapping,
-    text,
-)
+from .json_fields import base_name, integer, json_object, mapping, unreadable
+from .locks import is_locked
 from .monitor_directory import (
     ClipPart,
+    Infix,
     episode_of,
     infix_of,
+    lock_name,
+    names_in,
 )
 from .regular_files import open_regular
-from .trajectory import (
-    FORMAT_VERSION,
-    TrajectoryHeader,
-    check_version,
-    header_from_json,
-    layout_to_json,
-)
+from .row_log import tail_path
+from .trajectory import check_version, dtype_from_json
 
 FORMAT = "mjrec spans"
 SPANS, LOG, LOOKS, FINISHED = ".spans", ".log", ".looks", ".h5"
 
-# In the flags of a row.
-TERMINATED, TRUNCATED, STEP, FRAME = 1, 2, 4, 8
-# Words before the state: the row's number, the step, the reward, the flags.
-HEAD_WORDS = 4
-
 _LONGEST_LINE = 1 << 26
-
-
-def row_dtype(header: TrajectoryHeader) -> np.dtype[Any]:
-    """Return what a row of a log holds; `snapshot` as bytes, packed as the layout says.
-
-    `row` is its own number, `step` counts from the recording's reset, and `flags` tell
-    whether it is a step's, a frame's, or both.
-    """
-    members: list[tuple[str, str, tuple[int, ...]]] = [
-        *(("row", "<i8", ()), ("step", "<i8", ())),
-        *(("reward", "<f8", ()), ("flags", "<u8", ())),
-        ("state", "<f8", (header.state_length,)),
-        ("snapshot", "|u1", (header.snapshot.size,)),
-    ]
-    for name, kind in (("action", header.action), ("observation", header.observation)):
-        if kind is not None:
-            members.append((name, kind.dtype, kind.shape))
-    offsets, offset = [], 0
-    for _, dtype, shape in members:
-        offsets.append(offset)
-        size = np.dtype(dtype).itemsize * int(np.prod(shape, dtype=int))
-        offset += -(-size // 8) * 8
-    names, formats = [m[0] for m in members], [m[1:] for m in members]
-    return np.dtype(
-        {"names": names, "formats": formats, "offsets": offsets, "itemsize": offset}
-    )
 
 
 @dataclass
@@ -136,19 +99,19 @@ class SpanList:
 
     Attributes:
         path: of the list.
-        header: what its rows look like, and the facts of every recording.
-        recordings: by their names.
+        dtype: of its rows; None before its first line is there.
+        facts: of every recording.
+        recordings: by their names, in the order of their rows.
         is_closed: no row is added any more.
     """
 
     path: Path
-    header: TrajectoryHeader | None = None
-    recordings: dict[str, Recording] = attribute(default_factory=dict)
+    dtype: np.dtype[Any] | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    recordings: dict[str, Recording] = field(default_factory=dict)
     is_closed: bool = False
     _first: bytes = b""
     _offset: int = 0
-    # Size and time of change when it was read.
-    _seen: tuple[int, int] = (0, 0)
 
     @property
     def log(self) -> Path:
@@ -156,119 +119,71 @@ class SpanList:
         return self.path.with_suffix(LOG)
 
     @property
-    def looks(self) -> Path:
-        """The changes of the model."""
-        return self.path.with_suffix(LOOKS)
-
-    @property
     def is_headless(self) -> bool:
         """Whether rows are there, and nothing says what they are."""
         rows = self.log.stat().st_size if self.log.exists() else 0
-        return self.header is None and rows > 0
+        return self.dtype is None and rows > 0
 
     def in_flight(self) -> list[Recording]:
         """Return the recordings that only the log has."""
-        return [each for each in list(self.recordings.values()) if each.is_in_flight]
+        return [each for each in self.recordings.values() if each.is_in_flight]
 
-    def read_on(self, status: os.stat_result) -> bool:
-        """Read what was added since; tell whether it is the same list still.
-
-        Args:
-            status: the file's, before.
+    def read_on(self, file: BinaryIO) -> bool:
+        """Read what was added; tell whether the file is the one that was read before.
 
         Raises:
-            OSError: there is no such file.
             ValueError: it is no such list, or of a newer format.
         """
-        seen = status.st_size, status.st_mtime_ns
-        if seen == self._seen:
-            return True
-        with open_regular(self.path) as file:
-            # Names and inodes are given anew, where `force` removes what there was.
-            is_longer = status.st_size > self._offset or not self._first
-            if not is_longer or file.read(len(self._first)) != self._first:
-                return False
-            file.seek(self._offset)
-            while line := file.readline(
-                min(_LONGEST_LINE, status.st_size - self._offset)
-            ):
-                if not line.endswith(b"\n"):
-                    # It is being written, or its writer was killed.
-                    break
-                # In this order: what an error or Ctrl-C cuts short is taken again.
-                self._take(line)
-                self._first = self._first or line
-                self._offset += len(line)
-        self._seen = seen
+        # Names and inodes are given anew, where `force` removes what there was.
+        size = os.fstat(file.fileno()).st_size
+        if size < self._offset or file.read(len(self._first)) != self._first:
+            return False
+        file.seek(self._offset)
+        while line := file.readline(min(_LONGEST_LINE, size - self._offset)):
+            if not line.endswith(b"\n"):
+                # It is being written, or its writer was killed.
+                break
+            # In this order: what an error or Ctrl-C cuts short is taken again.
+            self._take(line)
+            self._first = self._first or line
+            self._offset += len(line)
         return True
 
     def _take(self, line: bytes) -> None:
-        if self.header is None:
+        if self.dtype is None:
             values = json_object(line)
             if values.get("format") != FORMAT:
                 raise ValueError("it is no list of spans")
-            check_version(field(values, "version", integer))
-            facts, rows = (
-                field(values, "facts", mapping),
-                field(values, "rows", mapping),
-            )
-            self.header = header_from_json(facts, rows)
+            check_version(integer(values.get("version")))
+            self.facts = mapping(values.get("facts"))
+            self.dtype = dtype_from_json(values.get("rows"))
             return
-        try:
-            values = json_object(line)
-            self._take_event(self.header.facts, values)
-        except ValueError:
-            # The end of a line whose writer was killed: nothing follows from it.
-            return
+        # The end of a line whose writer was killed: nothing follows from it.
+        with contextlib.suppress(ValueError, LookupError, TypeError):
+            self._take_event(json_object(line))
 
-    def _take_event(self, common: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    def _take_event(self, values: Mapping[str, Any]) -> None:
         if values.get("closed") is True:
             self.is_closed = True
         elif "begin" in values:
-            without = list_of(text)(values.get("without") or [])
-            facts = {k: v for k, v in common.items() if k not in without}
-            name = field(values, "begin", self._name)
+            name = base_name(values["begin"])
+            if infix_of_recording(name) != infix_of(self.path.name):
+                raise ValueError(f"{name!r:.100} is no recording of its monitor")
+            without = values.get("without", ())
+            common = {k: v for k, v in self.facts.items() if k not in without}
+            facts = {**common, **mapping(values["facts"])}
+            row, look = _count(values["row"]), _count(values["look"])
             # In the order of their rows, also where one is begun anew.
             self.recordings.pop(name, None)
-            self.recordings[name] = Recording(
-                name,
-                self,
-                {**facts, **field(values, "facts", mapping)},
-                row=field(values, "row", _count),
-                look=field(values, "look", _count),
-            )
+            self.recordings[name] = Recording(name, self, facts, row, look)
         elif "drop" in values:
-            self._named(values, "drop").is_dropped = True
+            self.recordings[values["drop"]].is_dropped = True
         elif "end" in values:
-            ended = self._named(values, "end")
-            ended.stop = field(values, "row", _count)
-            ended.facts.update(field(values, "facts", mapping))
+            recording = self.recordings[values["end"]]
+            recording.stop = _count(values["row"])
+            recording.facts.update(mapping(values["facts"]))
         elif "note" in values:
-            self._named(values, "note").facts.update(field(values, "facts", mapping))
-
-    def _name(self, value: Any) -> str:
-        """Return the name of a recording of this monitor."""
-        name = base_name(f"{text(value)}{FINISHED}").removesuffix(FINISHED)
-        is_ours = infix_of_recording(name) == infix_of(self.path.name)
-        if not is_ours:
-            raise ValueError(f"{name!r:.100} is no recording of its monitor")
-        return name
-
-    def _named(self, values: Mapping[str, Any], key: str) -> Recording:
-        name = field(values, key, text)
-        if name not in self.recordings:
-            raise ValueError(f"it has no recording {name!r:.100}")
-        return self.recordings[name]
-
-
-def first_line(header: TrajectoryHeader) -> dict[str, Any]:
-    """Return what a list of spans begins with."""
-    return {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "rows": layout_to_json(header),
-        "facts": dict(header.facts),
-    }
+            self.recordings[values["note"]].facts.update(mapping(values["facts"]))
 
 
 def append_line(
@@ -280,16 +195,15 @@ def append_line(
         FileNotWritten: the disk is full, and the list says what it said before; or
             the line is longer than any that is read.
     """
+    flags = os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW
+    flags |= os.O_CREAT | os.O_EXCL if is_first else 0
     try:
-        flags = os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW
-        flags |= os.O_CREAT | os.O_EXCL if is_first else 0
         descriptor = os.open(path, flags, 0o666)
         try:
             size = os.fstat(descriptor).st_size
-            torn = size and os.pread(descriptor, 1, size - 1) != b"\n"
             line = dumps(dict(values)).encode() + b"\n"
-            if torn:
-                # So that it says nothing, also where nothing but its end is missing.
+            if size and os.pread(descriptor, 1, size - 1) != b"\n":
+                # The torn end says nothing, also where nothing but its end is missing.
                 line = b"?\n" + line
             if len(line) > _LONGEST_LINE:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
@@ -315,9 +229,192 @@ def _take_back(descriptor: int, written: int) -> None:
 
 def infix_of_recording(name: str) -> str | None:
     """Return the infix in a recording's name; None where it is none."""
-    is_part = ClipPart.parse(name) is not None
-    is_known = is_part or episode_of(f"{name}{FINISHED}") is not None
-    return infix_of(name if is_part else f"{name}{FINISHED}") if is_known else None
+    if ClipPart.parse(name) is not None:
+        return infix_of(name)
+    path = f"{name}{FINISHED}"
+    return None if episode_of(path) is None else infix_of(path)
+
+
+class _Known(threading.local):
+    """What a thread has read of directories and lists."""
+
+    def __init__(self) -> None:
+        # When a directory had changed last, and the names that it had then.
+        self.directory: tuple[Path, int, list[str]] | None = None
+        self.lists: dict[Path, SpanList] = {}
+
+
+_known = _Known()
+_MOST_LISTS = 32
+# A directory's time stands still for moments in which it changes.
+_SETTLED_NS = 1_000_000_000
+
+
+def list_paths(directory: Path, infix: Infix | str | None = None) -> Iterator[Path]:
+    """Return the paths of the lists of a directory, or of one monitor in it."""
+    for name in _list_names(directory):
+        own = infix_of(name)
+        if own is not None and (infix is None or own == str(infix)):
+            yield directory / name
+
+
+def _list_names(directory: Path) -> list[str]:
+    # Each recording is looked for by itself, and there may be thousands of files.
+    changed, now = directory.stat().st_mtime_ns, time.time_ns()
+    if _known.directory is not None and _known.directory[:2] == (directory, changed):
+        return _known.directory[2]
+    names = sorted(name for name in names_in(directory) if name.endswith(SPANS))
+    is_settled = now - changed > _SETTLED_NS
+    _known.directory = (directory, changed, names) if is_settled else None
+    return names
+
+
+def read_list(path: Path) -> SpanList:
+    """Return a list as it is now.
+
+    Raises:
+        UnreadableFile: it is no such list, or of a newer format, or there is no such
+            file.
+    """
+    with unreadable(path), open_regular(path) as file:
+        spans = _known.lists.pop(path, None)
+        if spans is None or not spans.read_on(file):
+            file.seek(0)
+            spans = SpanList(path)
+            spans.read_on(file)
+        # The oldest goes first.
+        _known.lists[path] = spans
+        if len(_known.lists) > _MOST_LISTS:
+            _known.lists.pop(next(iter(_known.lists)))
+        return spans
+
+
+def find_recording(path: Path) -> Recording | None:
+    """Return a recording that is not dropped, by the path of its file; None where none.
+
+    Raises:
+        UnreadableFile: no list has it, and one of its monitor's cannot be read.
+    """
+    name = path.name.removesuffix(FINISHED)
+    infix = infix_of_recording(name)
+    if infix is None or not path.parent.is_dir():
+        return None
+    found, damage = None, None
+    for each in list_paths(path.parent, infix):
+        try:
+            recording = read_list(each).recordings.get(name)
+        except UnreadableFile as error:
+            # A list that was removed just now had nothing in flight.
+            damage = error if os.path.lexists(each) else damage
+            continue
+        if recording is not None and not recording.is_dropped:
+            found = recording
+    if found is None and damage is not None:
+        raise damage
+    return found
+
+
+def get_recording(path: Path) -> Recording:
+    """Return a recording that is not dropped, by the path of its file.
+
+    Raises:
+        UnreadableFile: there is none, or a list cannot be read.
+    """
+    recording = find_recording(path)
+    if recording is None:
+        raise UnreadableFile(path, "there is no such file, and no log of it")
+    return recording
+
+
+def is_in_flight(path: Path) -> bool:
+    """Tell whether a recording is in a log only, by the path of its file.
+
+    Raises:
+        UnreadableFile: as `find_recording`.
+    """
+    if path.suffix == FINISHED and path.is_file():
+        return False
+    return find_recording(path) is not None
+
+
+def recordings_in_flight(
+    directory: Path, infix: Infix | str | None = None
+) -> list[Recording]:
+    """Return the recordings that only logs have, of all monitors or one.
+
+    Lists that cannot be read are left out: `read_list` says why.
+    """
+    found: list[Recording] = []
+    for path in list_paths(directory, infix):
+        with contextlib.suppress(UnreadableFile):
+            found += read_list(path).in_flight()
+    return found
+
+
+def add_facts(path: Path, facts: Mapping[str, Any]) -> None:
+    """Add to the facts of a recording in flight; of a key, the newest counts.
+
+    Raises:
+        UnreadableFile: there is no such recording.
+        FileNotWritten: the disk is full; nothing was added.
+    """
+    recording = get_recording(path)
+    append_line(recording.spans.path, {"note": recording.name, "facts": dict(facts)})
+
+
+def drop_recording(path: Path) -> None:
+    """Give up the rows of a recording; it is no error where there are none.
+
+    Raises:
+        FileNotWritten: the disk is full.
+        DirectoryNotWritable: files cannot be removed.
+    """
+    recording = find_recording(path)
+    if recording is not None:
+        append_line(recording.spans.path, {"drop": recording.name})
+        remove_if_done(recording.spans.path)
+
+
+def remove_if_done(path: Path) -> None:
+    """Remove a list and its logs once the log is closed and nothing is in flight.
+
+    Raises:
+        DirectoryNotWritable: they cannot be removed.
+    """
+    # Asked first: a monitor that is closed begins nothing any more.
+    is_open = _is_open(path)
+    try:
+        spans = read_list(path)
+    except UnreadableFile:
+        return
+    is_over = spans.is_closed or not is_open
+    if is_over and not spans.in_flight() and not spans.is_headless:
+        remove_list(path)
+
+
+def remove_list(path: Path) -> None:
+    """Remove a list and its logs.
+
+    Raises:
+        DirectoryNotWritable: they cannot be removed.
+    """
+    log = path.with_suffix(LOG)
+    try:
+        # The log first, so that no reader opens it without the rest; the list last,
+        # because the others are found through it.
+        for each in (log, tail_path(log), path.with_suffix(LOOKS), path):
+            each.unlink(missing_ok=True)
+    except OSError as error:
+        raise DirectoryNotWritable(path.parent, error) from error
+
+
+def _is_open(path: Path) -> bool:
+    infix = Infix.parse(infix_of(path.name) or "")
+    try:
+        return infix is not None and is_locked(path.parent / lock_name(infix))
+    except OSError:
+        # Unknown: leave its files alone.
+        return True
 
 
 def _count(value: Any) -> int:

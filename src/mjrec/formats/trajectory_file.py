@@ -3,21 +3,19 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
-from .in_flight import find_recording, remove_if_done
 from .journal import KILLED
 from .json_fields import unreadable
 from .monitor_directory import Infix, trajectory_prefix
 from .regular_files import open_regular
-from .span_reader import SpanReader
-from .spans import FINISHED
+from .spans import FINISHED, find_recording, remove_if_done
 from .trajectory import TrajectoryReader, added_up
-from .trajectory_hdf5 import SIGNATURE, TrajectoryHdf5Reader, write_hdf5
+from .trajectory_hdf5 import SIGNATURE, open_hdf5, write_hdf5
+from .trajectory_log import open_recording
 
 
 def open_trajectory(path: Path) -> TrajectoryReader:
@@ -33,7 +31,7 @@ def open_trajectory(path: Path) -> TrajectoryReader:
     """
     if not path.is_file() and find_recording(path) is not None:
         try:
-            return SpanReader(path)
+            return open_recording(path)
         except UnreadableFile:
             if not path.is_file():
                 raise
@@ -41,7 +39,7 @@ def open_trajectory(path: Path) -> TrajectoryReader:
     with unreadable(path), open_regular(path) as file:
         if file.read(len(SIGNATURE)) != SIGNATURE:
             raise ValueError("it is no trajectory")
-    return TrajectoryHdf5Reader(path)
+    return open_hdf5(path)
 
 
 def find_trajectory(
@@ -89,33 +87,32 @@ def finish_trajectory(path: Path, *, facts: Mapping[str, Any] | None = None) -> 
 
 
 def _make_hdf5(path: Path, facts: Mapping[str, Any]) -> None:
-    with SpanReader(path) as reader:
-        known = {**reader.header.facts, **facts}
-        known.update(_how_it_ended(reader, known))
-        reader.header = dataclasses.replace(reader.header, facts=known)
+    with open_recording(path) as reader:
+        known = {**reader.facts, **facts}
+        reader.facts = {**known, **_how_it_ended(reader, known)}
         write_hdf5(reader, path)
 
 
-def amend_trajectory(finished: Path, facts: Mapping[str, Any]) -> None:
-    """Add to the facts of a finished trajectory; of a key, the new value counts.
+def amend_trajectory(finished: Path, change: Callable[[Any], Any]) -> None:
+    """Change the facts of a finished trajectory.
 
-    The file is written anew, whole or not at all: for what is seldom done.
+    The file is written anew, whole or not at all: for what is seldom done. Nothing is
+    in it that this package does not write; its arrays stay, bit for bit.
 
     Args:
         finished: the HDF5 file.
-        facts: what to add.
+        change: returns the new facts.
 
     Raises:
         UnreadableFile: there is no such file, or it is damaged.
         FileNotWritten: the disk is full; the file is as before.
     """
-    with TrajectoryHdf5Reader(finished) as reader:
-        known = {**reader.header.facts, **facts}
-        reader.header = dataclasses.replace(reader.header, facts=known)
+    with open_hdf5(finished) as reader:
+        reader.facts = change(dict(reader.facts))
         write_hdf5(reader, finished)
 
 
-def _how_it_ended(reader: SpanReader, facts: Mapping[str, Any]) -> dict[str, Any]:
+def _how_it_ended(reader: TrajectoryReader, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return what there is to say where nobody could say it."""
     if "complete" in facts:
         return {}

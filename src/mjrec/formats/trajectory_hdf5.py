@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The HDF5 file of a recorded episode: as strangers read it, with plain h5py.
 
-`docs/format.md` has every dataset. Snapshots are rows of a compound type, whose
-members bear MuJoCo's names: `file["snapshots"]["geom_xpos"]` is an array, and the
-shuffle filter, which goes by whole rows there, puts the same byte of one row after the
-other side by side, so that what does not change costs nothing. (Of what was measured
-that was the smallest form and the fastest to write; `docs/format.md` has numbers.)
+`docs/format.md` has every dataset. States and snapshots are rows of a compound type,
+whose members bear MuJoCo's names: `file["states"]["qpos"]` is an array. The shuffle
+filter, which goes by whole rows there, puts the same byte of one row after the other
+side by side, so that what does not change costs nothing.
 
-Nothing here bounds the memory or time that a file asks for: `trajectory_file` does.
+Nothing here bounds the memory or time that a file asks for: `foreign_trajectories`
+does.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
-import json
 import os
 import signal
 import threading
@@ -28,21 +28,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic_files import replacing
-from ..errors import ClosedError, FileNotWritten, UnreadableFile
+from ..errors import FileNotWritten, UnreadableFile
 from ..json_text import dumps
 from .json_fields import json_object, unreadable
 from .regular_files import regular_path
 from .trajectory import (
     FORMAT_VERSION,
-    Array,
+    PARTS,
     ModelChange,
-    RowLayout,
     TrajectoryReader,
-    array_from_json,
+    check_dtype,
     check_version,
-    field_name,
-    header_from_json,
-    layout_to_json,
+    row_dtype,
 )
 
 # How every HDF5 file begins.
@@ -54,17 +51,18 @@ _FORMAT = b"mjrec trajectory"
 # cannot open.
 _LIBVER = ("v110", "v110")
 
-# Facts that are attributes of their own too, for whoever looks around in a viewer.
-_PLAIN_FACTS = (
-    *("env_id", "episode_id", "type", "seed", "start_time", "end_time"),
-    *("rate", "timestep", "stride"),
-    *("complete", "terminated", "truncated", "length", "reward"),
-)
+_COLUMNS = {
+    "rewards": "<f8",
+    "terminated": "|b1",
+    "truncated": "|b1",
+    "frame_steps": "<i8",
+}
 
-# Of rows, so that a video frame's can be had without most of the others.
-_SNAPSHOT_CHUNK_BYTES = 1 << 18
-_SNAPSHOT_CHUNK_ROWS = 32
-_CHUNK_BYTES = 1 << 17
+_NO_STATE = np.dtype(("<f8", (0,)))
+
+_CHUNK_BYTES = 1 << 18
+# Of snapshots, so that a frame's can be had without most of the others.
+_ROWS_IN_CHUNK = 32
 # How much is in memory at a time while it is written.
 _BUFFER_BYTES = 1 << 22
 
@@ -169,117 +167,81 @@ class _Unfailing(io.RawIOBase):
         return size or 0
 
 
-class TrajectoryHdf5Reader(TrajectoryReader):
-    """Reads the HDF5 file of a finished trajectory.
+def open_hdf5(path: Path) -> TrajectoryReader:
+    """Open the HDF5 file of a finished trajectory.
 
     Raises:
         UnreadableFile: it is no such file, of a newer version, or damaged.
     """
+    with _reading(path), contextlib.ExitStack() as opened:
+        # Without any wish about locking: HDF5 refuses a file that is open in this
+        # process with another one, in the user's own code, say.
+        file = opened.enter_context(h5py.File(regular_path(path), "r"))
+        reader = _reader_of(file, path)
+        opened.pop_all()
+    return reader
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+
+def _reader_of(file: h5py.File, path: Path) -> TrajectoryReader:
+    attributes = file.attrs
+    if "format" not in attributes or _attribute(attributes, "format", "S") != _FORMAT:
+        raise ValueError("it is an HDF5 file, but no trajectory")
+    check_version(int(_attribute(attributes, "format_version", "iu")))
+    facts = bytes(_attribute(attributes, "facts", "S"))
+    if zlib.crc32(facts) != _attribute(attributes, "crc32", "iu"):
+        raise ValueError("its facts are damaged")
+    there = [part for part in PARTS if part == "state" or f"{part}s" in {*file}]
+    datasets = {part: _dataset(file, f"{part}s") for part in there}
+    columns = {name: _column(file, name, kind) for name, kind in _COLUMNS.items()}
+    rows, steps = len(datasets["state"]), len(columns["rewards"])
+    counts = {"action": steps, "snapshot": len(columns["frame_steps"])}
+    lengths = [len(each) == counts.get(part, rows) for part, each in datasets.items()]
+    lengths += [len(columns[name]) == steps for name in ("terminated", "truncated")]
+    if not all(lengths) or (rows != steps + 1 and (rows, steps) != (0, 0)):
+        raise ValueError("its datasets are not of the same steps")
+    last = max(rows - 1, 0)
+    # Compared, because differences of such numbers may overflow.
+    bounds = np.concatenate(([0], columns["frame_steps"], [last]))
+    if (bounds[1:] < bounds[:-1]).any():
+        raise ValueError("its frames are not of its steps, in order")
+    kinds = {p: np.dtype((each.dtype, each.shape[1:])) for p, each in datasets.items()}
+    if kinds["state"].names is None:
+        # There was no simulation.
+        del kinds["state"]
+    changes = _group(file, "model_changes")
+
+    def read(part: str, start: int, stop: int) -> NDArray[Any]:
         with _reading(path):
-            # Without any wish about locking: HDF5 refuses a file that is open in this
-            # process with another one, in the user's own code, say.
-            self._file = h5py.File(regular_path(path), "r")
-            try:
-                self._open()
-            except BaseException:
-                self._file.close()
-                raise
-
-    def close(self) -> None:
-        """Close the file; idempotent. What is in memory stays."""
-        self._file.close()
-
-    def _open(self) -> None:
-        attributes = self._file.attrs
-        if "format" not in attributes or _text(attributes, "format") != _FORMAT:
-            raise ValueError("it is an HDF5 file, but no trajectory")
-        check_version(_whole_number(attributes, "format_version"))
-        facts, layout = _text(attributes, "facts"), _text(attributes, "layout")
-        if zlib.crc32(layout, zlib.crc32(facts)) != _whole_number(attributes, "crc32"):
-            raise ValueError("its facts or its layout are damaged")
-        self.header = header = header_from_json(json_object(facts), json_object(layout))
-        self.dropped = _whole_number(attributes, "dropped")
-        self.rewards = self._column("rewards", "<f8")
-        steps = self.step_count
-        self.terminated = self._column("terminated", "|b1", steps)
-        self.truncated = self._column("truncated", "|b1", steps)
-        self.frame_steps = self._column("frame_steps", "<i8")
-        state = Array("<f8", (header.state_length,)).numpy
-        self._datasets = {"states": self._dataset("states", state)}
-        self.row_count = rows = len(self._datasets["states"])
-        if rows != steps + 1 and (rows, steps) != (0, 0):
-            raise ValueError(f"it has {rows} states for {steps} steps")
-        bounds = np.concatenate(([0], self.frame_steps, [max(rows - 1, 0)]))
-        # Compared, because differences of such numbers may overflow.
-        if (bounds[1:] < bounds[:-1]).any() or (self.frame_count and not rows):
-            raise ValueError("its frames are not of its steps, in order")
-        if header.action is not None:
-            self._datasets["actions"] = self._dataset(
-                "actions", header.action.numpy, steps
-            )
-        if header.observation is not None:
-            self._datasets["observations"] = self._dataset(
-                "observations", header.observation.numpy, rows
-            )
-        if header.snapshot.size:
-            self._datasets["snapshots"] = self._dataset(
-                "snapshots", _row_type(header.snapshot), self.frame_count
-            )
-        self._changes = _group(self._file, "model_changes")
-        self.change_count = len(self._changes)
-
-    def _rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        size = self.header.snapshot.size
-        if name != "snapshots":
-            return self._read(self._datasets[name], start, stop)
-        if not size:
-            return np.empty((stop - start, 0), np.uint8)
-        rows = self._read(self._datasets[name], start, stop)
-        return rows.view(np.uint8).reshape(stop - start, size)
-
-    def _model_change(self, index: int) -> ModelChange:
-        self._check_open()
-        with _reading(self.path):
-            group = _group(self._changes, str(index))
-            step = _whole_number(group.attrs, "step")
-            if step < 0:
-                raise ValueError("a change of the model is of no step")
-            datasets = {field_name(name): _own_dataset(group, name) for name in group}
-            return ModelChange(
-                step=step,
-                fields={name: _whole(dataset) for name, dataset in datasets.items()},
-            )
-
-    def _column(self, name: str, dtype: str, count: int | None = None) -> NDArray[Any]:
-        dataset = self._dataset(name, np.dtype(dtype), count)
-        return self._read(dataset, 0, len(dataset))
-
-    def _dataset(self, name: str, kind: np.dtype[Any], count: int | None = None) -> Any:
-        """Return a dataset with one of a kind for each of `count` things."""
-        dataset = _own_dataset(self._file, name)
-        # Memory is made for what the layout says, and HDF5 fills it as the file says.
-        if dataset.dtype != kind.base:
-            raise ValueError(f"its {name} are of dtype {dataset.dtype}")
-        if dataset.shape[:1] + kind.shape != dataset.shape:
-            raise ValueError(f"its {name} have the shape {dataset.shape}")
-        if count not in (None, dataset.shape[0]):
-            raise ValueError(f"it has {dataset.shape[0]} {name}, not {count}")
-        return dataset
-
-    def _read(self, dataset: Any, start: int, stop: int) -> NDArray[Any]:
-        self._check_open()
-        with _reading(self.path):
+            dataset = datasets[part]
             values = np.empty((stop - start, *dataset.shape[1:]), dataset.dtype)
             if values.size:
                 dataset.read_direct(values, np.s_[start:stop])
             return values
 
-    def _check_open(self) -> None:
-        if not self._file:
-            raise ClosedError(f"The trajectory {self.path} is closed.")
+    def read_change(index: int) -> ModelChange:
+        with _reading(path):
+            group = _group(changes, str(index))
+            step = int(_attribute(group.attrs, "step", "iu"))
+            return ModelChange(
+                step=step,
+                fields={n: np.asarray(_dataset(group, n)[()]) for n in group},
+            )
+
+    return TrajectoryReader(
+        path=path,
+        facts=json_object(facts),
+        dtype=row_dtype(**kinds),
+        row_count=rows,
+        rewards=columns["rewards"],
+        terminated=columns["terminated"],
+        truncated=columns["truncated"],
+        frame_steps=columns["frame_steps"],
+        change_count=len(changes),
+        dropped=int(_attribute(attributes, "dropped", "iu")),
+        read=read,
+        read_change=read_change,
+        release=file.close,
+    )
 
 
 @contextlib.contextmanager
@@ -306,8 +268,8 @@ def _group(parent: h5py.Group, name: str) -> h5py.Group:
     return group
 
 
-def _own_dataset(group: h5py.Group, name: str) -> Any:
-    """Return a dataset whose data is in this file, packed as mjrec packs it."""
+def _dataset(group: h5py.Group, name: str) -> Any:
+    """Return a dataset whose numbers are in this file, packed as mjrec packs them."""
     dataset = _linked(group, name)
     if not isinstance(dataset, h5py.Dataset):
         raise ValueError(f"its {name} is no dataset")
@@ -321,19 +283,18 @@ def _own_dataset(group: h5py.Group, name: str) -> Any:
         properties.get_layout() == h5py.h5d.VIRTUAL
         or properties.get_external_count()
         or filters - _FILTERS
+        or dataset.shape is None
     ):
         raise ValueError(f"its {name} is stored in a way that mjrec does not write")
-    if dataset.shape is None:
-        raise ValueError(f"its {name} is no dataset")
+    check_dtype(dataset.dtype)
     return dataset
 
 
-def _whole(dataset: Any) -> NDArray[Any]:
-    kind = array_from_json({"dtype": dataset.dtype.str, "shape": list(dataset.shape)})
-    values = np.empty(kind.shape, kind.dtype)
-    if values.size:
-        dataset.read_direct(values)
-    return values
+def _column(file: h5py.File, name: str, kind: str) -> NDArray[Any]:
+    dataset = _dataset(file, name)
+    if dataset.dtype != kind or dataset.ndim != 1:
+        raise ValueError(f"its {name} are of dtype {dataset.dtype}")
+    return np.asarray(dataset[()])
 
 
 def _attribute(attributes: Any, name: str, kinds: str) -> Any:
@@ -346,101 +307,41 @@ def _attribute(attributes: Any, name: str, kinds: str) -> Any:
     return attributes[name]
 
 
-def _text(attributes: Any, name: str) -> bytes:
-    return bytes(_attribute(attributes, name, "S"))
-
-
-def _whole_number(attributes: Any, name: str) -> int:
-    return int(_attribute(attributes, name, "iu"))
-
-
-def _row_type(layout: RowLayout) -> np.dtype[Any]:
-    """Return the type of a row with the fields that have any bytes."""
-    fields = [field for field in layout.fields if field.array.size]
-    return np.dtype(
-        {
-            "names": [field.name for field in fields],
-            "formats": [(field.array.dtype, field.array.shape) for field in fields],
-            "offsets": [field.offset for field in fields],
-            "itemsize": layout.size,
-        }
-    )
-
-
 def _write(file: h5py.File, reader: TrajectoryReader) -> None:
-    _write_attributes(file, reader)
-    _write_rows(file, reader)
-    changes = file.create_group("model_changes")
-    for index, change in enumerate(reader.iter_model_changes()):
-        _write_change(changes.create_group(str(index)), change)
-
-
-def _write_attributes(file: h5py.File, reader: TrajectoryReader) -> None:
-    header = reader.header
-    # Of fixed length: see _attribute. Those that only strangers read need not be.
+    facts = dumps(dict(reader.facts)).encode()
+    # Texts of fixed length: see _attribute.
     file.attrs["format"] = np.bytes_(_FORMAT)
     file.attrs["format_version"] = np.int64(FORMAT_VERSION)
-    facts = dumps(dict(header.facts)).encode()
-    layout = json.dumps(layout_to_json(header)).encode()
     file.attrs["facts"] = np.bytes_(facts)
-    file.attrs["layout"] = np.bytes_(layout)
     # HDF5 has checksums of its own for what it thinks of as its structure, and the
     # deflate filter for what it compressed; long texts have neither.
-    file.attrs["crc32"] = np.int64(zlib.crc32(layout, zlib.crc32(facts)))
+    file.attrs["crc32"] = np.int64(zlib.crc32(facts))
     file.attrs["dropped"] = np.int64(reader.dropped)
-    for name, value in _plain_facts(header.facts):
-        file.attrs[name] = value
-
-
-def _plain_facts(facts: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    model = facts.get("model")
-    version = model.get("mujoco") if isinstance(model, Mapping) else None
-    named = [(name, facts.get(name)) for name in _PLAIN_FACTS]
-    for name, value in (*named, ("mujoco_version", version)):
-        match value:
-            case bool() | float():
-                yield name, value
-            case int() if -(2**63) <= value < 2**63:
-                yield name, np.int64(value)
-            case str() if value.isprintable():
-                yield name, value
-
-
-def _write_rows(file: h5py.File, reader: TrajectoryReader) -> None:
-    header, steps, rows = reader.header, reader.step_count, reader.row_count
-    state = Array("<f8", (header.state_length,)).numpy
-    states = _store(file, "states", state, rows, reader.states)
-    states.attrs["components"] = [c.name for c in header.state]
-    states.attrs["offsets"] = np.array([c.offset for c in header.state], np.int64)
-    states.attrs["lengths"] = np.array([c.length for c in header.state], np.int64)
-    columns = {
-        name: getattr(reader, name)
-        for name in ("rewards", "terminated", "truncated", "frame_steps")
-    }
-    for c in header.state:
-        if c.name == "time" and c.length == 1:
-            columns["time"] = states[:, c.offset] if rows else np.empty(0)
-    for name, values in columns.items():
-        _store(file, name, values.dtype, len(values), _slices_of(values))
-    if header.action is not None:
-        _store(file, "actions", header.action.numpy, steps, reader.actions)
-    if header.observation is not None:
-        kind = header.observation.numpy
-        _store(file, "observations", kind, rows, reader.observations)
-    if size := header.snapshot.size:
-        kind = _row_type(header.snapshot)
+    for name, dtype in _COLUMNS.items():
+        values = getattr(reader, name)
         _store(
-            *(file, "snapshots", kind, reader.frame_count),
-            lambda start, stop: reader.snapshots(start, stop).view(kind).reshape(-1),
-            chunk_bytes=min(_SNAPSHOT_CHUNK_BYTES, _SNAPSHOT_CHUNK_ROWS * size),
+            file, name, np.dtype(dtype), len(values), functools.partial(_cut, values)
         )
+    counts = {"action": reader.step_count, "snapshot": reader.frame_count}
+    for part in PARTS:
+        kind = reader.kind(part)
+        if kind is None and part == "state":
+            # There was no simulation; their number is needed all the same.
+            kind = _NO_STATE
+        if kind is not None:
+            count = counts.get(part, reader.row_count)
+            _store(file, f"{part}s", kind, count, functools.partial(reader.read, part))
+    changes = file.create_group("model_changes")
+    for index, change in enumerate(reader.iter_model_changes()):
+        group = changes.create_group(str(index))
+        group.attrs["step"] = np.int64(change.step)
+        for name, values in change.fields.items():
+            packing = _PACKING if values.ndim and values.size else {}
+            group.create_dataset(name, data=values, **packing)
 
 
-def _write_change(group: h5py.Group, change: ModelChange) -> None:
-    group.attrs["step"] = np.int64(change.step)
-    for name, values in change.fields.items():
-        packing = _PACKING if values.ndim and values.size else {}
-        group.create_dataset(name, data=values, **packing)
+def _cut(values: NDArray[Any], start: int, stop: int) -> NDArray[Any]:
+    return values[start:stop]
 
 
 def _store(
@@ -448,16 +349,16 @@ def _store(
     name: str,
     kind: np.dtype[Any],
     count: int,
-    read: Callable[[int, int], NDArray[Any] | None],
-    *,
-    chunk_bytes: int = _CHUNK_BYTES,
-) -> Any:
+    read: Callable[[int, int], NDArray[Any]],
+) -> None:
     """Write `count` of a kind, which `read(start, stop)` gives."""
     shape, size = (count, *kind.shape), kind.itemsize
     if not count * size:
         # Nothing to be cut into chunks.
-        return file.create_dataset(name, shape, kind.base)
-    chunk = max(1, min(count, chunk_bytes // size))
+        file.create_dataset(name, shape, kind.base)
+        return
+    most = _ROWS_IN_CHUNK if name == "snapshots" else count
+    chunk = max(1, min(count, most, _CHUNK_BYTES // size))
     packing = {**_PACKING, "chunks": (chunk, *kind.shape)}
     dataset = file.create_dataset(name, shape, kind.base, **packing)
     # Whole chunks.
@@ -465,8 +366,3 @@ def _store(
     for start in range(0, count, step):
         stop = min(start + step, count)
         dataset[start:stop] = read(start, stop)
-    return dataset
-
-
-def _slices_of(values: NDArray[Any]) -> Callable[[int, int], NDArray[Any]]:
-    return lambda start, stop: values[start:stop]

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from ..rendering.progress import Progress
+from ..rendering.jobs import Progress
 
 if TYPE_CHECKING:
     import rich.console

@@ -12,9 +12,9 @@ from .. import json_text
 from ..atomic_files import write_text
 from ..errors import DirectoryNotWritable
 from ..formats.frame_hashes import frame_hash_path
-from ..formats.in_flight import add_facts, drop_recording
 from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import trajectory_prefix, video_prefix
+from ..formats.spans import add_facts, drop_recording
 from .fast_path import FastPath, counting
 from .keep_rules import Standing
 from .live_videos import LiveVideos

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..formats.row_log import TAIL_HEAD
 from ..formats.span_writer import ROW_HEAD, SpanWriter
-from ..formats.spans import FRAME, STEP, TERMINATED, TRUNCATED
+from ..formats.trajectory import FRAME, STEP, TERMINATED, TRUNCATED
 from ..simulation.raw_memory import WORDS
 from .stats_recorder import StatsRecorder
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ..errors import Error
-from ..formats.in_flight import is_in_flight
 from ..formats.monitor_directory import ClipPart
+from ..formats.spans import is_in_flight
 
 
 class Finisher(Protocol):

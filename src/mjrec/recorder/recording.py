@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileNotWritten, PicturesDiffer
 from ..formats.span_writer import SpanLogs, SpanWriter
-from ..formats.trajectory import Array, ModelChange, RowLayout, TrajectoryHeader
+from ..formats.trajectory import ModelChange, row_dtype
 from ..rates import rate_from_timestep, stride_for
 from ..simulation.raw_memory import words_of
 from .fast_path import FastPath, gathering
@@ -88,9 +88,9 @@ class Recording:
         self._start = start
         self._max_fps = max_fps
         self._is_alone = is_alone
-        self._components = () if start is None else start.state
-        self._layout = RowLayout() if start is None else start.snapshot
-        self._takes_frames = bool(self._layout.fields)
+        self._state = None if start is None else start.state
+        self._snapshot = None if start is None else start.snapshot
+        self._takes_frames = self._snapshot is not None
         self._stride = 1
         self._span: SpanWriter | None = None
         self._fast: FastPath | None = None
@@ -98,8 +98,8 @@ class Recording:
         self._action: StepArray | None = None
         self._observation = None if observation is None else step_array(observation)
         # What belongs to step 0 waits here until there is a span.
-        self._first_state = np.full(sum(c.length for c in self._components), np.nan)
-        self._first_snapshot = np.empty(self._layout.size, np.uint8)
+        self._first_state = np.full(_words(self._state), np.nan)
+        self._first_snapshot = np.empty(_words(self._snapshot), np.uint64)
         self._first_observation = None
         if self._observation is not None:
             self._observation.set(observation)
@@ -285,22 +285,27 @@ class Recording:
         )
 
     def _begin(self) -> SpanWriter:
-        header = TrajectoryHeader(
-            facts={**self._facts, **self._parts(), **self._measured_pace()},
-            state=self._components,
-            snapshot=self._layout,
-            action=_array_of(self._action),
-            observation=_array_of(self._observation),
+        action, observation = self._action, self._observation
+        dtype = row_dtype(
+            state=self._state,
+            snapshot=self._snapshot,
+            action=None if action is None else action.kind,
+            observation=None if observation is None else observation.kind,
         )
-        span = self._logs.begin(self._name, header, alone=self._is_alone)
+        facts = {**self._facts, **self._parts(), **self._measured_pace()}
+        span = self._logs.begin(self._name, facts, dtype, alone=self._is_alone)
         try:
             own = None if self._start is None else self._start.model_fields
             for fields in (own, self._first_change):
                 if fields:
-                    span.add_change(ModelChange(step=0, fields=fields))
+                    span.log.add_change(ModelChange(step=0, fields=fields))
             columns, slot = span.log.columns, span.make_room()
-            columns["state"][slot] = self._first_state
-            columns["snapshot"][slot] = self._first_snapshot
+            for part, first in (
+                ("state", self._first_state),
+                ("snapshot", self._first_snapshot),
+            ):
+                if part in columns:
+                    columns[part][slot] = first
             if self._action is not None:
                 columns["action"][slot] = 0
             if self._first_observation is not None:
@@ -314,6 +319,8 @@ class Recording:
         return span
 
     def _write_state(self, span: SpanWriter, slot: int, *, has_picture: bool) -> None:
+        if "state" not in span.log.columns:
+            return
         state = span.log.columns["state"][slot]
         state[...] = np.nan
         if not has_picture or self._states is None:
@@ -336,7 +343,7 @@ class Recording:
         else:
             changed = states.changed_fields()
         if changed:
-            span.add_change(ModelChange(step=number, fields=changed))
+            span.log.add_change(ModelChange(step=number, fields=changed))
         return self._takes_frames
 
     def _write_arrays(self, span: SpanWriter, slot: int) -> None:
@@ -397,8 +404,8 @@ def _measured(seconds: float, max_fps: float | Fraction | None) -> Mapping[str, 
     return _pace(rate, 1 / rate, max_fps)
 
 
-def _array_of(array: StepArray | None) -> Array | None:
-    return None if array is None else array.kind
+def _words(kind: np.dtype[Any] | None) -> int:
+    return 0 if kind is None else kind.itemsize // 8
 
 
 class DeferredVideo:

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.trajectory import Array
-
 _ARRAY = np.ndarray
 
 # What every value of a kind fits into exactly: people give float32 to an environment
@@ -22,7 +20,7 @@ class StepArray:
     """Memory for an array that comes with every step.
 
     Attributes:
-        kind: dtype and shape.
+        kind: dtype and shape, as a dtype.
         values: the array that was set last; always the same memory.
         parts: the names and shapes of a dictionary's arrays, which lie one behind the
             other; None for a plain array.
@@ -34,7 +32,7 @@ class StepArray:
         shape: tuple[int, ...],
         parts: dict[str, tuple[int, ...]] | None = None,
     ) -> None:
-        self.kind = Array(dtype.str, shape)
+        self.kind = np.dtype((dtype, shape))
         self.parts = parts
         self.values: NDArray[Any] = np.zeros(shape, dtype)
         self._shape = self.values.shape
@@ -114,7 +112,7 @@ def action_array(example: Any) -> StepArray | None:
     """
     if isinstance(example, list | tuple | np.ndarray):
         array = step_array(example)
-        if array is not None and array.kind.dtype == "<i8" and array.kind.shape:
+        if array is not None and array.kind.base == "<i8" and array.kind.shape:
             return StepArray(np.dtype("<f8"), array.kind.shape)
         return array
     return step_array(example)

@@ -12,6 +12,7 @@ import contextlib
 import logging
 import os
 import select
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,8 @@ from ..child_python import Child, LineWriter, said_in
 from ..errors import Error
 from ..formats.monitor_directory import infix_of
 from ..patience import Patience, patience_s
-from .progress import Progress
-from .shared_pool import check_workers
+from .jobs import Progress
+from .pool import check_workers
 
 logger = logging.getLogger(__name__)
 
@@ -124,7 +125,7 @@ class Background:
             on_progress(self._progress)
             process.wait_for_news(patience.begin_slice())
             patience.end_slice()
-            if self._listen():
+            if self._listen() or process.has_worked():
                 patience.renew()
             elif patience.is_over:
                 logger.error(
@@ -202,8 +203,7 @@ class Background:
             logger.log(*message["log"])
         elif "done" in message:
             self.waiting.pop(message["done"], None)
-            if message["failure"]:
-                self.failures[message["name"]] = message["failure"]
+            self.failures.update(message["failures"])
 
     def _replace(self, how: str) -> None:
         """Let another process do what one that has died left; it is the last."""
@@ -258,6 +258,7 @@ class _Process:
     def __init__(self, arguments: list[str]) -> None:
         self.child = Child(_MODULE, *arguments, environ=os.environ)
         self.knows_all = self.has_ended = False
+        self._cpu_seconds = 0.0
         self._lines = LineWriter(self.child.orders.fileno())
         self._unread = b""
         os.set_blocking(self.child.answers.fileno(), False)
@@ -276,6 +277,18 @@ class _Process:
                 break
         *lines, self._unread = self._unread.split(b"\n")
         return [said_in(line) for line in lines]
+
+    def has_worked(self) -> bool:
+        """Tell whether it has used its CPU since the last call.
+
+        What it waits for itself, it looks at every second. Blocked for good, by a disk
+        that does not answer for example, it uses none.
+        """
+        before = self._cpu_seconds
+        with contextlib.suppress(OSError):
+            # The kernel's number for the CPU clock of another process.
+            self._cpu_seconds = time.clock_gettime((~self.child.pid << 3) | 2)
+        return self._cpu_seconds > before
 
     def wait_for_news(self, seconds: float) -> None:
         """Wait until it says something or ends, or so many seconds have passed."""

@@ -7,9 +7,8 @@ first part of a clip; `that was all` where it is waited for, and `a video is exp
 On its standard output it says one JSON object a line::
 
     {"progress": {"videos_done": 0, "videos": 2, "frames_done": 40, "frames": 2002}}
-    {"done": "<recording>", "name": "<video or trajectory>", "failure": null}
+    {"done": "<recording>", "failures": {"<video or trajectory>": "..."}}
     {"log": [30, "..."]}                                for the simulation's log
-    {"pulse": 12.5}                                     it is at work
 
 What libraries print goes to the standard error.
 
@@ -20,6 +19,7 @@ no use to anybody any more.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import logging
 import os
@@ -33,19 +33,15 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..child_python import LineWriter, say_stacks_when_asked, take_standard_output
-from ..patience import patience_s
 from .background import ALL_SAID, EXPECTED
 from .finish import Finisher
-from .jobs import VideoJob
-from .progress import Progress
-from .recordings import key_of
+from .jobs import Progress, VideoJob, key_of
 
 _NICE = 10
 _SECONDS_BETWEEN_REPORTS = 0.2
 _SECONDS_BETWEEN_LOOKS = 0.05
 _SECONDS_TO_LEAVE = 2.0
 _READ_SIZE = 1 << 16
-_LONGEST_BETWEEN_PULSES = 5.0
 
 _Say = Callable[..., None]
 
@@ -80,9 +76,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.getLogger().addHandler(handler)
     told: queue.SimpleQueue[str] = queue.SimpleQueue()
     threading.Thread(target=_read, args=[told], daemon=True).start()
-    threading.Thread(target=_beat, args=[answers, say], daemon=True).start()
     try:
-        with Finisher(arguments.directory, workers=workers) as finisher:
+        with contextlib.closing(
+            Finisher(arguments.directory, workers=workers)
+        ) as finisher:
             _work(finisher, arguments.directory, told, say, strict=arguments.strict)
     except _Stopped:
         return 0
@@ -110,23 +107,6 @@ def _read(names: queue.SimpleQueue[str]) -> None:
     os._exit(1)
 
 
-def _beat(answers: LineWriter, say: _Say) -> None:
-    """Say that the main thread is at work, to a simulation that waits for it.
-
-    Whatever that thread waits for itself, it looks at again every second. Blocked for
-    good, by a disk that does not answer for example, it uses no CPU.
-    """
-    clock = time.pthread_getcpuclockid(threading.main_thread().ident or 0)
-    seconds = min(_LONGEST_BETWEEN_PULSES, patience_s() / 4)
-    before = 0.0
-    while True:
-        now = time.clock_gettime(clock)
-        if now > before and not answers.is_behind:
-            say(pulse=now)
-        before = now
-        time.sleep(seconds)
-
-
 def _work(
     finisher: Finisher,
     directory: Path,
@@ -148,7 +128,7 @@ def _work(
             elif not all_said:
                 job = VideoJob(directory=directory, recording=name, strict=strict)
                 if key_of(name) is None or not finisher.add(job):
-                    say(done=name, name=name, failure=None)
+                    say(done=name, failures={})
 
     def look_up(progress: Progress) -> None:
         """Listen and report, in the midst of work."""
@@ -166,9 +146,9 @@ def _work(
             finisher.rest()
             take_in(wait=True)
         elif finisher.is_ready() or all_said:
-            job, outcome = finisher.do_next()
+            job, result = finisher.do_next()
             say(progress=vars(finisher.progress))
-            say(done=job.recording, name=outcome.name, failure=outcome.failure)
+            say(done=job.recording, failures={**result.failures, **result.blank})
         else:
             # The simulation is still writing the model.
             time.sleep(_SECONDS_BETWEEN_LOOKS)

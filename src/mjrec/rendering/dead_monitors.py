@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import Error, FileNotWritten, UnreadableFile
-from ..formats.in_flight import drop_recording, remove_list
 from ..formats.journal import (
     KILLED,
     JournalEntry,
@@ -34,6 +33,7 @@ from ..formats.monitor_directory import (
     journal_name,
     manifest_name,
 )
+from ..formats.spans import drop_recording, remove_list
 from ..formats.trajectory_file import (
     find_trajectory,
     finish_trajectory,
@@ -47,9 +47,10 @@ from ..results.manifest_and_stats import (
     write_manifest_and_stats,
 )
 from .cut_videos import finish_text, finish_video
+from .jobs import key_of
 from .leftovers import Leftovers, leftovers_of
 from .recorded_facts import open_for_rendering, video_path
-from .recordings import claim, key_of, parts_of
+from .recordings import claim, parts_of
 
 logger = logging.getLogger(__name__)
 
@@ -200,7 +201,7 @@ class _DeadMonitor:
             path = find_trajectory(self._directory, self._infix, number)
             if path is not None:
                 with open_for_rendering(path) as reader:
-                    return reader.header.facts
+                    return reader.facts
         return {}
 
     def _known(self, number: int | None) -> dict[str, Any]:
@@ -223,7 +224,7 @@ class _DeadMonitor:
     def _finish_log(self, path: Path) -> str:
         """Give a recording in flight its final form; return what was done."""
         with open_trajectory(path) as reader:
-            facts, steps = dict(reader.header.facts), reader.step_count
+            facts, steps = dict(reader.facts), reader.step_count
         if not facts.get("kept", True) and is_done(video_path(path, facts)):
             # Its renderer died between the two.
             drop_recording(path)
@@ -387,4 +388,4 @@ def _clips(now: Leftovers) -> Iterator[_Line]:
 
 def _facts_of(path: Path) -> Mapping[str, Any]:
     with open_for_rendering(path) as reader:
-        return reader.header.facts
+        return reader.facts

@@ -20,8 +20,7 @@ from ..simulation.cameras import Camera, camera_from_members, is_tracking
 from ..simulation.recorded_scene import GivenStates, RecordedScene
 from ..simulation.renderer import Canvas, SceneRenderer
 from ..simulation.warnings import log_mujoco_warnings
-from .recorded_facts import open_for_rendering
-from .recorded_frames import check_has_frames
+from .recorded_facts import check_has_frames, open_for_rendering
 from .views import PlainCamera, View
 
 
@@ -170,7 +169,7 @@ def trajectory_drawing(
     with contextlib.ExitStack() as opened:
         reader = opened.enter_context(open_for_rendering(path, is_vetted=True))
         check_has_frames(reader)
-        facts = reader.header.facts
+        facts = reader.facts
         scene = RecordedScene(reader)
         model, recorded = scene.model, scene.view
         look: dict[str, Any] = {

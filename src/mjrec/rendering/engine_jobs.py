@@ -4,8 +4,7 @@
 The process that hands them out opens no trajectory and draws nothing. It may be killed
 at any time, and what its workers have finished stays. The settings of the workers may
 be `{"models": [sha256, ...]}`: compiled models that the user whose jobs they are has
-stored, and that the workers load. What comes back is `{"outcome": {...}}`, null where
-nothing was left to do.
+stored, and that the workers load. What comes back is a `RenderedVideos`.
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ from ..engines.work import Engine, Job, JobOutcome, Work
 from ..errors import InvalidArgument
 from ..simulation.model_trust import TRUST_VARIABLE, note_models, stored_models
 from .finish import Finisher, note_failure
-from .jobs import Outcome, VideoJob
-from .progress import Progress
+from .jobs import Progress, RenderedVideos, VideoJob
 from .recordings import may_be_left
 
 _WORKER = "mjrec.rendering.engine_jobs:VideoWorker"
@@ -64,7 +62,7 @@ def do_on_engine(
     jobs: Iterable[VideoJob],
     *,
     on_progress: Callable[[Progress], object] = lambda _: None,
-) -> Iterator[Outcome]:
+) -> Iterator[RenderedVideos]:
     """Do what `do_jobs` does, by the workers of an engine.
 
     Outcomes come in the order in which they are over.
@@ -78,7 +76,7 @@ def do_on_engine(
         Error: the engine cannot do any work.
     """
     by_name = {
-        f"video/{job.nothing.name}": job
+        f"video/{_name_of(job)}": job
         for job in jobs
         if job.variant is not None or may_be_left(job.directory, job.key)
     }
@@ -100,24 +98,37 @@ def do_on_engine(
         for done in run.results():
             # Without patience there is always one.
             assert done is not None
-            job = by_name[done.key]
-            outcome = outcome_of(done, job)
-            now = _counted(now, outcome)
+            result = result_of(done, by_name[done.key])
+            # It was taken for one video.
+            count = len(result.videos)
+            videos = count or int(bool(result.failures or result.elsewhere))
+            now = Progress(
+                videos=now.videos + videos - 1,
+                videos_done=now.videos_done + videos,
+                frames_done=now.frames_done + sum(result.videos.values()),
+                frames=None,
+            )
             on_progress(now)
-            if outcome is not None:
-                yield replace(outcome, directory=job.nothing.directory)
+            if not result.is_empty:
+                yield result
 
 
-def outcome_of(done: JobOutcome, job: VideoJob) -> Outcome | None:
-    """Return what became of a job; None where nothing was to be done."""
+def result_of(done: JobOutcome, job: VideoJob) -> RenderedVideos:
+    """Return the result of a job that an engine's worker did."""
+    directory = job.directory if job.video is None else job.video.parent
     if done.failure is not None:
         if job.variant is None:
             # Its worker has died, and could not.
-            note_failure(job.directory, job.nothing.name, done.failure)
-        return replace(job.nothing, failure=done.failure)
+            note_failure(job.directory, _name_of(job), done.failure)
+        failures = {_name_of(job): done.failure}
+        return RenderedVideos(directory=directory, failures=failures)
     assert done.value is not None
-    said = done.value["outcome"]
-    return None if said is None else Outcome.from_json(said)
+    # Under the name by which this process knows it.
+    return replace(RenderedVideos.from_json(done.value), directory=directory)
+
+
+def _name_of(job: VideoJob) -> str:
+    return job.key.told_name if job.video is None else job.video.name
 
 
 def environ_for_drawing() -> dict[str, str]:
@@ -152,22 +163,11 @@ class VideoWorker:
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         """Do a job."""
         job = VideoJob.from_json(arguments)
-        outcome = self._finisher.do_next()[1] if self._finisher.add(job) else None
-        return {"outcome": None if outcome is None else outcome.as_json()}
+        result = RenderedVideos(directory=job.directory)
+        if self._finisher.add(job):
+            _, result = self._finisher.do_next()
+        return result.as_json()
 
     def close(self) -> None:
         """End the process that draws."""
         self._finisher.close()
-
-
-def _counted(now: Progress, outcome: Outcome | None) -> Progress:
-    """Count a job that is over, which was taken for one video."""
-    if outcome is None or outcome.is_trajectory:
-        return replace(now, videos=now.videos - 1)
-    further = len(outcome.further_videos)
-    return replace(
-        now,
-        videos=now.videos + further,
-        videos_done=now.videos_done + 1 + further,
-        frames_done=now.frames_done + (1 + further) * outcome.frame_count,
-    )

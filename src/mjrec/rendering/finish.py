@@ -1,22 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finishing recordings: the trajectory's final form, the videos, the manifest.
 
-One recording after the other, each by all workers. What cannot be done is told, stays
-as it was, and stops nothing else.
+One recording after the other, each by all workers. What cannot be done is reported,
+stays as it was, and stops nothing else.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple, Self
 
 from ..errors import (
-    BlankVideo,
     DirectoryNotWritable,
     Error,
     FileNotWritten,
@@ -24,41 +21,26 @@ from ..errors import (
     InvalidArgument,
 )
 from ..formats import render_failures
-from ..formats.in_flight import drop_recording, list_paths, remove_if_done
 from ..formats.second_names import give_all_second_names
+from ..formats.spans import drop_recording, list_paths, remove_if_done
 from ..formats.trajectory_file import finish_trajectory
 from ..results.manifest_and_stats import update_manifests
-from .jobs import Outcome, VideoJob
-from .progress import Progress
+from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
+from .pool import SharedPool
 from .recorded_facts import further_video_paths, video_facts
 from .recordings import (
-    PendingRecording,
-    RecordingKey,
+    Plan,
     claim,
-    key_of,
     look_at,
     read_recording,
     recordings,
     remove_unfinished,
 )
 from .render_video import render_video
-from .shared_pool import SharedPool
 
 logger = logging.getLogger(__name__)
 
 _OnProgress = Callable[[Progress], object]
-
-
-class _Work(NamedTuple):
-    """How much a job is, and which file of a model has to be there for it."""
-
-    videos: int
-    frames: int
-    model_file: Path | None = None
-
-    @property
-    def has_model(self) -> bool:
-        return self.model_file is None or self.model_file.exists()
 
 
 def finish(
@@ -68,8 +50,8 @@ def finish(
     workers: int | None,
     strict: bool = False,
     on_progress: _OnProgress = lambda _: None,
-) -> Iterator[Outcome]:
-    """Finish what is pending in a directory, and yield what became of each recording.
+) -> Iterator[RenderedVideos]:
+    """Finish what is pending in a directory, and yield the result of each recording.
 
     Nothing is yielded of one that nothing was to be done about. What another
     process is at is left to it. Manifests of monitors that are closed are kept true,
@@ -88,9 +70,9 @@ def finish(
     wanted = recordings(directory) if keys is None else keys
     jobs = [VideoJob.finishing(directory, key, strict=strict) for key in wanted]
     has_failed = False
-    for outcome in do_jobs(jobs, directory, workers=workers, on_progress=on_progress):
-        has_failed = has_failed or outcome.failure is not None
-        yield outcome
+    for result in do_jobs(jobs, directory, workers=workers, on_progress=on_progress):
+        has_failed = has_failed or bool(result.failures)
+        yield result
     try:
         bring_up_to_date(directory)
     except FileNotWritten:
@@ -105,8 +87,8 @@ def do_jobs(
     *,
     workers: int | None,
     on_progress: _OnProgress = lambda _: None,
-) -> Iterator[Outcome]:
-    """Do jobs with workers of this process, and yield what became of each.
+) -> Iterator[RenderedVideos]:
+    """Do jobs with workers of this process, and yield the result of each.
 
     Args:
         jobs: which.
@@ -114,12 +96,14 @@ def do_jobs(
         workers: as of `finish`.
         on_progress: likewise.
     """
-    with Finisher(directory, workers=workers, on_progress=on_progress) as finisher:
+    finisher = Finisher(directory, workers=workers, on_progress=on_progress)
+    with contextlib.closing(finisher):
         for job in jobs:
             finisher.add(job)
         while finisher:
-            _, outcome = finisher.do_next()
-            yield outcome
+            _, result = finisher.do_next()
+            if not result.is_empty:
+                yield result
 
 
 def bring_up_to_date(directory: Path) -> None:
@@ -153,7 +137,7 @@ def note_failure(directory: Path, name: str, reason: str) -> None:
 
 
 class Finisher:
-    """Does the jobs that are added to it, with one pool of workers.
+    """Does the jobs that are added to it, in their order, with one pool of workers.
 
     Args:
         directory: whose CPUs are shared.
@@ -172,25 +156,15 @@ class Finisher:
         workers: int | None,
         on_progress: _OnProgress = lambda _: None,
     ) -> None:
-        self.progress = Progress()
+        self.progress = Progress(frames=0)
         self.on_progress = on_progress
         self._pool = SharedPool(directory, workers=workers)
-        self._waiting: dict[str, tuple[VideoJob, _Work]] = {}
+        # None where a job cannot be planned: its turn says why.
+        self._waiting: dict[str, tuple[VideoJob, Plan | None]] = {}
         self._gl_failure: GLError | None = None
 
     def __len__(self) -> int:
         return len(self._waiting)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the workers. Idempotent."""
@@ -198,40 +172,37 @@ class Finisher:
 
     def add(self, job: VideoJob) -> bool:
         """Add a job, and return whether there is anything to do."""
-        try:
-            work = _work_of(job)
-        except (Error, OSError):
-            # The same again when its turn comes, which is when it is told.
-            work = _Work(1, 0)
-        if work is None:
-            return False
-        self._waiting[job.name] = job, work
-        if work.videos:
-            self._count(videos=work.videos, frames=work.frames)
+        plan: Plan | None = None
+        with contextlib.suppress(Error, OSError):
+            plan = _plan(job)
+            if plan is None:
+                return False
+        self._waiting[job.name] = job, plan
+        videos, frames = _work(plan)
+        if videos:
+            self._count(videos=videos, frames=frames)
             self.start_workers()
         return True
 
     def is_ready(self) -> bool:
-        """Tell whether a job waits whose model is there already."""
-        return any(work.has_model for _, work in self._waiting.values())
+        """Tell whether the model of the next job is there."""
+        _, plan = next(iter(self._waiting.values()))
+        return plan is None or plan.has_model
 
-    def do_next(self) -> tuple[VideoJob, Outcome]:
-        """Do the first job whose model is there, else the first."""
-        waiting = self._waiting.values()
-        ready = (job for job, work in waiting if work.has_model)
-        job, work = self._waiting.pop(next(ready, next(iter(waiting))[0]).name)
-        before = self.progress
-        outcome = self._do(job)
-        if work.videos:
-            # Also the frames that were not drawn: nobody waits for them any more.
-            frames_done = before.frames_done + work.frames
-            self.progress = replace(self.progress, frames_done=frames_done)
-            self._count(videos_done=work.videos)
-        return job, outcome
+    def do_next(self) -> tuple[VideoJob, RenderedVideos]:
+        """Do the first job."""
+        job, plan = self._waiting.pop(next(iter(self._waiting)))
+        before, (videos, frames) = self.progress.frames_done, _work(plan)
+        result = self._do(job)
+        if videos:
+            # Also the frames that were not drawn: they are not waited for any more.
+            self.progress = replace(self.progress, frames_done=before + frames)
+            self._count(videos_done=videos)
+        return job, result
 
     def start_workers(self) -> None:
         """Start the workers: soon there is a video to draw. Idempotent."""
-        # What stands in the way is told when the video is drawn.
+        # What stands in the way is reported when the video is drawn.
         with contextlib.suppress(Error):
             self._pool.start()
 
@@ -244,23 +215,26 @@ class Finisher:
         self.progress = replace(self.progress, **now)
         self.on_progress(self.progress)
 
-    def _do(self, job: VideoJob) -> Outcome:
-        outcome = job.nothing
+    def _do(self, job: VideoJob) -> RenderedVideos:
+        if job.video is None:
+            nothing, name = RenderedVideos(directory=job.directory), job.key.told_name
+        else:
+            nothing, name = RenderedVideos(directory=job.video.parent), job.video.name
         try:
             if job.variant is not None:
-                _check_is_no_original(job)
-                return self._render(outcome, job, [job.directory / job.recording])
+                plan = _plan(job)
+                assert plan is not None
+                return self._render(job, plan)
             lock = claim(job.directory, job.key)
             if lock is None:
-                return replace(outcome, is_elsewhere=True)
+                return replace(nothing, elsewhere=(name,))
             try:
                 # Another process may have done it since it was added.
-                pending = look_at(job.directory, job.key)
-                if pending is None:
-                    return outcome
-                if pending.video is not None:
-                    outcome = replace(outcome, name=pending.video.name)
-                return self._finish(job, pending)
+                plan = look_at(job.directory, job.key)
+                if plan is None:
+                    return nothing
+                name = plan.videos[0].name if plan.videos else name
+                return self._finish(job, plan)
             finally:
                 lock.release()
         except (Error, OSError) as error:
@@ -269,38 +243,33 @@ class Finisher:
             logger.exception("%s cannot be rendered.", job.recording)
             reason = f"{type(error).__name__}: {error}"
         if job.variant is None:
-            note_failure(job.directory, outcome.name, reason)
-        return replace(outcome, failure=reason)
+            note_failure(job.directory, name, reason)
+        return replace(nothing, failures={name: reason})
 
-    def _finish(self, job: VideoJob, pending: PendingRecording) -> Outcome:
-        if pending.is_log and pending.is_kept:
-            finish_trajectory(pending.parts[0])
-        outcome = replace(job.nothing, name=pending.parts[0].name)
-        if pending.video is not None:
-            further = tuple(video.name for video in pending.further_videos)
-            for video in (pending.video, *pending.further_videos):
+    def _finish(self, job: VideoJob, plan: Plan) -> RenderedVideos:
+        if plan.is_log and plan.is_kept:
+            finish_trajectory(plan.parts[0])
+        result = RenderedVideos(
+            directory=job.directory, trajectories=(plan.parts[0].name,)
+        )
+        if plan.videos:
+            for video in plan.videos:
                 remove_unfinished(video)
-            outcome = replace(outcome, name=pending.video.name)
-            outcome = self._render(outcome, job, pending.parts)
-            if outcome.is_video:
-                outcome = replace(outcome, further_videos=further)
-        if not pending.is_kept:
+            result = self._render(job, plan)
+        if not plan.is_kept:
             # The first one last: it says which video they are of.
-            for part in reversed(pending.parts):
+            for part in reversed(plan.parts):
                 part.unlink(missing_ok=True)
                 drop_recording(part)
-        return outcome
+        return result
 
-    def _render(
-        self, outcome: Outcome, job: VideoJob, parts: Sequence[Path]
-    ) -> Outcome:
-        """Render the videos of a recording, and return what became of them."""
+    def _render(self, job: VideoJob, plan: Plan) -> RenderedVideos:
         if self._gl_failure is not None:
             # The same for all of them, after a second of trying each.
             raise self._gl_failure
         try:
-            file = render_video(
-                parts,
+            return render_video(
+                plan.parts,
                 job.variant,
                 workers=self._pool.at_work(),
                 out=job.video,
@@ -310,42 +279,33 @@ class Finisher:
         except GLError as error:
             self._gl_failure = error
             raise
-        except BlankVideo as error:
-            # It is as much of a video as there will ever be.
-            return replace(
-                outcome,
-                is_video=True,
-                frame_count=error.frame_count,
-                failure=str(error),
-                blank_video=error.path.name,
-            )
-        frame_count = 0 if file is None else file.frame_count
-        return replace(outcome, is_video=frame_count > 0, frame_count=frame_count)
 
 
-def _work_of(job: VideoJob) -> _Work | None:
-    """Return how much a job is; None where nothing is to be done."""
-    if job.variant is not None:
-        recorded = read_recording([job.directory / job.recording])
-        return _Work(1, len(recorded.chosen(job.variant.max_fps).indices))
-    pending = look_at(job.directory, job.key)
-    if pending is None:
-        return None
-    videos = int(pending.video is not None) + len(pending.further_videos)
-    return _Work(videos, pending.frame_count, pending.model_file)
+def _plan(job: VideoJob) -> Plan | None:
+    """Return what a job is; None where nothing is to be done.
 
-
-def _check_is_no_original(job: VideoJob) -> None:
-    """Raise InvalidArgument if a video would replace one of a further camera."""
+    Raises:
+        InvalidArgument: a video would replace one of a further camera.
+        Error: the recording cannot be read.
+    """
+    if job.variant is None:
+        return look_at(job.directory, job.key)
     assert job.video is not None
-    if job.video.parent.resolve() != job.directory.resolve():
-        return
     trajectory = job.directory / job.recording
-    facts = read_recording([trajectory]).facts[0]
-    originals = further_video_paths(trajectory, facts) if video_facts(facts) else []
-    if job.video.with_suffix(".mp4").name in {path.name for path in originals}:
+    recorded = read_recording([trajectory])
+    facts, originals = recorded.facts[0], []
+    if video_facts(facts) and job.video.parent.resolve() == job.directory.resolve():
+        originals = [path.name for path in further_video_paths(trajectory, facts)]
+    if job.video.with_suffix(".mp4").name in originals:
         raise InvalidArgument(
             f"{job.video.name} is a recorded video: this camera was recorded too. If "
             "it is not there yet, render what is pending; else say what is to be other "
             "besides the camera, or where to write it."
         )
+    frames = len(recorded.chosen(job.variant.max_fps).indices)
+    return Plan(parts=(trajectory,), videos=(job.video,), frame_count=frames)
+
+
+def _work(plan: Plan | None) -> tuple[int, int]:
+    """Return how many videos and frames a job is, as far as is known."""
+    return (1, 0) if plan is None else (len(plan.videos), plan.frame_count)

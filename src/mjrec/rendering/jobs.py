@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is to be rendered and what became of it, in plain data.
+"""What is to be rendered and its results, in plain data.
 
 A job is about one recording, and the same wherever it is done: in this process, in the
 one beside a simulation, by a worker of an engine. It can be done twice, also by two at
@@ -8,74 +8,102 @@ once: the second finds nothing left to do, or puts the same file in its place.
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Self
 
-from ..formats.video_names import camera_part, name_part
+from ..formats.monitor_directory import (
+    ClipPart,
+    Infix,
+    clip_lock_name,
+    clip_part_name,
+    episode_of,
+    infix_of,
+    trajectory_prefix,
+    video_lock_name,
+    video_prefix,
+)
 from ..rates import to_rate
-from .recordings import RecordingKey, key_of
-from .views import View
+from .views import Variant, View
+
+_CLIP_VIDEO = re.compile(r".*\.video[0-9]{6,18}\.step(?P<step>[0-9]{6,18})\.mp4")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Variant:
-    """What is to be other than recorded; None is as recorded.
+class Progress:
+    """How far a rendering is.
 
     Attributes:
-        view: from where, how large and how well it is drawn.
-        max_fps: the most frames per second of simulated time: frames 0, n, 2n ... of
-            those recorded, with the smallest n that fits, and the last.
-        fps: frames per second of the file. If None, a second of the video is as much
-            simulated time as when the episode was recorded.
-        annotate: whether episode, step, time and return are written on the frames.
-
-    Raises:
-        InvalidArgument: one is no rate.
+        videos_done: how many videos are over, also as failures.
+        videos: how many there are, as far as is known.
+        frames_done: how many frames of these videos are drawn.
+        frames: how many frames these videos have; None where they were not counted:
+            the frames of a video that an engine's worker draws are known when it is
+            over.
     """
 
-    view: View = field(default_factory=View)
-    max_fps: float | Fraction | None = None
-    fps: float | Fraction | None = None
-    annotate: bool | None = None
+    videos_done: int = 0
+    videos: int = 0
+    frames_done: int = 0
+    frames: int | None = 0
 
-    def __post_init__(self) -> None:
-        for rate in (self.max_fps, self.fps):
-            if rate is not None:
-                to_rate(rate)
 
-    def name_for(self, trajectory: str) -> str:
-        """Return the name of the video that shows a trajectory this way.
+@dataclass(frozen=True)
+class RecordingKey:
+    """Which recording of a directory.
 
-        It is the original's with what is other before its extension, such as
-        `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. A camera whose
-        name could be another of these parts is there as `camera-draft`, and one that
-        has none by a hash of its members. Readers of a directory never take it for the
-        original, and those who clear the directory remove it too.
-        """
-        view, parts = self.view, []
-        if isinstance(view.camera, Mapping):
-            members = json.dumps(view.camera, sort_keys=True)
-            digest = hashlib.sha256(members.encode()).hexdigest()
-            parts.append(f"camera-{digest[:8]}")
-        elif view.camera is not None:
-            parts.append(camera_part(view.camera))
-        if view.width or view.height:
-            parts.append(f"{view.width or ''}x{view.height or ''}")
-        if view.quality:
-            parts.append(view.quality)
-        for prefix, rate in (("max", self.max_fps), ("", self.fps)):
-            if rate is not None:
-                parts.append(f"{prefix}{name_part(f'{float(rate):g}')}fps")
-        if self.annotate is not None:
-            parts.append("annotated" if self.annotate else "plain")
-        key = key_of(trajectory)
-        usual = Path(trajectory if key is None else key.video_name)
-        return ".".join([usual.stem, *parts, "mp4"])
+    Attributes:
+        infix: of its monitor.
+        number: the episode's; of a clip, how many steps the monitor had recorded when
+            it began.
+        is_clip: whether it is a clip.
+    """
+
+    infix: Infix
+    number: int
+    is_clip: bool = False
+
+    @property
+    def name(self) -> str:
+        """The base name of the trajectory without extension; that of the first part."""
+        if self.is_clip:
+            return clip_part_name(self.infix, self.number, 0)
+        return trajectory_prefix(self.infix, self.number)
+
+    @property
+    def video_name(self) -> str:
+        """The base name of an episode's video. In which a clip began, only rows say."""
+        return f"{video_prefix(self.infix, self.number)}.mp4"
+
+    @property
+    def told_name(self) -> str:
+        """What it is called where nothing is known of it."""
+        return self.name if self.is_clip else self.video_name
+
+    @property
+    def lock_name(self) -> str:
+        """The name of the file that is locked by the process that works on it."""
+        name_of = clip_lock_name if self.is_clip else video_lock_name
+        return name_of(self.infix, self.number)
+
+
+def key_of(name: str) -> RecordingKey | None:
+    """Return that of the recording that a file is of; None for other files.
+
+    A clip's video that began with an episode is called as that episode's.
+    """
+    if (part := ClipPart.parse(name)) is not None:
+        return RecordingKey(part.infix, part.first_step, is_clip=True)
+    infix, number = Infix.parse(infix_of(name) or ""), episode_of(name)
+    if infix is None or number is None:
+        return None
+    clip = _CLIP_VIDEO.fullmatch(name)
+    if clip is not None:
+        return RecordingKey(infix, int(clip["step"]), is_clip=True)
+    return RecordingKey(infix, number)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,13 +144,6 @@ class VideoJob:
         assert key is not None
         return key
 
-    @property
-    def nothing(self) -> Outcome:
-        """What became of it as long as nothing did."""
-        if self.video is not None:
-            return Outcome(name=self.video.name, directory=self.video.parent)
-        return Outcome(name=self.key.told_name, directory=self.directory)
-
     def as_json(self) -> dict[str, Any]:
         """Return what JSON can hold, for `from_json` in another process."""
         variant = self.variant and {
@@ -159,42 +180,53 @@ class VideoJob:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """What became of a video, or of a trajectory where no video was wanted.
+class RenderedVideos:
+    """What became of the videos that were to be rendered, by the names of files.
 
     Attributes:
-        name: of the file.
-        directory: where it is, or was to be.
-        is_video: a video was rendered.
-        frame_count: how many frames it has, and each of the further ones.
-        further_videos: the names of those that were rendered with it, of further
-            cameras.
-        blank_video: the name of the one that shows nothing, where that is the failure.
-        failure: why it could not be done; None where it was, or needed nothing. Of a
-            video that was rendered: that it shows nothing.
-        is_elsewhere: another process is at it.
+        directory: where they are.
+        videos: those that were rendered, each with the number of its frames.
+        trajectories: of episodes without a video, which got their final form.
+        failures: why videos could not be rendered.
+        blank: what videos that were rendered do not show, where `strict` asked.
+        elsewhere: those that another process is rendering.
     """
 
-    name: str
     directory: Path
-    is_video: bool = False
-    frame_count: int = 0
-    failure: str | None = None
-    is_elsewhere: bool = False
-    further_videos: tuple[str, ...] = ()
-    blank_video: str | None = None
+    videos: Mapping[str, int] = field(default_factory=dict)
+    trajectories: Sequence[str] = ()
+    failures: Mapping[str, str] = field(default_factory=dict)
+    blank: Mapping[str, str] = field(default_factory=dict)
+    elsewhere: Sequence[str] = ()
+
+    @classmethod
+    def joined(cls, parts: Iterable[Self], directory: Path) -> Self:
+        """Return what several results, in which no name comes twice, come to.
+
+        Args:
+            parts: the results.
+            directory: where the videos are, if there are no results that say it.
+        """
+        parts = list(parts)
+        return cls(
+            directory=parts[-1].directory if parts else directory,
+            videos={name: n for part in parts for name, n in part.videos.items()},
+            trajectories=tuple(name for part in parts for name in part.trajectories),
+            failures={name: w for part in parts for name, w in part.failures.items()},
+            blank={name: why for part in parts for name, why in part.blank.items()},
+            elsewhere=tuple(name for part in parts for name in part.elsewhere),
+        )
 
     @property
-    def is_trajectory(self) -> bool:
-        """Whether no video was wanted: a trajectory got its final form."""
-        return not (self.is_video or self.is_elsewhere or self.failure is not None)
+    def is_empty(self) -> bool:
+        """Whether there was nothing to do."""
+        return not (self.videos or self.trajectories or self.failures or self.elsewhere)
 
     def as_json(self) -> dict[str, Any]:
         """Return what JSON can hold, for `from_json` in another process."""
-        return {**asdict(self), "directory": str(self.directory)}
+        return {**vars(self), "directory": str(self.directory)}
 
     @classmethod
-    def from_json(cls, said: Mapping[str, Any]) -> Self:
-        """Return what another process of ours said with `as_json`."""
-        paths = {"directory": Path(said["directory"])}
-        return cls(**{**said, **paths, "further_videos": tuple(said["further_videos"])})
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """Return what another process of ours wrote with `as_json`."""
+        return cls(**{**values, "directory": Path(values["directory"])})

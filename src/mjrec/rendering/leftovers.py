@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..errors import UnreadableFile
-from ..formats.in_flight import read_list
 from ..formats.locks import is_locked
 from ..formats.manifest import read_manifest
 from ..formats.monitor_directory import (
@@ -24,7 +23,7 @@ from ..formats.monitor_directory import (
     lock_name,
     names_in,
 )
-from ..formats.spans import SPANS, Recording, SpanList
+from ..formats.spans import SPANS, Recording, SpanList, read_list
 from ..formats.unfinished_video import note_path
 from ..formats.video_metadata import is_broken, metadata_path
 from ..results.journal_or_stats import MonitorResults

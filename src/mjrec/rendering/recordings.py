@@ -22,101 +22,56 @@ from numpy.typing import NDArray
 
 from ..errors import DirectoryNotWritable, UnreadableFile
 from ..formats.frame_hashes import frame_hash_path
-from ..formats.in_flight import recordings_in_flight
 from ..formats.locks import Lock, is_locked, try_lock
 from ..formats.monitor_directory import (
     ClipPart,
-    Infix,
-    clip_lock_name,
-    clip_part_name,
-    episode_of,
-    infix_of,
     iter_monitor_files,
     lock_name,
     names_in,
-    trajectory_prefix,
-    video_lock_name,
-    video_prefix,
 )
-from ..formats.spans import FINISHED
+from ..formats.spans import FINISHED, recordings_in_flight
 from ..formats.trajectory import added_up
 from ..formats.trajectory_file import find_trajectory
 from ..formats.video_metadata import is_done, metadata_path
+from .jobs import RecordingKey, key_of
 from .recorded_facts import (
+    ChosenFrames,
+    chosen_frames,
     further_video_paths,
     model_file,
     open_for_rendering,
+    recorded_rate,
     video_facts,
     video_path,
 )
-from .recorded_frames import ChosenFrames, chosen_frames, recorded_rate
 
 _UNFINISHED = re.compile(r"[0-9a-f]{8}\.part", re.ASCII)
-_CLIP_VIDEO = re.compile(r".*\.video[0-9]{6,18}\.step(?P<step>[0-9]{6,18})\.mp4")
-
-
-@dataclass(frozen=True)
-class RecordingKey:
-    """Which recording of a directory.
-
-    Attributes:
-        infix: of its monitor.
-        number: the episode's; of a clip, how many steps the monitor had recorded when
-            it began.
-        is_clip: whether it is a clip.
-    """
-
-    infix: Infix
-    number: int
-    is_clip: bool = False
-
-    @property
-    def name(self) -> str:
-        """The base name of the trajectory without extension; that of the first part."""
-        if self.is_clip:
-            return clip_part_name(self.infix, self.number, 0)
-        return trajectory_prefix(self.infix, self.number)
-
-    @property
-    def video_name(self) -> str:
-        """The base name of an episode's video. In which a clip began, only rows say."""
-        return f"{video_prefix(self.infix, self.number)}.mp4"
-
-    @property
-    def told_name(self) -> str:
-        """What it is called where nothing is known of it."""
-        return self.name if self.is_clip else self.video_name
-
-    @property
-    def lock_name(self) -> str:
-        """The name of the file that is locked by the process that works on it."""
-        name_of = clip_lock_name if self.is_clip else video_lock_name
-        return name_of(self.infix, self.number)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PendingRecording:
-    """A recording that is left to do.
+class Plan:
+    """What is to be done about a recording.
 
     Attributes:
-        key: which one.
         parts: its rows, by the names of their files, in order.
-        video: what is to be rendered; None where nothing is.
-        further_videos: what is to be rendered besides, of further cameras.
+        videos: those that are to be rendered, the first camera's first.
         frame_count: how many frames are to be rendered, of all of these.
         is_log: its rows are in a log still.
         is_kept: the trajectory stays once the video is there.
         model_file: what has to be there for rendering, if it is known.
     """
 
-    key: RecordingKey
     parts: tuple[Path, ...]
-    video: Path | None
-    further_videos: tuple[Path, ...]
+    videos: tuple[Path, ...]
     frame_count: int
-    is_log: bool
-    is_kept: bool
-    model_file: Path | None
+    is_log: bool = False
+    is_kept: bool = True
+    model_file: Path | None = None
+
+    @property
+    def has_model(self) -> bool:
+        """Whether the model is there; while a simulation runs it may be on its way."""
+        return self.model_file is None or self.model_file.exists()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +132,7 @@ def read_recording(parts: Sequence[Path]) -> Recorded:
         if clip is not None and clip.number != number:
             raise UnreadableFile(path, f"part {number} of its video is not there")
         with open_for_rendering(path) as reader:
-            facts.append(reader.header.facts)
+            facts.append(reader.facts)
             frame_counts.append(reader.frame_count)
             rewards.append(reader.rewards)
             steps = reader.frame_steps
@@ -192,22 +147,6 @@ def read_recording(parts: Sequence[Path]) -> Recorded:
         step_count=len(all_rewards),
         reward=added_up(all_rewards),
     )
-
-
-def key_of(name: str) -> RecordingKey | None:
-    """Return that of the recording that a file is of; None for other files.
-
-    A clip's video that began with an episode is called as that episode's.
-    """
-    if (part := ClipPart.parse(name)) is not None:
-        return RecordingKey(part.infix, part.first_step, is_clip=True)
-    infix, number = Infix.parse(infix_of(name) or ""), episode_of(name)
-    if infix is None or number is None:
-        return None
-    clip = _CLIP_VIDEO.fullmatch(name)
-    if clip is not None:
-        return RecordingKey(infix, int(clip["step"]), is_clip=True)
-    return RecordingKey(infix, number)
 
 
 def recordings(directory: Path) -> list[RecordingKey]:
@@ -256,7 +195,7 @@ def _is_done(directory: Path, key: RecordingKey) -> bool:
     return (directory / f"{key.name}{FINISHED}").is_file()
 
 
-def look_at(directory: Path, key: RecordingKey) -> PendingRecording | None:
+def look_at(directory: Path, key: RecordingKey) -> Plan | None:
     """Return what is left to do about a recording; None where it is nothing.
 
     One that is still running, or of which its monitor has not decided yet whether it
@@ -281,24 +220,21 @@ def look_at(directory: Path, key: RecordingKey) -> PendingRecording | None:
     first, facts, last = parts[0], recorded.facts[0], recorded.facts[-1]
     if is_log and is_open and ("complete" not in last or last.get("candidate", False)):
         return None
-    video: Path | None = None
-    further: list[Path] = []
+    videos: list[Path] = []
     if key.is_clip or video_facts(facts).get("recording") == "deferred":
-        video, further = video_path(first, facts), further_video_paths(first, facts)
-    if video is not None and is_done(video):
-        video, further = None, []
-    if video is None and not is_log:
+        videos = [video_path(first, facts), *further_video_paths(first, facts)]
+    if videos and is_done(videos[0]):
+        videos = []
+    if not (videos or is_log):
         return None
-    frames = 0 if video is None else len(recorded.chosen().indices)
-    return PendingRecording(
-        key=key,
+    frames = len(recorded.chosen().indices) if videos else 0
+    return Plan(
         parts=tuple(parts),
-        video=video,
-        further_videos=tuple(further),
-        frame_count=frames * (1 + len(further)),
+        videos=tuple(videos),
+        frame_count=frames * len(videos),
         is_log=is_log,
         is_kept=not key.is_clip and facts.get("kept", True),
-        model_file=model_file(directory, last),
+        model_file=model_file(directory, last) if videos else None,
     )
 
 

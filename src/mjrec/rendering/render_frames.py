@@ -17,8 +17,12 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidArgument
 from ..frames import Frame
 from .pool import WorkerPool
-from .recorded_facts import open_for_rendering
-from .recorded_frames import check_has_frames, chosen_frames, warn_of_other_frames
+from .recorded_facts import (
+    check_has_frames,
+    chosen_frames,
+    open_for_rendering,
+    warn_of_other_frames,
+)
 from .views import View, plain_camera
 
 if TYPE_CHECKING:
@@ -86,7 +90,7 @@ def render(
         quality=quality,
     )
     with open_for_rendering(path) as reader:
-        facts = reader.header.facts
+        facts = reader.facts
         check_has_frames(reader)
         warn_of_other_frames(path.name, facts)
         chosen = chosen_frames(reader.frame_count, facts, max_fps)

@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from ..annotation import Caption, check_annotation
-from ..errors import EncoderError, NoPictures
+from ..errors import BlankVideo, EncoderError, NoPictures
 from ..formats.journal import KILLED
 from ..formats.second_names import give_second_names, take_second_names
-from ..formats.video_file import VideoFile
 from ..formats.video_metadata import StepRuns, timing_facts, write_metadata
 from ..formats.video_names import second_name_of
 from ..formats.video_sink import VideoSink
@@ -29,22 +28,20 @@ from ..frames import Frame, grid_shape
 from ..machine import machine_fingerprint
 from ..provenance import versions
 from ..rates import to_rate
-from .jobs import Variant
+from .jobs import RenderedVideos
 from .pool import WorkerPool
 from .recorded_facts import (
-    further_video_paths,
-    open_for_rendering,
-    video_facts,
-    video_path,
-)
-from .recorded_frames import (
     ChosenFrames,
     captions,
+    further_video_paths,
+    open_for_rendering,
     usual_fps,
+    video_facts,
+    video_path,
     warn_of_other_frames,
 )
 from .recordings import Recorded, read_recording
-from .views import PlainCamera, View, plain_camera
+from .views import PlainCamera, Variant, View, plain_camera
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +71,7 @@ def render_video(
     out: Path | None = None,
     strict: bool = False,
     on_frame: Callable[[], object] = lambda: None,
-) -> VideoFile | None:
+) -> RenderedVideos:
     """Render the video of a recording, with its frame hashes and its metadata.
 
     Where several cameras were recorded, so many videos, or one of all side by side. All
@@ -89,18 +86,18 @@ def render_video(
         workers: draw the frames.
         out: the video, of the first camera or of all side by side; as the recording
             says, beside it, if None.
-        strict: whether a video that shows nothing is an error; else it is a warning.
+        strict: whether a video that shows nothing is among the `blank` of the result;
+            else it is a warning.
         on_frame: called after every frame, once for each of every video.
 
     Returns:
-        What was written, of the first camera; None where the recording broke before
-        there was a frame, which the metadata now says.
+        The videos; none, and the name of the trajectory, where the recording broke
+        before there was a frame, which the metadata now says.
 
     Raises:
         NoPictures: it has no frames.
         UnreadableFile: it is damaged.
         MissingDependency: frames are to be written on, and there is no Pillow.
-        BlankVideo: `strict`, and a video shows nothing. All are there and stay.
         FileNotWritten: the disk is full.
         Error: its frames cannot be drawn or encoded.
     """
@@ -108,7 +105,7 @@ def render_video(
     facts, variant = recorded.facts[0], variant or Variant()
     if not sum(recorded.frame_counts):
         _note_that_it_broke(recorded, out)
-        return None
+        return RenderedVideos(directory=parts[0].parent, trajectories=(parts[0].name,))
     warn_of_other_frames(parts[0].name, facts)
     chosen = recorded.chosen(variant.max_fps)
     runs = list(_runs(recorded, chosen.indices))
@@ -136,27 +133,29 @@ def render_video(
         # They would go on leading to what is replaced now.
         take_second_names(shots[-1].path)
     sinks: list[VideoSink] = []
+    videos: dict[str, int] = {}
     try:
         for shot in shots:
-            sink = _film(
-                shot,
-                rate,
-                functools.partial(_drawn, workers, shot, runs, annotate=annotate),
-                on_frame,
-            )
+            draw = functools.partial(_drawn, workers, shot, runs, annotate=annotate)
+            sink = _film(shot.path, rate, draw, on_frame)
             sinks.append(sink)
-            sink.describe({**said, **shot.facts, **workers.gl_facts})
+            facts = sink.describe({**said, **shot.facts, **workers.gl_facts})
+            videos[sink.path.name] = facts["frame_count"]
     except BaseException:
         for sink in sinks:
             sink.discard()
         raise
     if out is None:
         give_second_names(shots[-1].path)
-    suspects = [sink for sink in sinks if sink.blank.suspicion() is not None]
-    for number, sink in reversed(list(enumerate(suspects))):
-        # With `strict` the first is an error, when all others have been warned of.
-        sink.blank.judge(sink.path, strict=strict and number == 0)
-    return sinks[-1].file
+    blank: dict[str, str] = {}
+    for sink in sinks:
+        try:
+            sink.blank.judge(sink.path, strict=strict)
+        except BlankVideo as error:
+            blank[sink.path.name] = str(error)
+    first = shots[-1].path
+    videos = {first.name: videos[first.name], **videos}
+    return RenderedVideos(directory=first.parent, videos=videos, blank=blank)
 
 
 def _note_that_it_broke(recorded: Recorded, out: Path | None) -> None:
@@ -290,7 +289,7 @@ def _shots(
 
 
 def _film(
-    shot: _Shot,
+    path: Path,
     fps: Fraction,
     draw: Callable[[], Iterable[tuple[Frame, Caption | None]]],
     on_frame: Callable[[], object],
@@ -301,10 +300,8 @@ def _film(
         What has written it; its metadata is still missing.
     """
     most = 0
-
-    def film() -> VideoSink:
-        nonlocal most
-        sink = VideoSink(shot.path, fps=fps)
+    for is_last in (False, True):
+        sink = VideoSink(path, fps=fps)
         try:
             for number, (frame, caption) in enumerate(draw(), 1):
                 sink.write(frame, caption)
@@ -312,17 +309,13 @@ def _film(
                     most = number
                     on_frame()
             sink.finish()
-        except BaseException:
+            break
+        except BaseException as error:
             # Half a video is of no use: all of it can be rendered again.
             sink.discard()
-            raise
-        return sink
-
-    try:
-        return film()
-    except EncoderError as error:
-        # Killed, for lack of memory or for hanging.
-        if (error.returncode or 0) >= 0:
-            raise
-        logger.warning("The video %s is begun anew: %s", shot.path.name, error)
-    return film()
+            # Killed, for lack of memory or for hanging.
+            is_killed = isinstance(error, EncoderError) and (error.returncode or 0) < 0
+            if is_last or not is_killed:
+                raise
+            logger.warning("The video %s is begun anew: %s", path.name, error)
+    return sink

@@ -3,93 +3,34 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from ..annotation import check_annotation
 from ..engines.work import Engine
 from ..errors import InvalidArgument
-from ..formats.in_flight import is_in_flight
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
+from ..formats.spans import is_in_flight
+from ..formats.video_names import camera_part, name_part
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine, given_engine
 from .finish import bring_up_to_date, do_jobs
-from .jobs import Outcome, Variant, VideoJob
-from .progress import Progress
-from .recordings import RecordingKey, key_of, parts_of, recordings
+from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
+from .pool import check_workers
+from .recordings import parts_of, recordings
 from .recovery import recover
-from .shared_pool import check_workers
-from .views import View
+from .views import Variant, View
 
 _SHOWN = 20
 
 _OnProgress = Callable[[Progress], object]
-
-
-@dataclass(frozen=True, kw_only=True)
-class RenderedVideos:
-    """What became of the videos that were to be rendered, by the names of files.
-
-    Attributes:
-        directory: where they are.
-        videos: those that were rendered, each with the number of its frames.
-        trajectories: of episodes without a video, which got their final form.
-        failures: why videos could not be rendered.
-        blank: what videos that were rendered do not show, where `strict` asked.
-        elsewhere: those that another process is rendering.
-    """
-
-    directory: Path
-    videos: Mapping[str, int] = field(default_factory=dict)
-    trajectories: Sequence[str] = ()
-    failures: Mapping[str, str] = field(default_factory=dict)
-    blank: Mapping[str, str] = field(default_factory=dict)
-    elsewhere: Sequence[str] = ()
-
-    @classmethod
-    def of(cls, outcomes: Iterable[Outcome], directory: Path) -> Self:
-        """Return what outcomes come to.
-
-        Args:
-            outcomes: what `iter_rendered_videos` yields.
-            directory: where the videos are, if there are no outcomes that say it.
-        """
-        videos: dict[str, int] = {}
-        blank: dict[str, str] = {}
-        failures: dict[str, str] = {}
-        trajectories, elsewhere = [], []
-        for outcome in outcomes:
-            directory = outcome.directory
-            if outcome.is_video:
-                names = (outcome.name, *outcome.further_videos)
-                videos.update(dict.fromkeys(names, outcome.frame_count))
-                if outcome.failure is not None:
-                    blank[outcome.blank_video or outcome.name] = outcome.failure
-            elif outcome.failure is not None:
-                failures[outcome.name] = outcome.failure
-            elif outcome.is_elsewhere:
-                elsewhere.append(outcome.name)
-            else:
-                trajectories.append(outcome.name)
-        return cls(
-            directory=directory,
-            videos=videos,
-            trajectories=tuple(trajectories),
-            failures=failures,
-            blank=blank,
-            elsewhere=tuple(elsewhere),
-        )
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether there was nothing to do."""
-        return not (self.videos or self.trajectories or self.failures or self.elsewhere)
 
 
 def render_videos(
@@ -167,7 +108,7 @@ def render_videos(
         fps=fps,
         annotate=annotate,
     )
-    outcomes = iter_rendered_videos(
+    results = iter_rendered_videos(
         Path(target),
         variant,
         episode=episode,
@@ -179,7 +120,7 @@ def render_videos(
         on_progress=on_progress,
     )
     path = Path(target)
-    return RenderedVideos.of(outcomes, path if path.is_dir() else path.parent)
+    return RenderedVideos.joined(results, path if path.is_dir() else path.parent)
 
 
 def iter_rendered_videos(
@@ -193,7 +134,7 @@ def iter_rendered_videos(
     trust_models: bool = False,
     engine: Engine | str | None = None,
     on_progress: _OnProgress | None = None,
-) -> Iterator[Outcome]:
+) -> Iterator[RenderedVideos]:
     """Do what `render_videos` does, and yield what became of each as it is over.
 
     What is asked for is checked before anything is begun, and before this returns.
@@ -219,24 +160,29 @@ def iter_rendered_videos(
     directory, keys = _recordings_of(target, episode)
     is_pending = variant == Variant() and out is None
     if is_pending:
-        jobs = _pending_jobs(target, keys, strict=strict)
+        jobs = [VideoJob.finishing(directory, key, strict=strict) for key in keys]
+        if not keys and not target.is_dir():
+            raise InvalidArgument(
+                f"No video of {target.name} is pending: no recording has such a name. "
+                "To render it again, say what is to be other (camera, size, max_fps, "
+                "quality, fps, annotate) or where to write it (out, --out)."
+            )
     else:
         workers = workers or usable_cpus()
         jobs = _variant_jobs(target, keys, variant, out, strict=strict)
-    tell = on_progress or (lambda _: None)
-    outcomes = (
-        do_jobs(jobs, directory, workers=workers, on_progress=tell)
-        if given is None
-        else do_on_engine(given, jobs, on_progress=tell)
-    )
+    on_progress = on_progress or (lambda _: None)
+    if given is None:
+        results = do_jobs(jobs, directory, workers=workers, on_progress=on_progress)
+    else:
+        results = do_on_engine(given, jobs, on_progress=on_progress)
     if is_pending:
-        outcomes = itertools.chain(outcomes, _afterwards(directory, target, episode))
-    return _trusting(outcomes) if trust_models else outcomes
+        results = itertools.chain(results, _afterwards(directory, target, episode))
+    return _trusting(results) if trust_models else results
 
 
 def _afterwards(
     directory: Path, target: Path, episode: int | None
-) -> Iterator[Outcome]:
+) -> Iterator[RenderedVideos]:
     """Bring the directory up to date, and yield what stands in the way.
 
     Of a whole directory, what killed monitors left is put in order too.
@@ -244,12 +190,12 @@ def _afterwards(
     bring_up_to_date(directory)
     if target.is_dir() and episode is None:
         for file in recover(directory).failures:
-            yield Outcome(name=file.name, directory=directory, failure=file.what)
+            yield RenderedVideos(directory=directory, failures={file.name: file.what})
 
 
-def _trusting(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
+def _trusting(results: Iterator[RenderedVideos]) -> Iterator[RenderedVideos]:
     with trusting_models():
-        yield from outcomes
+        yield from results
 
 
 def _recordings_of(
@@ -281,25 +227,6 @@ def _recordings_of(
             f"{listed}{' ...' * (len(numbers) > _SHOWN)}."
         )
     return target, chosen
-
-
-def _pending_jobs(
-    target: Path, keys: Sequence[RecordingKey], *, strict: bool
-) -> list[VideoJob]:
-    """Return the jobs that finish recordings.
-
-    Raises:
-        InvalidArgument: the target is a file of no recording.
-    """
-    if target.is_dir():
-        return [VideoJob.finishing(target, key, strict=strict) for key in keys]
-    if not keys:
-        raise InvalidArgument(
-            f"No video of {target.name} is pending: no recording has such a name. To "
-            "render it again, say what is to be other (camera, size, max_fps, quality, "
-            "fps, annotate) or where to write it (out, --out)."
-        )
-    return [VideoJob.finishing(target.parent, key, strict=strict) for key in keys]
 
 
 def _variant_jobs(
@@ -347,7 +274,37 @@ def _variant_jobs(
             recording=name,
             strict=strict,
             variant=variant,
-            video=out or directory / variant.name_for(name),
+            video=out or directory / name_of_variant(name, variant),
         )
         for name in names
     ]
+
+
+def name_of_variant(trajectory: str, variant: Variant) -> str:
+    """Return the name of the video that shows a trajectory this way.
+
+    It is the original's with what is other before its extension, such as
+    `openaigym.video.<infix>.video000027.side.1280x720.draft.mp4`. A camera whose
+    name could be another of these parts is there as `camera-draft`, and one that
+    has none by a hash of its members. Readers of a directory never take it for the
+    original, and those who clear the directory remove it too.
+    """
+    view, parts = variant.view, []
+    if isinstance(view.camera, Mapping):
+        members = json.dumps(view.camera, sort_keys=True)
+        digest = hashlib.sha256(members.encode()).hexdigest()
+        parts.append(f"camera-{digest[:8]}")
+    elif view.camera is not None:
+        parts.append(camera_part(view.camera))
+    if view.width or view.height:
+        parts.append(f"{view.width or ''}x{view.height or ''}")
+    if view.quality:
+        parts.append(view.quality)
+    for prefix, rate in (("max", variant.max_fps), ("", variant.fps)):
+        if rate is not None:
+            parts.append(f"{prefix}{name_part(f'{float(rate):g}')}fps")
+    if variant.annotate is not None:
+        parts.append("annotated" if variant.annotate else "plain")
+    key = key_of(trajectory)
+    usual = Path(trajectory if key is None else key.video_name)
+    return ".".join([usual.stem, *parts, "mp4"])

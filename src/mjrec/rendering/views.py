@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from fractions import Fraction
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..errors import InvalidArgument, UnknownName
 from ..frames import check_quality, check_size
+from ..rates import to_rate
 
 PlainCamera: TypeAlias = "str | int | dict[str, Any]"
 
@@ -62,6 +64,33 @@ class View:
     def as_json(self) -> dict[str, Any]:
         """Return what JSON can hold, for `View(**...)` in another process."""
         return asdict(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """What is to be other than recorded; None is as recorded.
+
+    Attributes:
+        view: from where, how large and how well it is drawn.
+        max_fps: the most frames per second of simulated time: frames 0, n, 2n ... of
+            those recorded, with the smallest n that fits, and the last.
+        fps: frames per second of the file. If None, a second of the video is as much
+            simulated time as when the episode was recorded.
+        annotate: whether episode, step, time and return are written on the frames.
+
+    Raises:
+        InvalidArgument: one is no rate.
+    """
+
+    view: View = field(default_factory=View)
+    max_fps: float | Fraction | None = None
+    fps: float | Fraction | None = None
+    annotate: bool | None = None
+
+    def __post_init__(self) -> None:
+        for rate in (self.max_fps, self.fps):
+            if rate is not None:
+                to_rate(rate)
 
 
 def plain_camera(camera: Any) -> PlainCamera:

@@ -29,10 +29,10 @@ from ..formats.json_fields import field, integer, list_of, rate, read_object
 from ..formats.video_metadata import metadata_path
 from ..frames import Frame
 from ..rendering.pool import WorkerPool
-from ..rendering.recorded_facts import open_for_rendering
-from ..rendering.recorded_frames import (
+from ..rendering.recorded_facts import (
     captions,
     check_has_frames,
+    open_for_rendering,
     warn_of_other_frames,
 )
 from ..rendering.views import View
@@ -156,7 +156,7 @@ class _Shots:
 def _of_trajectory(path: Path, count: int, view: View) -> Iterator[_Shots]:
     with open_for_rendering(path) as reader:
         check_has_frames(reader)
-        warn_of_other_frames(path.name, reader.header.facts)
+        warn_of_other_frames(path.name, reader.facts)
         indices = _spread(reader.frame_count, count, path)
         times = [caption.time for caption in captions(reader, indices)]
     workers = WorkerPool(1)

@@ -16,7 +16,6 @@ from typing import Any
 
 from .. import json_text
 from ..errors import DirectoryNotWritable, UnreadableFile
-from ..formats.in_flight import is_in_flight
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.manifest import GYM_VERSION, Manifest, read_manifest, write_manifest
 from ..formats.monitor_directory import (
@@ -35,7 +34,7 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.render_failures import forget_failure, reason_of
-from ..formats.spans import FINISHED
+from ..formats.spans import FINISHED, is_in_flight
 from ..formats.stats_file import StatsFile, read_stats_file, write_stats_file
 from ..formats.video_metadata import (
     finished_videos,

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from ..formats.in_flight import recordings_in_flight
 from ..formats.journal import MOST_EPISODES
 from ..formats.monitor_directory import (
     Infix,
@@ -16,6 +15,7 @@ from ..formats.monitor_directory import (
     is_manifest,
     iter_monitor_files,
 )
+from ..formats.spans import recordings_in_flight
 
 # Videos of further cameras have the camera's name before the ending.
 _VIDEO = re.compile(r".*\.video(?P<episode>\d{6,})\.(?P<kind>meta\.json|mp4|avi|json)")

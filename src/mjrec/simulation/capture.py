@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ClosedError, PicturesDiffer
-from ..formats.trajectory import RowLayout, StateComponent
 from .cameras import is_tracking, raw_data, raw_model
 from .captured_arrays import (
     STATE_SPEC,
     needs_constraints,
-    snapshot_layout,
-    state_components,
+    snapshot_dtype,
+    state_dtype,
     state_words,
 )
 from .change_detection import Looks
@@ -37,8 +36,8 @@ T = TypeVar("T")
 
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
-# Fields of a model that `snapshot_layout` looks at, which environments leave alone.
-_SETTLING_THE_LAYOUT = (
+# Fields of a model that `snapshot_dtype` looks at, which environments leave alone.
+_SETTLING_THE_KIND = (
     *("tendon_limited", "tendon_matid", "tendon_plasticadr"),
     "sensor_",
 )
@@ -49,9 +48,9 @@ class EpisodeStart:
     """What is known of a simulation when an episode begins.
 
     Attributes:
-        state: the components of a state.
-        snapshot: of what frames are drawn from; without fields where `refusal` says
-            why there are none.
+        state: what a state consists of.
+        snapshot: what frames are drawn from; None where `refusal` says why there are
+            none.
         model: where the model is stored, for the facts of a trajectory.
         scene: how it is shown, likewise; None where there are no snapshots.
         model_fields: what is other than in the stored model.
@@ -64,8 +63,8 @@ class EpisodeStart:
             environment is called again. It keeps the words alive.
     """
 
-    state: tuple[StateComponent, ...]
-    snapshot: RowLayout
+    state: np.dtype[Any]
+    snapshot: np.dtype[Any] | None
     model: Mapping[str, Any]
     scene: Mapping[str, Any] | None
     model_fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -122,7 +121,9 @@ class Capture:
         self._frames: _Frames | None = None
         self._refusal: str | None = None
         self._looks_at_everything = False
-        self._quick: _QuickLook | None = None
+        # Whether only the state has changed since the last capture, and what ends that.
+        self._is_current: Callable[[], bool] = _never
+        self._look_closely: Callable[[], None] = lambda: None
         # As `simulation` gave them last; they may be dm_control's wrappers.
         self._seen: tuple[Any, Any] = (None, None)
 
@@ -142,20 +143,23 @@ class Capture:
         stored, fields = self._stored_model(raw_model(self._seen[0]))
         self._looks_at_everything = False
         frames = self._frames_of(stored, data, self._view(), fields)
-        refusal = self._refusal = self._reason_against(frames, fields)
-        self._quick = None
+        refusal = self._refusal = self._obstacle()
+        if refusal is None and not frames.is_sound(fields):
+            refusal = self._refusal = self._at_moment(
+                lambda: frames.objection(fields, frames.source.taken())
+            )
+        self._is_current = _never
         if self._is_unmoved is not None and refusal is None and not frames.scene:
-            self._quick = _QuickLook(self._is_unmoved, stored.looks, frames)
-        quick = self._quick
+            self._watch(stored.looks, self._is_unmoved)
         return EpisodeStart(
-            state=stored.components,
-            snapshot=frames.layout if refusal is None else RowLayout(),
+            state=stored.state,
+            snapshot=frames.kind if refusal is None else None,
             model=stored.facts,
             scene=frames.facts() if refusal is None else None,
             model_fields=fields,
             refusal=refusal,
-            words=None if quick is None else frames.words,
-            is_current=(lambda: False) if quick is None else quick.is_current,
+            words=None if self._is_current is _never else frames.words,
+            is_current=self._is_current,
         )
 
     def capture_state(self, out: NDArray[np.float64]) -> None:
@@ -168,12 +172,12 @@ class Capture:
         mujoco.mj_getState(stored.model, frames.data, out, STATE_SPEC)
 
     def capture_snapshot(
-        self, out: NDArray[np.uint8]
+        self, out: NDArray[np.uint64]
     ) -> Mapping[str, NDArray[Any]] | None:
         """Write what a frame of this moment is drawn from into `out`.
 
         Args:
-            out: `(snapshot.size,)`, contiguous, at a multiple of 8 bytes.
+            out: all of its words.
 
         Returns:
             Model and view fields that are other than at the capture before, or at the
@@ -183,10 +187,9 @@ class Capture:
             PicturesDiffer: the frame of this moment cannot be made from a snapshot,
                 which was possible when the episode began.
         """
-        quick = self._quick
-        if quick is not None and quick.is_current():
+        if self._frames is not None and self._is_current():
             # The usual case, in half the time of the others.
-            quick.take(out)
+            self._frames.source.take(out)
             return None
         _, frames = self._followed()
         reason = self._refusal or self._obstacle()
@@ -203,7 +206,7 @@ class Capture:
     def model_changed(self) -> None:
         """Note that anything in the model may be another; the next capture looks."""
         self._looks_at_everything = True
-        self._end_quick_look()
+        self._look_closely()
 
     def forget_pictures(self) -> None:
         """Let the next episode's frames depend on none that was made before.
@@ -229,7 +232,7 @@ class Capture:
         """Let go of model and data; idempotent. What waits is still stored."""
         if self._store is not None:
             self._store.leave()
-        self._end_quick_look()
+        self._look_closely()
         self._stored = self._frames = None
         self._seen = (None, None)
 
@@ -260,20 +263,18 @@ class Capture:
             *(data._address, id(view.camera), id(view.option), view.max_geom),
             *(view.fresh, view.height, view.width, view.label),
             stored.looks.view_bytes(),
-            # Then the layout may be another one, and nothing is equal to this.
-            object() if any(n.startswith(_SETTLING_THE_LAYOUT) for n in fields) else 0,
+            # Then a snapshot may need others, and nothing is equal to this.
+            object() if any(n.startswith(_SETTLING_THE_KIND) for n in fields) else 0,
         )
         if self._frames is None or self._frames.key != key:
             self._frames = _Frames(stored, data, view, key)
         return self._frames
 
-    def _reason_against(self, frames: _Frames, fields: Mapping[str, Any]) -> str | None:
-        reason = self._obstacle()
-        if reason is not None:
-            return reason
-        if frames.is_sound(fields):
-            return frames.objection(fields) if fields else None
-        return self._at_moment(lambda: frames.objection(fields))
+    def _watch(self, looks: Looks, is_unmoved: Callable[[], bool]) -> None:
+        """Let `is_current` tell whether view and model are as at the last capture."""
+        seen, present = [*looks.seen], [*looks.present]
+        self._is_current = lambda: seen == present and is_unmoved()
+        self._look_closely = seen.clear
 
     def _at_moment(self, do: Callable[[], T]) -> T:
         """Return what `do` returns in the moment when a frame would be drawn."""
@@ -282,12 +283,13 @@ class Capture:
         return results[-1]
 
     def _captured(
-        self, frames: _Frames, out: NDArray[np.uint8]
+        self, frames: _Frames, out: NDArray[np.uint64]
     ) -> dict[str, NDArray[Any]] | None:
         frames.source.take(out)
         changed = self._changed()
-        if changed is not None:
-            reason = frames.objection_after(changed, out)
+        fields = [name for name in changed or () if not name.startswith("camera.")]
+        if fields and not frames.is_sound(fields):
+            reason = frames.objection(fields, out.view(frames.kind)[0])
             if reason is not None:
                 raise _differs(reason)
         return frames.drawn(changed)
@@ -305,12 +307,6 @@ class Capture:
             )
         return changed
 
-    def _end_quick_look(self) -> None:
-        """Look closely from here on, whoever has been told of the memory."""
-        if self._quick is not None:
-            self._quick.end()
-            self._quick = None
-
     def _followed(self) -> tuple[_StoredModel, _Frames]:
         """Take note of other objects in mid-episode."""
         model, data = self._simulation()
@@ -320,7 +316,7 @@ class Capture:
         if model is not self._seen[0] or data is not self._seen[1]:
             if not stored.looks.is_of(raw_model(model)):
                 raise _differs("the environment has gone over to another model")
-            self._end_quick_look()
+            self._look_closely()
             frames = self._frames = _Frames(stored, raw_data(data), frames.view, None)
             self._seen = (model, data)
         return stored, frames
@@ -328,10 +324,6 @@ class Capture:
 
 class _StoredModel:
     """A model that is stored, and what is known of it.
-
-    Args:
-        model: the model.
-        facts: where it is stored.
 
     Attributes:
         scene: where each frame leaves its two cameras; None before the first.
@@ -343,7 +335,7 @@ class _StoredModel:
         self.model = model
         self.facts = facts
         self.looks = Looks(model)
-        self.components = state_components(model)
+        self.state = state_dtype(model)
         self.scene: mujoco.MjvScene | None = None
         self.options: set[bytes] = set()
         self.fields: set[str] = set()
@@ -357,14 +349,9 @@ class _Frames:
     tracks a body goes a fifth of the way to it in each frame. Positions are those that
     MuJoCo computes, without any drawing.
 
-    Args:
-        stored: the model; kept alive, as is the data.
-        data: its data.
-        view: how the scene is shown.
-        key: what it depends on.
-
     Attributes:
-        layout: of the snapshots.
+        key: what it depends on.
+        kind: of the snapshots.
         source: of the snapshots themselves.
         words: of a row, where it can be gathered.
         scene: has the cameras; None where no frame has an influence on the next.
@@ -375,17 +362,15 @@ class _Frames:
     ) -> None:
         model = stored.model
         self.data, self.view, self.key = data, view, key
-        self.layout = snapshot_layout(model, data, view.option)
-        self.source = SnapshotSource(model, data, self.layout)
+        self.kind = snapshot_dtype(model, data, view.option)
+        self.source = SnapshotSource(model, data, self.kind)
         state = state_words(model, data)
         self.words: NDArray[np.intp] | None = None
         if state is not None and self.source.words is not None:
             self.words = np.concatenate([state, self.source.words])
         self._stored = stored
         self._facts = view.facts()
-        # Moved as frames move it; the environment's own stays where it is.
-        self._camera = copy.copy(view.camera)
-        self._lookat = self._camera.lookat.tolist()
+        self._follow_camera()
         self.scene: mujoco.MjvScene | None = None
         if is_tracking(view.camera) or (not view.fresh and _has_infinite_plane(model)):
             self.scene = stored.scene or mujoco.MjvScene(model, maxgeom=1)
@@ -393,10 +378,9 @@ class _Frames:
     def facts(self) -> dict[str, Any]:
         """Return the facts of the scene, and what the frame before left in it."""
         facts = {**self._facts}
-        if self.scene is not None and not self.view.fresh:
-            before = self._stored.scene
-            if before is not None:
-                facts["previous_cameras"] = [c.pos.tolist() for c in before.camera]
+        before = self._stored.scene
+        if self.scene is not None and not self.view.fresh and before is not None:
+            facts["previous_cameras"] = [c.pos.tolist() for c in before.camera]
         if is_tracking(self._camera):
             self._lookat = self._camera.lookat.tolist()
             facts["camera"] = {**facts["camera"], "lookat": self._lookat}
@@ -412,58 +396,37 @@ class _Frames:
         is_known = stored.looks.option_bytes() in stored.options
         return is_known and stored.fields.issuperset(fields)
 
-    def objection(
-        self, fields: Collection[str], row: NDArray[np.uint8] | None = None
-    ) -> str | None:
+    def objection(self, fields: Iterable[str], row: Any) -> str | None:
         """Say why frames of this moment cannot be drawn from snapshots.
 
         Args:
-            fields: of the model, other than in the stored one.
-            row: the snapshot of this moment; it is taken, if None.
+            fields: of model and option, that have changed.
+            row: the snapshot of this moment.
         """
-        stored, view = self._stored, self.view
-        reason = needs_constraints(stored.model, view.option)
-        if reason is not None or self.is_sound(fields):
+        stored, option = self._stored, self.view.option
+        reason = needs_constraints(stored.model, option)
+        if reason is not None:
             return reason
-        if row is None:
-            row = np.empty(self.layout.size, np.uint8)
-            self.source.take(row)
-        found = scene_difference(stored.model, self.data, self.layout, row, view)
+        needed = snapshot_dtype(stored.model, self.data, option).names or ()
+        missing = {*needed} - {*(self.kind.names or ())}
+        if missing:
+            return (
+                f"it now needs {', '.join(sorted(missing))} as well, which the "
+                "recording of this episode was not begun with"
+            )
+        found = scene_difference(stored.model, self.data, row, self.view)
         if found is not None:
             return f"drawn from its snapshot the scene is another one: {found}"
         stored.options.add(stored.looks.option_bytes())
         stored.fields.update(fields)
         return None
 
-    def objection_after(
-        self, changed: Iterable[str], row: NDArray[np.uint8]
-    ) -> str | None:
-        """Say why snapshots do not suffice any longer, after something has changed.
-
-        Args:
-            changed: the fields of model and view that have.
-            row: the snapshot of this moment.
-        """
-        fields = [name for name in changed if not name.startswith("camera.")]
-        if self.is_sound(fields):
-            return None
-        now = snapshot_layout(self._stored.model, self.data, self.view.option)
-        missing = _names(now) - _names(self.layout)
-        reason = needs_constraints(self._stored.model, self.view.option)
-        if reason is None and missing:
-            return (
-                f"it now needs {', '.join(sorted(missing))} as well, which the "
-                "recording of this episode was not begun with"
-            )
-        return reason or self.objection(fields, row)
-
     def drawn(
         self, changed: dict[str, NDArray[Any]] | None
     ) -> dict[str, NDArray[Any]] | None:
         """Let the cameras move as a frame moves them, and add that to what changed."""
         if any(name.startswith(VIEW_PREFIXES) for name in changed or ()):
-            self._camera = copy.copy(self.view.camera)
-            self._lookat = self._camera.lookat.tolist()
+            self._follow_camera()
         if self.scene is None:
             return changed
         lookat = self._camera.lookat
@@ -475,30 +438,10 @@ class _Frames:
         self._stored.scene = self.scene
         return changed
 
-
-class _QuickLook:
-    """Tells whether only the state has changed, and takes snapshots while it is so.
-
-    Attributes:
-        take: writes a snapshot.
-    """
-
-    def __init__(
-        self, is_unmoved: Callable[[], bool], looks: Looks, frames: _Frames
-    ) -> None:
-        self._is_unmoved = is_unmoved
-        self._seen, self._present = [*looks.seen], [*looks.present]
-        self.take = frames.source.take
-
-    def is_current(self) -> bool:
-        """Tell whether view and model are as they were at the capture before."""
-        # Not `self._is_unmoved()`: calling an attribute takes CPython twice as long.
-        is_unmoved = self._is_unmoved
-        return self._seen == self._present and is_unmoved()
-
-    def end(self) -> None:
-        """A closer look is needed from here on."""
-        self._seen.clear()
+    def _follow_camera(self) -> None:
+        # Moved as frames move it; the environment's own stays where it is.
+        self._camera = copy.copy(self.view.camera)
+        self._lookat = self._camera.lookat.tolist()
 
 
 def _has_infinite_plane(model: mujoco.MjModel) -> bool:
@@ -506,8 +449,8 @@ def _has_infinite_plane(model: mujoco.MjModel) -> bool:
     return bool((planes[:, :2] <= 0).any())
 
 
-def _names(layout: RowLayout) -> set[str]:
-    return {field.name for field in layout.fields}
+def _never() -> bool:
+    return False
 
 
 def _differs(reason: str) -> PicturesDiffer:

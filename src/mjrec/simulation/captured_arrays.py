@@ -19,13 +19,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.trajectory import Array, RowLayout, StateComponent
+from ..formats.trajectory import packed
 from .raw_memory import WORDS, address_of, can_be_gathered, raw_memory, words_of
-from .tendon_colours import has_limited_tendons, has_plastic_tendons
 
 STATE_SPEC = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 _PREFIX = "mjSTATE_"
+_JOINT_WRAP = int(mujoco.mjtWrap.mjWRAP_JOINT)
 
 # Components whose array in `MjData` has another name.
 _STATE_ARRAYS = {"warmstart": "qacc_warmstart", "plugin": "plugin_state"}
@@ -93,19 +93,13 @@ def _elementary_bits() -> dict[str, int]:
 STATE_BITS = _elementary_bits()
 
 
-def state_components(model: mujoco.MjModel) -> tuple[StateComponent, ...]:
+def state_dtype(model: mujoco.MjModel) -> np.dtype[Any]:
     """Return what the state of `model` consists of, in the order of its vector.
 
     Components that this model has none of (`act` without activations) are left out.
     """
-    components: list[StateComponent] = []
-    offset = 0
-    for name, bit in STATE_BITS.items():
-        length = mujoco.mj_stateSize(model, bit)
-        if length > 0:
-            components.append(StateComponent(name, offset, length))
-            offset += length
-    return tuple(components)
+    sizes = {name: mujoco.mj_stateSize(model, bit) for name, bit in STATE_BITS.items()}
+    return packed((name, ("<f8", (size,))) for name, size in sizes.items() if size)
 
 
 def read_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
@@ -125,8 +119,8 @@ def state_words(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.intp] 
         (`eq_active`), or is new in MuJoCo.
     """
     arrays = []
-    for part in state_components(model):
-        name = _STATE_ARRAYS.get(part.name, part.name)
+    for part in state_dtype(model).names or ():
+        name = _STATE_ARRAYS.get(part, part)
         array = _time(data) if name == "time" else getattr(data, name, None)
         if array is None or array.dtype != np.float64:
             return None
@@ -154,11 +148,11 @@ def _time_offset() -> int:
     return offset - _REACH
 
 
-def snapshot_layout(
+def snapshot_dtype(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     option: mujoco.MjvOption | None = None,
-) -> RowLayout:
+) -> np.dtype[Any]:
     """Return what of a simulation's data a snapshot holds.
 
     Everything that the default option and any camera needs, and what `option` needs
@@ -172,29 +166,39 @@ def snapshot_layout(
     names = set(ALWAYS)
     if model.nskin:
         names.update(_FOR_SKINS)
-    if has_plastic_tendons(model):
+    # Of tendons whose spring can yield, which mujoco 4 brought.
+    if (getattr(model, "tendon_plasticadr", np.empty(0)) >= 0).any():
         names.add("plastic")
     # Not `np.isin`, whose first call loads numpy's masked arrays (100 ms).
     if not _drawn_sensors().isdisjoint(model.sensor_type.tolist()):
         names.add("sensordata")
     if option is not None:
         names.update(_for_option(option))
-    held = [name for name in names if array_kind(data, name).size]
+    held = [name for name in names if array_kind(data, name) is not None]
     # In the order of the memory, which is read faster so.
     held.sort(key=lambda name: address_of(getattr(data, name)))
     arrays = [(name, array_kind(data, name)) for name in held]
     if has_limited_tendons(model):
         arrays.append((TENDON_RGBA, array_kind(model, TENDON_RGBA)))
-    return RowLayout.packed(arrays)
+    return packed(arrays)
 
 
-def array_kind(holder: Any, name: str) -> Array:
-    """Return the kind of an array of a model or of data; empty where there is none."""
+def array_kind(holder: Any, name: str) -> np.dtype[Any] | None:
+    """Return the kind of an array of a model or of data; None where it is empty."""
+    # `bvh_active` and others are not in every version.
     array = getattr(holder, name, None)
-    if array is None:
-        # `bvh_active` and others are not in every version.
-        return Array("<f8", (0,))
-    return Array("|u1" if array.dtype == bool else array.dtype.str, array.shape)
+    if array is None or not array.size:
+        return None
+    return np.dtype(("|u1" if array.dtype == bool else array.dtype.str, array.shape))
+
+
+def has_limited_tendons(model: mujoco.MjModel) -> bool:
+    """Tell whether a tendon may be drawn in another colour than the model's."""
+    if not model.ntendon:
+        return False
+    spatial = model.wrap_type[model.tendon_adr] != _JOINT_WRAP
+    plain = model.tendon_matid < 0
+    return bool((spatial & plain & (model.tendon_limited != 0)).any())
 
 
 def needs_constraints(model: mujoco.MjModel, option: mujoco.MjvOption) -> str | None:

@@ -50,7 +50,7 @@ class RecordedScene:
 
     def __init__(self, reader: TrajectoryReader) -> None:
         self._reader = reader
-        facts = reader.header.facts
+        facts = reader.facts
         try:
             self.view = view_from_facts(facts["scene"])
             self.previous_cameras = _positions(facts["scene"].get("previous_cameras"))
@@ -65,7 +65,7 @@ class RecordedScene:
         self._restart()
         self._originals: dict[str, NDArray[Any]] = {}
         self._block = range(0)
-        self._values: dict[str, NDArray[Any]] = {}
+        self._rows = reader.snapshots(0, 0)
 
     def bring_to(self, index: int) -> bool:
         """Bring back what was there at frame `index`, one of `count`.
@@ -79,7 +79,7 @@ class RecordedScene:
         try:
             changed = self._change_model(int(self._reader.frame_steps[index]))
             check_camera(self.model, self.view.camera)
-            restore_snapshot(self._values_of(index), self.model, self.data)
+            restore_snapshot(self._row(index), self.model, self.data)
         except InvalidArgument as error:
             raise UnreadableFile(self._reader.path, error) from error
         return any(map(is_kept_by_context, changed))
@@ -115,17 +115,14 @@ class RecordedScene:
             return read_member(getattr(self.view, struct), member)
         return read_member(self.model, name)
 
-    def _values_of(self, index: int) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a snapshot, read in blocks."""
-        layout = self._reader.header.snapshot
+    def _row(self, index: int) -> Any:
+        """Return a snapshot; they are read in blocks."""
         if index not in self._block:
-            rows = max(1, _BLOCK_BYTES // max(1, layout.size))
+            rows = max(1, _BLOCK_BYTES // max(1, self._rows.itemsize))
             start = index - index % rows
             self._block = range(start, min(start + rows, self.count))
-            packed = self._reader.snapshots(self._block.start, self._block.stop)
-            self._values = layout.unpack(packed)
-        place = index - self._block.start
-        return {name: values[place] for name, values in self._values.items()}
+            self._rows = self._reader.snapshots(self._block.start, self._block.stop)
+        return self._rows[index - self._block.start]
 
 
 def check_states(model: Any, states: ArrayLike, spec: int) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import mujoco
@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument
-from ..formats.trajectory import RowLayout, StateComponent
+from ..formats.trajectory import columns_of
 from .captured_arrays import (
     STATE_BITS,
     STATE_SPEC,
     drawn_readings,
     read_state,
-    state_components,
+    state_dtype,
 )
 from .fields import apply_fields
 from .snapshot import SnapshotSource, layout_objection
@@ -50,7 +50,7 @@ _SHOWING = (
 
 
 def state_columns(
-    model: mujoco.MjModel, components: Sequence[StateComponent]
+    model: mujoco.MjModel, parts: Mapping[str, slice]
 ) -> NDArray[np.intp]:
     """Return where in a recorded row the numbers of this MuJoCo's state stand.
 
@@ -58,15 +58,11 @@ def state_columns(
         InvalidArgument: a component is unknown to this MuJoCo, or this model has
             another number of it.
     """
-    own = {part.name: part.length for part in state_components(model)}
-    given = {part.name: part for part in components}
-    lengths = {name: part.length for name, part in given.items()}
-    width = sum(lengths.values())
-    is_inside = all(0 <= p.offset <= width - p.length for p in components)
-    if lengths == own and len(given) == len(components) and is_inside:
-        offsets = [given[name].offset + np.arange(n) for name, n in own.items()]
-        return np.concatenate(offsets)
-    unknown = sorted(given.keys() - STATE_BITS.keys())
+    own = _lengths(columns_of(state_dtype(model)))
+    lengths = _lengths(parts)
+    if lengths == own:
+        return np.concatenate([np.r_[parts[name]] for name in own])
+    unknown = sorted(lengths.keys() - STATE_BITS.keys())
     if unknown:
         raise InvalidArgument(
             f"The state holds {', '.join(unknown)}, which MuJoCo {mujoco.__version__} "
@@ -79,15 +75,19 @@ def state_columns(
     ]
     raise InvalidArgument(
         "The state is not one of this model. How many numbers it holds: "
-        f"{'; '.join(differences) or 'some twice'}. Use the model that it was recorded "
-        "with (`trajectory.model()`)."
+        f"{'; '.join(differences)}. Use the model that it was recorded with "
+        "(`trajectory.model()`)."
     )
+
+
+def _lengths(parts: Mapping[str, slice]) -> dict[str, int]:
+    return {name: part.stop - part.start for name, part in parts.items()}
 
 
 def set_state(
     model: mujoco.MjModel,
     data: mujoco.MjData,
-    components: Sequence[StateComponent],
+    parts: Mapping[str, slice],
     row: NDArray[np.float64],
 ) -> None:
     """Put a recorded state into `data`, whichever MuJoCo it was recorded by.
@@ -98,13 +98,13 @@ def set_state(
     Args:
         model: the model of `data`.
         data: what is set.
-        components: where the parts of the state are in `row`.
+        parts: where the parts of the state are in `row`.
         row: the state, `(n,) float64`.
 
     Raises:
         InvalidArgument: the row is not a state of this model.
     """
-    columns = state_columns(model, components)
+    columns = state_columns(model, parts)
     values = np.asarray(row, np.float64)
     if values.ndim != 1 or len(values) < len(columns):
         raise InvalidArgument(
@@ -119,18 +119,16 @@ class StateSteps:
 
     Args:
         model: it is copied.
-        components: of the recorded rows.
+        parts: of the recorded rows, as `TrajectoryReader.columns` has them.
 
     Raises:
         InvalidArgument: the rows are not states of this model.
     """
 
-    def __init__(
-        self, model: mujoco.MjModel, components: Sequence[StateComponent]
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, parts: Mapping[str, slice]) -> None:
         self._model = copy.copy(model)
         self._data = mujoco.MjData(self._model)
-        self._columns = state_columns(self._model, components)
+        self._columns = state_columns(self._model, parts)
         self._inputs = _input_numbers(self._model)
 
     @property
@@ -188,8 +186,8 @@ class SnapshotSteps(StateSteps):
 
     Args:
         model: it is copied.
-        components: of the recorded states.
-        layout: of the recorded snapshots.
+        parts: of the recorded states.
+        kind: of the recorded snapshots.
 
     Raises:
         InvalidArgument: states or snapshots are not of this model.
@@ -198,14 +196,13 @@ class SnapshotSteps(StateSteps):
     def __init__(
         self,
         model: mujoco.MjModel,
-        components: Sequence[StateComponent],
-        layout: RowLayout,
+        parts: Mapping[str, slice],
+        kind: np.dtype[Any],
     ) -> None:
-        super().__init__(model, components)
-        _check_layout(self._model, self._data, layout)
-        self._layout = layout
-        self._source = SnapshotSource(self._model, self._data, layout)
-        names = np.array([name.partition("[")[0] for name in column_names(layout)])
+        super().__init__(model, parts)
+        _check_snapshots(self._model, self._data, kind)
+        self._source = SnapshotSource(self._model, self._data, kind)
+        names = np.array([name.partition("[")[0] for name in column_names(kind)])
         self._unseen = np.zeros(len(names), bool)
         if "sensordata" in names:
             self._unseen[names == "sensordata"] = ~drawn_readings(self._model)
@@ -217,7 +214,7 @@ class SnapshotSteps(StateSteps):
         own = state[self._columns]
         mujoco.mj_setState(self._model, self._data, own, STATE_SPEC)
         mujoco.mj_step1(self._model, self._data)
-        return _taken(self._source, self._layout)
+        return numbers_of(self._source.taken())
 
     def stepped(
         self, before: NDArray[np.float64], after: NDArray[np.float64], substeps: int
@@ -230,7 +227,7 @@ class SnapshotSteps(StateSteps):
             substeps: the physics steps.
         """
         self._step(before, after, substeps)
-        return _taken(self._source, self._layout)
+        return numbers_of(self._source.taken())
 
     def alike(
         self, recorded: NDArray[np.float64], found: NDArray[np.float64]
@@ -261,7 +258,7 @@ class LiveStates:
     Args:
         model: the environment's.
         data: its.
-        components: of the recorded rows.
+        parts: of the recorded rows, as `TrajectoryReader.columns` has them.
         is_settled: whether the environment leaves positions and velocities computed
             for its state after each step, as dm_control does, and not for the substep
             before, as `mj_step` alone does.
@@ -274,13 +271,13 @@ class LiveStates:
         self,
         model: mujoco.MjModel,
         data: mujoco.MjData,
-        components: Sequence[StateComponent],
+        parts: Mapping[str, slice],
         *,
         is_settled: bool,
     ) -> None:
         self._model = model
         self._data = data
-        self._columns = state_columns(model, components)
+        self._columns = state_columns(model, parts)
         self._is_settled = is_settled
 
     def read(self, out: NDArray[np.float64]) -> None:
@@ -312,35 +309,35 @@ class LiveStates:
 def live_snapshot(
     model: mujoco.MjModel,
     data: mujoco.MjData,
-    components: Sequence[StateComponent],
-    layout: RowLayout,
+    parts: Mapping[str, slice],
+    kind: np.dtype[Any],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return state and snapshot of a simulation, as it is, as recordings hold them.
 
     Raises:
         InvalidArgument: what is recorded is not of this model.
     """
-    _check_layout(model, data, layout)
-    columns = state_columns(model, components)
+    _check_snapshots(model, data, kind)
+    columns = state_columns(model, parts)
     state = np.empty(len(columns))
     state[columns] = read_state(model, data)
-    return state, _taken(SnapshotSource(model, data, layout), layout)
+    return state, numbers_of(SnapshotSource(model, data, kind).taken())
 
 
-def numbers_of(layout: RowLayout, rows: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return packed snapshots, `(n, size)`, as numbers, one behind the other."""
-    arrays = layout.unpack(rows).values()
+def numbers_of(rows: Any) -> NDArray[np.float64]:
+    """Return a snapshot, or `(n,)` of them, as numbers, one behind the other."""
+    arrays = [rows[name] for name in rows.dtype.names]
     return np.concatenate(
-        [array.reshape(len(rows), -1).astype(np.float64) for array in arrays], axis=1
+        [a.reshape(*rows.shape, -1).astype(np.float64) for a in arrays], axis=-1
     )
 
 
-def column_names(layout: RowLayout) -> list[str]:
+def column_names(kind: np.dtype[Any]) -> list[str]:
     """Return what each of the numbers is called: `geom_xpos[3, 2]`."""
     return [
-        f"{field.name}{list(index)}"
-        for field in layout.fields
-        for index in np.ndindex(field.array.shape)
+        f"{name}{list(index)}"
+        for name in kind.names or ()
+        for index in np.ndindex(kind[name].shape)
     ]
 
 
@@ -389,25 +386,18 @@ class PreservedState:
                 field[...] = values
 
 
-def _check_layout(
-    model: mujoco.MjModel, data: mujoco.MjData, layout: RowLayout
+def _check_snapshots(
+    model: mujoco.MjModel, data: mujoco.MjData, kind: np.dtype[Any]
 ) -> None:
-    objection = layout_objection(model, data, layout)
+    objection = layout_objection(model, data, kind)
     if objection is not None:
         raise InvalidArgument(objection)
-
-
-def _taken(source: SnapshotSource, layout: RowLayout) -> NDArray[np.float64]:
-    row = np.empty((1, layout.size), np.uint8)
-    source.take(row[0])
-    return numbers_of(layout, row).reshape(-1)
 
 
 def _input_numbers(model: mujoco.MjModel) -> NDArray[np.bool_]:
     """Return which numbers of a state are inputs, in this MuJoCo's order."""
     user = int(mujoco.mjtState.mjSTATE_USER)
-    parts = [
-        np.full(part.length, bool(STATE_BITS[part.name] & user))
-        for part in state_components(model)
-    ]
-    return np.concatenate(parts)
+    lengths = _lengths(columns_of(state_dtype(model)))
+    return np.concatenate(
+        [np.full(n, bool(STATE_BITS[name] & user)) for name, n in lengths.items()]
+    )

@@ -21,9 +21,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from ..formats.trajectory import RowLayout
 from .captured_arrays import TENDON_RGBA
 from .snapshot import restore_snapshot
 from .view import SceneView
@@ -33,17 +31,11 @@ _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 # Not set by `mjv_updateScene` in every geom, or only later, when it is drawn.
 _NOT_SET = ("camdist", "modelrbound", "transparent", "label")
 
-# The one plugin that comes with MuJoCo and draws only if told to: with this attribute
-# it paints the geoms of its bodies, in the model itself.
-_CABLE = "mujoco.elasticity.cable"
-_CABLE_PAINTS = "vmax"
-
 
 def scene_difference(
     model: mujoco.MjModel,
     data: mujoco.MjData,
-    layout: RowLayout,
-    row: NDArray[np.uint8],
+    row: Any,
     view: SceneView,
 ) -> str | None:
     """Say in what the frame of a snapshot would differ from the one of the live data.
@@ -53,8 +45,7 @@ def scene_difference(
     Args:
         model: the model of this moment.
         data: its data.
-        layout: of the snapshot.
-        row: the snapshot of this moment, `(layout.size,) uint8`.
+        row: the snapshot of this moment.
         view: how the scene is shown.
 
     Returns:
@@ -64,10 +55,10 @@ def scene_difference(
     if plugin is not None:
         return f"the plugin {plugin} draws by itself, from what it alone knows"
     # Where tendons have colours of their own these are set in the model.
-    sets_model = any(field.name == TENDON_RGBA for field in layout.fields)
+    sets_model = TENDON_RGBA in (row.dtype.names or ())
     restored_model = copy.copy(model) if sets_model else model
     restored = mujoco.MjData(restored_model)
-    restore_snapshot(layout.unpack(row), restored_model, restored)
+    restore_snapshot(row, restored_model, restored)
     live = updated_scene(model, data, view)
     again = updated_scene(restored_model, restored, view)
     return next(differences(live, again, view.option), None)
@@ -168,25 +159,9 @@ def drawing_plugin(model: mujoco.MjModel) -> str | None:
             plugin = _library().mjp_getPluginAtSlot(int(model.plugin[instance]))[0]
         except (OSError, AttributeError, ValueError):
             return f"number {instance}, which cannot be looked at,"
-        name = (plugin.name or b"").decode(errors="replace")
-        if plugin.visualize and not _is_plain_cable(model, instance, plugin, name):
-            return name
+        if plugin.visualize:
+            return str((plugin.name or b"").decode(errors="replace"))
     return None
-
-
-def _is_plain_cable(
-    model: mujoco.MjModel, instance: int, plugin: Any, name: str
-) -> bool:
-    if name != _CABLE:
-        return False
-    names = [plugin.attributes[i].decode() for i in range(plugin.nattribute)]
-    # All values stand one behind the other, each with a zero at its end.
-    text = bytes(model.plugin_attr[model.plugin_attradr[instance] :])
-    value = text.split(b"\0")[names.index(_CABLE_PAINTS)]
-    try:
-        return not float(value or 0)
-    except ValueError:
-        return False
 
 
 @functools.cache

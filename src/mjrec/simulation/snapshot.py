@@ -6,7 +6,6 @@ Restored into fresh data they give the same scene, byte for byte.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -14,15 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument
-from ..formats.trajectory import RowLayout
 from .captured_arrays import ALWAYS, SNAPSHOT_ARRAYS, TENDON_RGBA, array_kind
 from .raw_memory import WORDS, can_be_gathered, words_of
-from .tendon_colours import TendonColours
 
 # Indices of geoms and of each other, which the visualiser follows unseen.
 _PATHS = ("ten_wrapadr", "ten_wrapnum", "wrap_obj")
 # In the place of a geom.
 _PULLEY = -2
+
+_LIMIT_TENDON = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
+_TENDON = int(mujoco.mjtObj.mjOBJ_TENDON)
+_DYNAMIC = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
 
 
 class SnapshotSource:
@@ -31,7 +32,7 @@ class SnapshotSource:
     Args:
         model: the model; kept alive, as is the data.
         data: its data.
-        layout: what `snapshot_layout` gave for the model.
+        kind: what `snapshot_dtype` gave for the model.
 
     Attributes:
         words: what a snapshot consists of in `memory.WORDS`; None where it cannot be
@@ -39,87 +40,126 @@ class SnapshotSource:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, layout: RowLayout
+        self, model: mujoco.MjModel, data: mujoco.MjData, kind: np.dtype[Any]
     ) -> None:
-        self._layout = layout
+        self._kind = kind
         self._colours: TendonColours | None = None
         arrays = []
-        for field in layout.fields:
-            if field.name == TENDON_RGBA:
+        for name in kind.names or ():
+            if name == TENDON_RGBA:
                 self._colours = TendonColours(model, data)
                 arrays.append(self._colours.rgba)
             else:
-                arrays.append(getattr(data, field.name))
+                arrays.append(getattr(data, name))
         # They keep the data alive.
         self._arrays = arrays
         self._words = words_of(arrays) if can_be_gathered(arrays) else None
         self.words = self._words if self._colours is None else None
 
-    def take(self, out: NDArray[np.uint8]) -> None:
-        """Write a snapshot of this moment into `out`, `(layout.size,) uint8`.
-
-        It begins at a multiple of 8 bytes.
-        """
+    def take(self, out: NDArray[np.uint64]) -> None:
+        """Write a snapshot of this moment into `out`, all of its words."""
         if self._colours is not None:
             self._colours.update()
         if self._words is not None:
-            WORDS.take(self._words, None, out.view(np.uint64), "clip")
+            WORDS.take(self._words, None, out, "clip")
             return
-        for field, array in zip(self._layout.fields, self._arrays, strict=True):
-            part = out[field.offset : field.offset + field.array.size]
-            part[...] = array.reshape(-1).view(np.uint8)
+        row = out.view(self._kind)
+        for name, array in zip(self._kind.names or (), self._arrays, strict=True):
+            row[name] = array
+
+    def taken(self) -> Any:
+        """Return a snapshot of this moment: MuJoCo's arrays are its members."""
+        words = np.zeros(self._kind.itemsize // 8, np.uint64)
+        self.take(words)
+        return words.view(self._kind)[0]
+
+
+class TendonColours:
+    """The colours that a model's tendons are drawn in.
+
+    MuJoCo mixes the colour of a spatial tendon at its limit with that of constraints,
+    by the strength of the limit, unless a colour or a material was chosen for it. The
+    strength is gone once the step is over, so the colour itself is recorded. A scene
+    with nothing in it but the tendons tells it.
+
+    Attributes:
+        rgba: `(ntendon, 4) float32`, as of the last `update`; always the same array.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._model = model
+        self._data = data
+        self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
+        for groups in (self._option.geomgroup, self._option.sitegroup):
+            groups[:] = 0
+        self._option.tendongroup[:] = 1
+        self._option.flags[:] = 0
+        self._option.flags[int(mujoco.mjtVisFlag.mjVIS_TENDON)] = 1
+        segments = 2 * model.nwrap + model.ntendon * (model.vis.quality.numslices + 1)
+        self._scene = mujoco.MjvScene(model, maxgeom=segments + 100)
+        self.rgba = np.array(model.tendon_rgba)
+
+    def update(self) -> None:
+        """Bring `rgba` up to date with model and data."""
+        model, data = self._model, self._data
+        self.rgba[:] = model.tendon_rgba
+        limits = slice(data.ne + data.nf, data.ne + data.nf + data.nl)
+        if not data.nl or not (data.efc_type[limits] == _LIMIT_TENDON).any():
+            return
+        mujoco.mjv_updateScene(
+            *(model, data, self._option, None, self._camera, _DYNAMIC, self._scene)
+        )
+        plain = model.tendon_matid < 0
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == _TENDON and plain[geom.objid]:
+                self.rgba[geom.objid] = geom.rgba
 
 
 def layout_objection(
-    model: mujoco.MjModel, data: mujoco.MjData, layout: RowLayout
+    model: mujoco.MjModel, data: mujoco.MjData, kind: np.dtype[Any]
 ) -> str | None:
     """Say why recorded snapshots are none of this model; None if they may be.
 
     They hold at least what MuJoCo's default option needs.
     """
-    for field in layout.fields:
-        is_colour = field.name == TENDON_RGBA
-        if not is_colour and field.name not in SNAPSHOT_ARRAYS:
-            return f"The snapshots hold {field.name!r:.40}, which no frame needs."
-        own = array_kind(model if is_colour else data, field.name)
-        if field.array != own:
-            return (
-                f"The snapshots' {field.name} is {field.array.dtype} of the shape "
-                f"{field.array.shape}, and in this model {own.dtype} of {own.shape}."
-            )
-    held = {field.name for field in layout.fields}
-    missing = {name for name in ALWAYS if array_kind(data, name).size} - held
+    for name in kind.names or ():
+        is_colour = name == TENDON_RGBA
+        if not is_colour and name not in SNAPSHOT_ARRAYS:
+            return f"The snapshots hold {name!r:.40}, which no frame needs."
+        own = array_kind(model if is_colour else data, name)
+        if kind[name] != own:
+            return f"The snapshots' {name} is {kind[name]}, and in this model {own}."
+    held = {*(kind.names or ())}
+    missing = {name for name in ALWAYS if array_kind(data, name) is not None} - held
     if missing:
         return f"The snapshots hold no {', no '.join(sorted(missing))}."
     return None
 
 
-def restore_snapshot(
-    values: Mapping[str, NDArray[Any]], model: mujoco.MjModel, data: mujoco.MjData
-) -> None:
+def restore_snapshot(row: Any, model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Put what a snapshot holds back, ready for `mjv_updateScene`.
 
     Args:
-        values: the arrays by their names, as `RowLayout.unpack` gives them.
-        model: the colours of its tendons are set where `values` has them.
+        row: one of `TrajectoryReader.snapshots`.
+        model: the colours of its tendons are set where `row` has them.
         data: its data.
 
     Raises:
-        InvalidArgument: an array is not there, is of another kind, or leads to where
-            the model has nothing, which MuJoCo would not notice.
+        InvalidArgument: an array is of another kind, or leads to where the model has
+            nothing, which MuJoCo would not notice.
     """
-    for name, value in values.items():
-        is_known = name in SNAPSHOT_ARRAYS or name == TENDON_RGBA
+    kind = row.dtype
+    for name in kind.names or ():
         target = model if name == TENDON_RGBA else data
+        is_known = name in SNAPSHOT_ARRAYS or name == TENDON_RGBA
         own = array_kind(target, name) if is_known else None
-        if own is None or (value.dtype.str, value.shape) != (own.dtype, own.shape):
+        if kind[name] != own:
             raise InvalidArgument(
-                f"The snapshot's {name} is {value.dtype} of the shape {value.shape}, "
-                f"and here it is {own}: it belongs to another model or version of "
-                "MuJoCo."
+                f"The snapshot's {name} is {kind[name]}, and here it is {own}: it "
+                "belongs to another model or version of MuJoCo."
             )
-        getattr(target, name)[...] = value
-    if not values.keys().isdisjoint(_PATHS):
+        getattr(target, name)[...] = row[name]
+    if not {*_PATHS}.isdisjoint(kind.names or ()):
         _check_paths(model, data)
 
 

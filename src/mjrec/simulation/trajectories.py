@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, UnknownName, UnreadableFile
-from ..formats.in_flight import recordings_in_flight
 from ..formats.monitor_directory import infix_of, iter_monitor_files
+from ..formats.spans import recordings_in_flight
 from ..formats.trajectory import TrajectoryReader
 from .foreign_trajectories import open_vetted_trajectory
 
@@ -106,7 +106,7 @@ class Trajectory:
         count, row_count = reader.step_count, reader.row_count
         self.path = reader.path
         self.trust_models = trust_models
-        self.facts = reader.header.facts
+        self.facts = reader.facts
         self.states = reader.states(0, row_count)
         self.actions = reader.actions(0, count)
         self.rewards = reader.rewards
@@ -115,7 +115,7 @@ class Trajectory:
         self.observations = reader.observations(0, row_count)
         self.frame_steps = reader.frame_steps
         self.dropped = reader.dropped
-        self._header = reader.header
+        self._columns = reader.columns
 
     def __len__(self) -> int:
         """Return T, the number of steps."""
@@ -155,7 +155,7 @@ class Trajectory:
     @property
     def components(self) -> tuple[str, ...]:
         """The names of what a state consists of: `time`, `qpos`, `qvel`, `ctrl` ..."""
-        return tuple(part.name for part in self._header.state)
+        return tuple(self._columns)
 
     @property
     def time(self) -> NDArray[np.float64] | None:
@@ -171,7 +171,7 @@ class Trajectory:
         """
         with open_vetted_trajectory(self.path) as reader:
             rows = reader.snapshots(0, len(self.frame_steps))
-        return self._header.snapshot.unpack(rows)
+        return {name: rows[name].copy() for name in rows.dtype.names or ()}
 
     def component(self, name: str) -> NDArray[np.float64]:
         """Return a part of the states, `(T + 1, length)`.
@@ -183,10 +183,9 @@ class Trajectory:
         Raises:
             UnknownName: this model's states have no such part.
         """
-        for part in self._header.state:
-            if part.name == name:
-                return self.states[:, part.offset : part.offset + part.length]
-        raise UnknownName("state component", name, self.components)
+        if name not in self._columns:
+            raise UnknownName("state component", name, self.components)
+        return self.states[:, self._columns[name]]
 
     def model(self, step: int = 0) -> mujoco.MjModel:
         """Return the model as it was in this episode, a new one at each call.
@@ -239,7 +238,7 @@ class Trajectory:
         from .replay import set_state
 
         row = self.states[self._step(step)]
-        set_state(data.model, data, self._header.state, row)
+        set_state(data.model, data, self._columns, row)
 
     def _step(self, step: int) -> int:
         count = len(self.states)

@@ -11,7 +11,7 @@ Of a staged monitor directory, which is nobody's original:
   `<gpu>`: each names a single card;
 - names of files, where a uid, a camera or a prefix has the identity in it, have `user`
   or `host` instead, and whatever refers to them says the same;
-- trajectories have other facts, and the same arrays (`anonymous_trajectories`);
+- trajectories have other facts, and the same arrays (`amend_trajectory`);
 - models have no comments, and compile to the same (`anonymous_models`);
 - a compiled model that has the identity in it, which only its author could have
   loaded, is removed.
@@ -34,10 +34,10 @@ from ...atomic_files import replacing
 from ...errors import FileNotWritten, InvalidArgument
 from ...formats.json_fields import unreadable
 from ...formats.monitor_directory import FILE_PREFIX, Infix, infix_of
+from ...formats.trajectory_file import amend_trajectory
 from ...formats.video_names import is_second_name
 from ...json_text import dumps, loads
 from .anonymous_models import anonymous_sources, compiled_model
-from .anonymous_trajectories import write_anonymous_trajectory
 from .identity import Identity
 from .identity_matching import IdentityMatcher
 
@@ -145,7 +145,7 @@ def _make_file_anonymous(path: Path, texts: _Texts, matcher: IdentityMatcher) ->
         _rewrite(path, lambda data: b"".join(_csv_lines(data, texts)))
     elif name.endswith(".h5"):
         with _writing(path):
-            write_anonymous_trajectory(path, texts.value)
+            amend_trajectory(path, texts.value)
     elif name.startswith(_MODEL) and name.endswith(".zip"):
         _rewrite(path, lambda data: anonymous_sources(data, matcher))
     elif name.startswith(_MODEL) and matcher.found_in_bytes(compiled_model(path)):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ...errors import Error, FileNotWritten, InvalidArgument
 from ...formats.monitor_directory import FILE_PREFIX
-from ...rendering.progress import Progress
+from ...rendering.jobs import Progress
 from .assembly import Assembly
 from .bag import check_bagit
 from .contents import look_for_contents

@@ -295,7 +295,7 @@ class _Found:
     def _add_trajectory(self, path: Path) -> None:
         self._add(path)
         with open_for_rendering(path) as reader:
-            model = reader.header.facts.get("model") or {}
+            model = reader.facts.get("model") or {}
         self._models.update(filter(None, (model.get("mjb"), model.get("xml"))))
 
     def _add(self, path: Path, *, of: str | None = None) -> None:

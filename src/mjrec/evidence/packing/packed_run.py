@@ -237,7 +237,7 @@ def _session(recordings: Path, files: MonitorFiles, tally: _Tally) -> Session:
 def _of_trajectory(recordings: Path, name: str) -> tuple[list[str], str]:
     """Return the names of a trajectory's models, and its environment's arguments."""
     with open_trajectory(recordings / name) as reader:
-        facts = reader.header.facts
+        facts = reader.facts
     model = _mapping(facts.get("model"))
     files = [
         file for kind in ("xml", "mjb") if isinstance(file := model.get(kind), str)

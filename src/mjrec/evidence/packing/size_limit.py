@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ...errors import ArchiveTooLarge
 from ...machine import usable_cpus
+from ...rendering.jobs import Progress
 from ...rendering.pool import WorkerPool
-from ...rendering.progress import Progress
 from .assembly import Assembly
 from .smaller_videos import SCALES, draw_smaller, redrawable
 

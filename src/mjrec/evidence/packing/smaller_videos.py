@@ -19,11 +19,10 @@ from ...atomic_files import write_text
 from ...errors import PackError
 from ...formats.json_fields import read_object, unreadable
 from ...formats.video_metadata import metadata_path
-from ...rendering.jobs import Variant
+from ...rendering.jobs import Progress
 from ...rendering.pool import WorkerPool
-from ...rendering.progress import Progress
 from ...rendering.render_video import render_video
-from ...rendering.views import View
+from ...rendering.views import Variant, View
 from .contents import VideoFiles
 
 # Of width and height, one after the other until the archive is small enough.

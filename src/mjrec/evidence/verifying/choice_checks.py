@@ -279,7 +279,7 @@ def _objection_to_promise(monitor: RecordedMonitor, number: int) -> str | None:
     """Return what is wrong with the video that a trajectory names."""
     try:
         with open_trajectory(monitor.files.trajectories[number]) as reader:
-            promise = reader.header.facts.get("video")
+            promise = reader.facts.get("video")
     except UnreadableFile:
         # That is found elsewhere.
         return None

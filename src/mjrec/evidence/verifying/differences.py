@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...formats.trajectory import StateComponent
 from ..verification import Verdict
 from .tolerances import Fit
 
@@ -141,23 +140,22 @@ def judged(
 
 
 def compared_columns(
-    components: Sequence[StateComponent], *, with_warm_start: bool
+    parts: Mapping[str, slice], *, with_warm_start: bool
 ) -> tuple[list[str], NDArray[np.bool_]]:
     """Return the names of the numbers of a state that are compared, and which it is.
 
     Args:
-        components: of the recorded rows.
+        parts: of the recorded rows, as `TrajectoryReader.columns` has them.
         with_warm_start: whether the solver's is one of them.
     """
-    names = [""] * sum(part.length for part in components)
+    names = [
+        part if part == "time" else f"{part}[{index}]"
+        for part, columns in parts.items()
+        for index in range(columns.stop - columns.start)
+    ]
     compared = np.ones(len(names), bool)
-    for part in components:
-        for index in range(part.length):
-            names[part.offset + index] = (
-                part.name if part.name == "time" else f"{part.name}[{index}]"
-            )
-        if part.name == "warmstart":
-            compared[part.offset : part.offset + part.length] = with_warm_start
+    if "warmstart" in parts:
+        compared[parts["warmstart"]] = with_warm_start
     kept = [name for name, is_kept in zip(names, compared, strict=True) if is_kept]
     return kept, compared
 

@@ -16,28 +16,25 @@ from typing import Any
 
 from ...annotation import Caption, check_annotation
 from ...errors import Error, MissingDependency, NoPictures
-from ...formats.in_flight import is_in_flight
 from ...formats.monitor_directory import (
     Infix,
     episode_of,
     infix_of,
     trajectory_prefix,
 )
-from ...formats.spans import FINISHED
+from ...formats.spans import FINISHED, is_in_flight
 from ...formats.trajectory import TrajectoryReader
 from ...formats.video_metadata import StepRuns
 from ...formats.video_names import view_of
 from ...frames import grid_shape
 from ...rendering.recorded_facts import (
-    further_video_paths,
-    open_for_rendering,
-    video_path,
-)
-from ...rendering.recorded_frames import (
     ChosenFrames,
     captions,
     check_has_frames,
+    further_video_paths,
+    open_for_rendering,
     usual_fps,
+    video_path,
 )
 from ...rendering.views import PlainCamera, View, plain_camera
 from .live_pictures import told_live, why_others_are_shown
@@ -122,7 +119,7 @@ def _plan(
 ) -> DrawingPlan:
     seen = _seen(video, path, reader)
     _check_fits(video, reader, seen)
-    facts = reader.header.facts
+    facts = reader.facts
     return DrawingPlan(
         trajectory=path,
         indices=seen.chosen.indices,
@@ -137,7 +134,7 @@ def _plan(
 
 def _excuse(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> str | None:
     """Return why a video may show something else than what was recorded."""
-    facts = reader.header.facts
+    facts = reader.facts
     if not _is_live(facts) or video.name not in _original_views(path, facts):
         return None
     return why_others_are_shown(video, facts)
@@ -167,7 +164,7 @@ def _trajectory_of(video: ShippedVideo) -> Path:
 
 def _seen(video: ShippedVideo, path: Path, reader: TrajectoryReader) -> _Seen:
     """Return what a video is to show, after its own trajectory."""
-    facts = reader.header.facts
+    facts = reader.facts
     recorded = facts.get("video")
     if recorded is None and video.is_clip:
         raise NotDrawable("it is a video that is counted in steps")
@@ -222,7 +219,7 @@ def _sized(
     tiles: Sequence[Any] | None,
 ) -> View:
     """Return the view of a recorded video: as recorded, or smaller."""
-    facts = reader.header.facts
+    facts = reader.facts
     quality = facts["video"].get("quality", "full")
     if _is_live(facts):
         # Whoever draws live draws as the environment does.
@@ -251,13 +248,13 @@ def _seen_again(video: ShippedVideo, reader: TrajectoryReader) -> _Seen:
             f"it is none of the videos that its trajectory names ({view_of(video.name)}"
             "), and its metadata names no camera"
         )
-    every, rest = divmod(video.stride, reader.header.facts.get("stride", 1))
+    every, rest = divmod(video.stride, reader.facts.get("stride", 1))
     if rest or not every:
         raise DoesNotFit(f"no recorded pictures are {video.stride} steps apart")
     last = reader.frame_count - 1
     return _Seen(
         view=View(
-            camera=_variant_camera(video.camera, reader.header.facts),
+            camera=_variant_camera(video.camera, reader.facts),
             height=video.height,
             width=video.width,
             quality=video.quality,
@@ -282,7 +279,7 @@ def _check_fits(video: ShippedVideo, reader: TrajectoryReader, seen: _Seen) -> N
             f"its metadata says {video.frame_count} frames, and its trajectory has "
             f"{count} pictures"
         )
-    stride = reader.header.facts.get("stride", 1) * seen.chosen.every
+    stride = reader.facts.get("stride", 1) * seen.chosen.every
     steps = reader.frame_steps[list(seen.chosen.indices)].tolist()
     runs = StepRuns(steps, stride=stride).ranges
     if [list(run) for run in video.frame_steps] != runs:

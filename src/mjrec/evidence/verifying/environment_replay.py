@@ -71,8 +71,9 @@ class Replay:
 
 def action_kinds(reader: TrajectoryReader) -> list[np.dtype[Any]]:
     """Return the kinds of number that the actions may have been, likeliest first."""
-    assert reader.header.action is not None
-    recorded = np.dtype(reader.header.action.dtype)
+    action = reader.kind("action")
+    assert action is not None
+    recorded = action.base
     if recorded.kind != "f" or recorded.itemsize != 8:
         return [recorded]
     is_single = all(
@@ -131,10 +132,10 @@ class _Run:
         self._is_exact = is_exact
         self._has_limit = has_limit
         model, data = environment.simulation()
-        state = reader.header.state
+        parts = reader.columns
         self._model = model
-        self._live = LiveStates(model, data, state, is_settled=environment.is_settled)
-        names, self._compared = compared_columns(state, with_warm_start=is_exact)
+        self._live = LiveStates(model, data, parts, is_settled=environment.is_settled)
+        names, self._compared = compared_columns(parts, with_warm_start=is_exact)
         self._result = Replay(
             Differences(names), Differences(names), Differences(["the reward"])
         )
@@ -159,7 +160,7 @@ class _Run:
 
     def _look_at(self, observation: Any) -> None:
         """Learn what kind of observations there are."""
-        kind = self._reader.header.observation
+        kind = self._reader.kind("observation")
         if kind is None:
             return
         array = step_array(observation)
@@ -344,10 +345,11 @@ def _action_parts(
     Raises:
         InvalidArgument: what the recording says of them does not fit.
     """
-    said = reader.header.facts.get("action_parts")
+    said = reader.facts.get("action_parts")
     if said is None:
         return None
-    assert reader.header.action is not None
+    action = reader.kind("action")
+    assert action is not None
     trouble = InvalidArgument(f"its actions' parts cannot be: {said!r:.200}")
     if not isinstance(said, list) or len(said) > _MOST_PARTS:
         raise trouble
@@ -363,7 +365,7 @@ def _action_parts(
             raise trouble
         parts[name] = tuple(shape)
     size = sum(int(np.prod(shape)) for shape in parts.values())
-    if reader.header.action.shape != (size,):
+    if action.shape != (size,):
         raise trouble
     return parts
 

@@ -65,7 +65,7 @@ class EpisodePhysics:
         self._reader = reader
         self._subject = subject
         self._models = models
-        self._facts = reader.header.facts
+        self._facts = reader.facts
         self._fit = state_fit(self._facts)
         self._derived = derived_fit(self._facts)
         self._changes = first_changes(reader)
@@ -83,7 +83,7 @@ class EpisodePhysics:
         Raises:
             UnreadableFile: the file is damaged.
         """
-        if not self._reader.header.state or not self._reader.row_count:
+        if not self._reader.columns or not self._reader.row_count:
             reason = "no states were recorded: no MuJoCo simulation was to be seen"
             yield self._check(_STEPS, Verdict.NOT_CHECKABLE, reason)
             yield self._check(_REPLAY, Verdict.NOT_CHECKABLE, reason)
@@ -464,7 +464,7 @@ class EpisodePhysics:
 
     def _no_actions(self) -> str:
         facts = self._facts
-        if self._reader.header.action is None:
+        if self._reader.kind("action") is None:
             return "its actions are no plain arrays, and were not recorded"
         if "irregular_actions_from" in facts:
             return (
@@ -510,7 +510,7 @@ class EpisodePhysics:
         yield self._judged(_STATES, replay.states, self._fit, freely, doubt, how)
         yield self._judged(_REWARDS, replay.rewards, self._derived, freely, doubt, how)
         yield self._ends(replay, doubt, how)
-        if self._reader.header.observation is not None:
+        if self._reader.kind("observation") is not None:
             yield self._observations(replay, freely, doubt, how)
 
     def _judged(

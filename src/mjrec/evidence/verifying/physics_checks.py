@@ -31,8 +31,8 @@ from ...environments.made_again import (
 )
 from ...environments.mjcf_again import MjcfAgain
 from ...errors import Error, UnreadableFile
-from ...formats.in_flight import is_in_flight, recordings_in_flight
 from ...formats.monitor_directory import episode_of, infix_of, iter_monitor_files
+from ...formats.spans import is_in_flight, recordings_in_flight
 from ...formats.trajectory_file import open_trajectory
 from ...simulation.warnings import log_mujoco_warnings
 from ..verification import Check, Level, Verdict
@@ -91,7 +91,7 @@ def _checks_of(
         return
     try:
         with open_trajectory(path) as reader:
-            names.add(str(infix_of(path.name)), reader.header.facts)
+            names.add(str(infix_of(path.name)), reader.facts)
             episode = EpisodePhysics(reader, subject, workshop.models)
             yield from episode.checks(workshop.made)
     except Error as error:

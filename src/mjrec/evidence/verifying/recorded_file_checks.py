@@ -260,7 +260,7 @@ def _models_of(trajectory: Path, found: Findings) -> Mapping[str, str]:
     """Return the names of the files of a trajectory's model, each with its owner."""
     try:
         with open_trajectory(trajectory) as reader:
-            model = reader.header.facts.get("model")
+            model = reader.facts.get("model")
     except UnreadableFile as error:
         found.look(trajectory.name, f"it cannot be read: {error.reason}")
         return {}

@@ -29,10 +29,10 @@ class RepeatedEpisodes:
             UnreadableFile: it is damaged.
         """
         digest = hashlib.sha256()
-        digest.update(dumps(reader.header.facts.get("seed")).encode())
+        digest.update(dumps(reader.facts.get("seed")).encode())
         # What is not recorded is told by the states; they say the controls too.
         rows, total = reader.actions, reader.step_count
-        if reader.header.action is None:
+        if reader.kind("action") is None:
             rows, total = reader.states, reader.row_count
         for start in range(0, total, _CHUNK):
             values = rows(start, min(start + _CHUNK, total))

@@ -62,9 +62,8 @@ def begun_snapshot(
     Raises:
         InvalidArgument: what is recorded is not of this model.
     """
-    header = reader.header
-    state, numbers = live_snapshot(model, data, header.state, header.snapshot)
-    _, compared = compared_columns(header.state, with_warm_start=False)
+    state, numbers = live_snapshot(model, data, reader.columns, _kind(reader))
+    _, compared = compared_columns(reader.columns, with_warm_start=False)
     recorded = reader.states(0, 1)[0]
     is_near = np.allclose(
         state[compared], recorded[compared], rtol=tolerance, atol=tolerance
@@ -96,9 +95,8 @@ def follow_snapshots(
             changes it in a way that cannot be.
         UnreadableFile: the file is damaged.
     """
-    layout = reader.header.snapshot
     taking = _Taking(reader, model, begun)
-    result = FollowedSnapshots(Differences(column_names(layout)))
+    result = FollowedSnapshots(Differences(column_names(_kind(reader))))
     unknown: set[int] = set()
     chosen = np.arange(reader.frame_count)
     if few and len(chosen) > _FEW:
@@ -111,7 +109,7 @@ def follow_snapshots(
             uneven=uneven,
             is_end=first + len(rows) == reader.row_count,
         )
-        wanted = numbers_of(layout, _snapshots(reader, frames))
+        wanted = numbers_of(_snapshots(reader, frames))
         compared: list[int] = []
         ours, theirs = np.empty_like(wanted), np.empty_like(wanted)
         for step, recorded in zip(
@@ -132,9 +130,11 @@ def follow_snapshots(
     return result
 
 
-def _snapshots(
-    reader: TrajectoryReader, frames: NDArray[np.int64]
-) -> NDArray[np.uint8]:
+def _kind(reader: TrajectoryReader) -> np.dtype[Any]:
+    return reader.snapshots(0, 0).dtype
+
+
+def _snapshots(reader: TrajectoryReader, frames: NDArray[np.int64]) -> NDArray[Any]:
     first, last = int(frames[0]), int(frames[-1])
     if last - first + 1 == len(frames):
         return reader.snapshots(first, last + 1)
@@ -174,9 +174,8 @@ class _Taking:
         model: Any,
         begun: NDArray[np.float64] | None,
     ) -> None:
-        header = reader.header
-        self.steps = SnapshotSteps(model, header.state, header.snapshot)
-        self.clock = next(part.offset for part in header.state if part.name == "time")
+        self.steps = SnapshotSteps(model, reader.columns, _kind(reader))
+        self.clock = reader.columns["time"].start
         self._begun = begun
         self._coming = reader.iter_model_changes()
         self._next = next(self._coming, None)

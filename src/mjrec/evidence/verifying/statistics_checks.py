@@ -236,7 +236,7 @@ def _objections(
     reader: TrajectoryReader,
     entries: Mapping[int, JournalEntry],
 ) -> Iterator[str]:
-    facts = reader.header.facts
+    facts = reader.facts
     rewards, total = reader.rewards, sum_of(reader.rewards)
     ends = np.flatnonzero(reader.terminated | reader.truncated)
     yield from _differences(

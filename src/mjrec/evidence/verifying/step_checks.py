@@ -82,10 +82,9 @@ def follow_steps(
             in a way that cannot be.
         UnreadableFile: the file is damaged.
     """
-    state = reader.header.state
-    steps = StateSteps(model, state)
-    names, compared = compared_columns(state, with_warm_start=is_exact)
-    clock = next(part.offset for part in state if part.name == "time")
+    steps = StateSteps(model, reader.columns)
+    names, compared = compared_columns(reader.columns, with_warm_start=is_exact)
+    clock = reader.columns["time"].start
     result = FollowedSteps(
         Differences(names), keeps_more_than_state=steps.keeps_more_than_state
     )

@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording in flight as a trajectory: of a living process, a dead one, an ended one.
+
+Rows count as far as each says its own number: after a crash of the machine the pages of
+a log may be there without what was written into them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InvalidArgument
+from .json_fields import unreadable
+from .regular_files import open_regular
+from .row_log import RowLogReader
+from .spans import LOOKS, Recording, get_recording, read_list
+from .trajectory import (
+    FRAME,
+    STEP,
+    TERMINATED,
+    TRUNCATED,
+    ModelChange,
+    TrajectoryReader,
+    check_dtype,
+)
+
+# A row has a step, a frame, or both.
+_KINDS = STEP | FRAME
+
+# Read at once while looking through the rows.
+_CHUNK_BYTES = 1 << 22
+
+# How a change of the model begins: the row that it holds from, its step, and the length
+# of the record behind it.
+_CHANGE = struct.Struct("<QqQ")
+_LONGEST_HEADER = 1 << 16
+_LARGEST_CHANGE = 1 << 30
+
+
+def open_recording(path: Path) -> TrajectoryReader:
+    """Open what a log holds of a recording at this moment.
+
+    Args:
+        path: the file that the recording will be.
+
+    Raises:
+        UnreadableFile: there is no such recording, or its log is damaged, or of a newer
+            version.
+    """
+    recording = get_recording(path)
+    spans = recording.spans
+    assert spans.dtype is not None
+    with unreadable(spans.log), contextlib.ExitStack() as opened:
+        rows = opened.enter_context(
+            contextlib.closing(RowLogReader(spans.log, spans.dtype.itemsize))
+        )
+        count = rows.count
+        # Again: what was begun behind it is not its own.
+        spans = read_list(spans.path)
+        recording = spans.recordings.get(recording.name, recording)
+        if recording.stop is not None:
+            # All of its rows were counted when that was said.
+            count = rows.count
+        reader = _reader_of(recording, count, rows, path, opened)
+        reader.release = opened.pop_all().close
+        return reader
+
+
+def _reader_of(
+    recording: Recording,
+    count: int,
+    rows: RowLogReader,
+    path: Path,
+    opened: contextlib.ExitStack,
+) -> TrajectoryReader:
+    log, dtype = recording.spans.log, recording.spans.dtype
+    assert dtype is not None
+    first, stop = recording.row, _stop_of(recording, count)
+    heads = _sound_heads(rows, dtype, first, stop)
+    is_step, is_frame = heads["flags"] & STEP != 0, heads["flags"] & FRAME != 0
+    places = {
+        **dict.fromkeys(("state", "observation"), first + np.flatnonzero(is_step)),
+        # The row of step k has the action that led there; that of the reset has none.
+        "action": first + np.flatnonzero(is_step)[1:],
+        "snapshot": first + np.flatnonzero(is_frame),
+    }
+    last = int(np.flatnonzero(is_step | is_frame).max(initial=-1))
+    looks = _open_looks(recording, opened)
+    changes = list(_find_changes(looks, recording.look, first + last + 1))
+
+    def read(part: str, start: int, stop: int) -> NDArray[Any]:
+        with unreadable(log):
+            return _read_part(rows, dtype, part, places[part][start:stop])
+
+    def read_change(index: int) -> ModelChange:
+        assert looks is not None
+        step, offset, length = changes[index]
+        with unreadable(log.with_suffix(LOOKS)):
+            fields = _unpack_fields(os.pread(looks.fileno(), length, offset))
+            return ModelChange(step=step, fields=fields)
+
+    steps = heads[is_step][1:]
+    promised = stop if recording.stop is None else max(stop, recording.stop)
+    return TrajectoryReader(
+        path=path,
+        facts=dict(recording.facts),
+        dtype=dtype,
+        row_count=int(is_step.sum()),
+        rewards=steps["reward"].copy(),
+        terminated=steps["flags"] & TERMINATED != 0,
+        truncated=steps["flags"] & TRUNCATED != 0,
+        frame_steps=heads["step"][is_frame],
+        change_count=len(changes),
+        dropped=max(0, promised - first) - len(heads),
+        read=read,
+        read_change=read_change,
+        release=rows.close,
+    )
+
+
+def _stop_of(recording: Recording, count: int) -> int:
+    """Return the row behind the last of a recording, of `count` in the log."""
+    stop = recording.stop
+    if stop is None:
+        # One that was left without an end is followed by the next one, if there is any.
+        names = list(recording.spans.recordings)
+        following = names[names.index(recording.name) + 1 :][:1]
+        stop = recording.spans.recordings[following[0]].row if following else count
+    return max(recording.row, min(stop, count))
+
+
+def _sound_heads(
+    rows: RowLogReader, dtype: np.dtype[Any], first: int, stop: int
+) -> NDArray[Any]:
+    """Return the heads of the rows from `first` on, up to one that cannot be right."""
+    names = ["row", "step", "reward", "flags"]
+    head = np.dtype([(name, dtype[name]) for name in names])
+    at_once = max(1, _CHUNK_BYTES // dtype.itemsize)
+    parts = [np.empty(0, head)]
+    for start in range(first, stop, at_once):
+        found = rows.read(start, min(stop, start + at_once)).view(dtype)[:, 0]
+        part = np.empty(len(found), head)
+        for name in names:
+            part[name] = found[name]
+        parts.append(part)
+        if (part["row"] != np.arange(start, start + len(part))).any():
+            # A log may have a hole behind its rows.
+            break
+    heads = np.concatenate(parts)
+    is_step = heads["flags"] & STEP != 0
+    sound = heads["row"] == np.arange(first, first + len(heads))
+    sound &= heads["flags"] & _KINDS != 0
+    # States, actions and frames belong together by their places.
+    sound &= heads["step"] == np.cumsum(is_step) - 1
+    return heads if sound.all() else heads[: np.argmin(sound)]
+
+
+def _read_part(
+    rows: RowLogReader, dtype: np.dtype[Any], part: str, wanted: NDArray[np.intp]
+) -> NDArray[Any]:
+    member = dtype[part]
+    out = np.zeros((len(wanted), *member.shape), member.base)
+    at_once = max(1, _CHUNK_BYTES // dtype.itemsize)
+    start = 0
+    while start < len(wanted):
+        # What stands between those that are wanted is read, too.
+        stop = int(np.searchsorted(wanted, wanted[start] + at_once))
+        chosen = wanted[start:stop]
+        first, behind = int(chosen[0]), int(chosen[-1]) + 1
+        found = rows.read(first, behind).view(dtype)[:, 0]
+        if (found["row"] != np.arange(first, behind)).any():
+            raise ValueError("its log was changed while it was read")
+        values = found[part][chosen - first]
+        # One by one: padding holds whatever lies between MuJoCo's arrays.
+        for name in member.names or ():
+            out[name][start:stop] = values[name]
+        if member.names is None:
+            out[start:stop] = values
+        start = stop
+    return out
+
+
+def _open_looks(recording: Recording, opened: contextlib.ExitStack) -> BinaryIO | None:
+    log = recording.spans.log
+    try:
+        return opened.enter_context(open_regular(log.with_suffix(LOOKS)))
+    except FileNotFoundError:
+        # All files of a log are removed, and that before this one.
+        log.lstat()
+        return None
+
+
+def _find_changes(
+    looks: BinaryIO | None, offset: int, stop: int
+) -> Iterator[tuple[int, int, int]]:
+    """Yield the steps of the changes before row `stop`, and where their records are."""
+    if looks is None:
+        return
+    size = os.fstat(looks.fileno()).st_size
+    while offset + _CHANGE.size <= size:
+        prefix = os.pread(looks.fileno(), _CHANGE.size, offset)
+        row, step, length = _CHANGE.unpack(prefix)
+        offset += _CHANGE.size
+        if row >= stop or not 0 < length <= min(_LARGEST_CHANGE, size - offset):
+            return
+        yield step, offset, length
+        offset += length
+
+
+def pack_change(row: int, change: ModelChange) -> bytes:
+    """Return what the file of changes holds of one that holds from a row on.
+
+    Raises:
+        InvalidArgument: a field is no array of plain numbers, or has no name, or all
+            of them are too large.
+    """
+    arrays = {name: np.asarray(values) for name, values in change.fields.items()}
+    record = np.empty(
+        (),
+        [(n, each.dtype.newbyteorder("<"), each.shape) for n, each in arrays.items()],
+    )
+    try:
+        check_dtype(record.dtype)
+    except ValueError as error:
+        raise InvalidArgument(f"A model field cannot be recorded: {error}.") from None
+    for name, array in arrays.items():
+        record[name] = array
+    file = io.BytesIO()
+    np.lib.format.write_array(file, record, (1, 0), allow_pickle=False)
+    packed = file.getvalue()
+    if len(packed) > _LARGEST_CHANGE:
+        raise InvalidArgument(
+            f"A change of a model may have {_LARGEST_CHANGE} bytes, not {len(packed)}."
+        )
+    return _CHANGE.pack(row, change.step, len(packed)) + packed
+
+
+def _unpack_fields(packed: bytes) -> dict[str, NDArray[Any]]:
+    try:
+        record = np.lib.format.read_array(
+            io.BytesIO(packed), allow_pickle=False, max_header_size=_LONGEST_HEADER
+        )
+        check_dtype(record.dtype)
+        # Copies can be written to, and do not keep the rest.
+        return {name: record[name].copy() for name in record.dtype.names or ()}
+    # NumPy parses the header as Python, and raises what that raises.
+    except Exception as error:
+        raise ValueError(f"a change of the model is damaged ({error})") from error

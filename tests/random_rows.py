@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of random bytes, with NaNs of every kind, to be compared bit for bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from trajectories_by_hand import add_row
+from trajectory_contents import TrajectoryContent
+
+from mjrec.formats.monitor_directory import Infix, trajectory_prefix
+from mjrec.formats.span_writer import SpanLogs, SpanWriter
+from mjrec.formats.trajectory import packed, row_dtype
+
+INFIX = Infix(0, "1")
+NAME = trajectory_prefix(INFIX, 27)
+FACTS = {"env_id": "E-v0", "seed": 7, "limit": float("inf")}
+STATE = packed([("qpos", ("<f8", (2,))), ("time", ("<f8", (1,)))])
+# Rows with bytes between their arrays.
+SNAPSHOT = packed(
+    [
+        ("geom_xpos", ("<f8", (2, 3))),
+        ("wrap_obj", ("<i4", (3,))),
+        ("eq_active", ("|u1", (1,))),
+    ]
+)
+ACTION, OBSERVATION = np.dtype(("<f4", (3,))), np.dtype(("|u1", (2, 2)))
+DTYPE = row_dtype(
+    state=STATE, snapshot=SNAPSHOT, action=ACTION, observation=OBSERVATION
+)
+
+
+def rows(count: int, dtype: np.dtype[Any] = DTYPE) -> Any:
+    """Return rows of random bytes; of more rows the first are the same."""
+    data = np.random.default_rng(1).bytes(count * dtype.itemsize)
+    return np.frombuffer(data, dtype)
+
+
+def write(
+    logs: SpanLogs,
+    steps: int,
+    *,
+    episode: int = 27,
+    every: int = 1,
+    facts: dict[str, Any] = FACTS,
+    dtype: np.dtype[Any] = DTYPE,
+    first: int = 0,
+    span: SpanWriter | None = None,
+) -> SpanWriter:
+    """Record an episode, or go on with one from step `first` on, without an end."""
+    span = span or logs.begin(trajectory_prefix(INFIX, episode), facts, dtype)
+    for step, row in enumerate(rows(steps + 1, dtype)):
+        parts = {name: row[name] for name in dtype.names[4:]}
+        for name, kind in (("state", np.float64), ("snapshot", np.uint64)):
+            if name in parts:
+                parts[name] = np.frombuffer(row[name].tobytes(), kind)
+        if step % every:
+            parts.pop("snapshot", None)
+        if step >= first:
+            add_row(span, step, reward=step / 3, truncated=step == 9, **parts)
+    return span
+
+
+def check(
+    content: TrajectoryContent,
+    steps: int,
+    *,
+    every: int = 1,
+    dtype: np.dtype[Any] = DTYPE,
+) -> None:
+    """Check that a recording has exactly what `write` wrote."""
+    expected = rows(steps + 1, dtype)
+    assert content.dtype == dtype
+    assert content.rewards.tolist() == [k / 3 for k in range(1, steps + 1)]
+    assert content.truncated.tolist() == [k == 9 for k in range(1, steps + 1)]
+    assert not content.terminated.any()
+    if "state" in dtype.names:
+        assert content.states.tobytes() == expected["state"].tobytes()
+    if "action" in dtype.names:
+        assert content.actions.shape == (steps, *dtype["action"].shape)
+        assert content.actions.tobytes() == expected["action"][1:].tobytes()
+    if "observation" in dtype.names:
+        assert content.observations.tobytes() == expected["observation"].tobytes()
+    if "snapshot" in dtype.names:
+        assert content.frame_steps.tolist() == list(range(0, steps + 1, every))
+        # What lies between the arrays is nothing.
+        frames = np.zeros(len(content.frame_steps), dtype["snapshot"])
+        for name in frames.dtype.names:
+            frames[name] = expected["snapshot"][name][::every]
+        assert content.snapshots.tobytes() == frames.tobytes()
