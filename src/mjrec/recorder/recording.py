@@ -135,8 +135,12 @@ class Recording:
         """Note the action of the coming step, which the environment may overwrite."""
         if self.is_stopped:
             return
-        if self._span is None:
-            self._action = action_array(action)
+        if self._span is None and action is not None:
+            usual = self._run.action
+            if usual is None or not usual.set(action):
+                usual = action_array(action)
+                self._run.action = usual or self._run.action
+            self._action = usual
         if self._action is not None and not self._action.set(action):
             self._note_irregular("actions")
 
@@ -275,10 +279,14 @@ class Recording:
         # Of another size the last word would have what stands behind it in memory.
         if start is None or start.words is None or action is None or action.size % 8:
             return None
+        known = self._run.row_words
+        if known is None or known[0] is not start.words or known[1] is not action:
+            words = np.concatenate([start.words, words_of([action.values])])
+            self._run.row_words = known = start.words, action, words
         return gathering(
             self._run.stats,
             span,
-            np.concatenate([start.words, words_of([action.values])]),
+            known[2],
             set_action=action.set,
             is_current=start.is_current,
             stride=self._stride,
