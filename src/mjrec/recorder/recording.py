@@ -294,7 +294,7 @@ class Recording:
 
     def _begin(self) -> SpanWriter:
         action, observation = self._action, self._observation
-        dtype = row_dtype(
+        dtype = _row_dtype(
             state=self._state,
             snapshot=self._snapshot,
             action=None if action is None else action.kind,
@@ -403,6 +403,10 @@ def _pace(
         "timestep": None if timestep is None else str(timestep),
         "stride": stride_for(rate, max_fps),
     }
+
+
+# Mostly of one kind in all episodes; that two dtypes are one is told at once then.
+_row_dtype = functools.lru_cache(maxsize=8)(row_dtype)
 
 
 # Of the same few steps in each episode; fractions take Python long.
