@@ -101,7 +101,7 @@ def draw_through_render(trajectory: str, height: int, width: int) -> dict[str, f
 def draw_as_worker(trajectory: str, height: int, width: int) -> dict[str, float]:
     """Draw the same with what a worker draws with, in this process."""
     # As above.
-    from mjrec.rendering.drawing import open_drawing
+    from mjrec.rendering.worker import open_drawing
     from mjrec.simulation.renderer import Canvas
 
     start = time.perf_counter()

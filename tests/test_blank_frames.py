@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,30 +58,6 @@ def test_what_is_suspect(frames: list[Any], facts: dict[str, bool]) -> None:
     assert facts_of(*frames) == facts
 
 
-def test_frames_are_not_kept() -> None:
-    """Their memory may be drawn into at once."""
-    frame = picture(90, pixel=0)
-    blank = BlankFrames()
-    blank.add(frame)
-    frame[0, 0] = 7
-    blank.add(frame)
-    assert blank.facts() == {}
-
-
-def test_a_view_is_as_good_as_an_array() -> None:
-    """Upside down, as OpenGL gives it."""
-    assert facts_of(picture(90)[::-1], picture(90)[::-1]) == CONSTANT
-
-
-def test_an_ordinary_video_is_hardly_looked_at() -> None:
-    """Once something is seen and moves, frames are not looked at any more."""
-    blank = BlankFrames()
-    blank.add(picture(90, pixel=0))
-    blank.add(picture(90, pixel=1))
-    blank.add(None)  # type: ignore[arg-type]  # nobody looks
-    assert blank.facts() == {}
-
-
 class Screen:
     """Shows frames that were made before."""
 
@@ -124,23 +99,3 @@ def test_with_strict_it_is_an_error_and_the_video_is_kept(tmp_path: Path) -> Non
     assert caught.value.frame_count == len(frames_of(path)) == 2
     assert metadata_of(tmp_path, 0)["suspect_constant"] is True
     recorder.close()
-
-
-def test_an_ordinary_video_says_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, names: Callable[..., list[str]]
-) -> None:
-    """Neither key is there."""
-    recorder = record(tmp_path / "v.mp4", picture(9, pixel=0), picture(9), strict=True)
-    recorder.close()
-    assert not {"suspect_black", "suspect_constant"} & set(recorder.metadata)
-    assert not caplog.records
-
-
-def test_text_has_no_colour(tmp_path: Path, make_corridor: Any) -> None:
-    """An asciicast is never suspect."""
-    env = make_corridor(render_mode="ansi")
-    recorder = VideoRecorder(env, tmp_path / "v.json", strict=True)
-    for _ in range(3):
-        recorder.capture_frame()
-    recorder.close()
-    assert not {"suspect_black", "suspect_constant"} & set(recorder.metadata)

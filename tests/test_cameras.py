@@ -9,6 +9,7 @@ import pytest
 
 from mjrec.errors import InvalidArgument, UnknownName
 from mjrec.simulation.cameras import (
+    camera_from_members,
     camera_label,
     camera_names,
     raw_data,
@@ -42,153 +43,107 @@ def model_with(cameras: str = "", inside: str = "") -> mujoco.MjModel:
 FRONT_AND_SIDE = '<camera name="front"/><camera/><camera name="side"/>'
 
 
-def test_names_are_in_the_models_order_without_the_nameless() -> None:
-    """A camera without a name can be given by number only."""
-    assert camera_names(model_with(FRONT_AND_SIDE)) == ["front", "side"]
+@pytest.mark.parametrize(
+    ("camera", "number", "label"),
+    [
+        ("side", 2, "side"),
+        (0, 0, "front"),
+        (np.int64(1), 1, 1),
+        (Wrapper, 2, "side"),
+    ],
+)
+def test_a_camera_by_name_or_number(camera: Any, number: int, label: Any) -> None:
+    """Of MuJoCo's model or a wrapper; it is called by its name, else its number."""
+    model: Any = model_with(FRONT_AND_SIDE)
+    assert camera_names(model) == ["front", "side"]
+    if camera is Wrapper:
+        camera = label
+        assert resolve_camera(Wrapper(model), camera).fixedcamid == number
+    resolved = resolve_camera(model, camera)
+    assert int(resolved.type) == int(mujoco.mjtCamera.mjCAMERA_FIXED)
+    assert resolved.fixedcamid == number
+    assert camera_label(model, camera) == camera_label(model, resolved) == label
 
 
-def test_a_name_is_that_camera() -> None:
-    """The third camera of the model is the second one with a name."""
-    camera = resolve_camera(model_with(FRONT_AND_SIDE), "side")
-
-    assert int(camera.type) == int(mujoco.mjtCamera.mjCAMERA_FIXED)
-    assert camera.fixedcamid == 2
-
-
-@pytest.mark.parametrize("number", [0, 2, np.int64(1)])
-def test_a_number_is_that_camera(number: int) -> None:
-    """NumPy's integers are numbers too."""
-    camera = resolve_camera(model_with(FRONT_AND_SIDE), number)
-
-    assert int(camera.type) == int(mujoco.mjtCamera.mjCAMERA_FIXED)
-    assert camera.fixedcamid == number
-
-
-def test_minus_one_is_the_free_camera_where_the_model_puts_it() -> None:
-    """It is what `mjv_defaultFreeCamera` says."""
+def test_a_free_camera() -> None:
+    """-1 is where the model puts it; an `MjvCamera` is its owner's to move."""
     model = model_with()
     expected = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, expected)
-
     camera = resolve_camera(model, -1)
-
-    assert int(camera.type) == int(mujoco.mjtCamera.mjCAMERA_FREE)
     assert (camera.azimuth, camera.elevation) == (30, -70)
     assert camera.lookat.tolist() == expected.lookat.tolist()
     assert camera.distance == expected.distance
+    assert resolve_camera(model, camera) is camera
+    assert camera_label(model, -1) == -1
+    label: Any = camera_label(model, camera)
+    members = {k: v for k, v in label.items() if k not in ("type", "trackbodyid")}
+    assert camera_label(model, camera_from_members(model, members)) == label
+    with pytest.raises(InvalidArgument, match="zoom"):
+        camera_from_members(model, {"zoom": 2})
+    with pytest.raises(InvalidArgument, match="has 2"):
+        camera_from_members(model, {"type": 1, "trackbodyid": 9})
 
 
-def test_an_mjv_camera_is_given_back() -> None:
-    """The same object, so that its owner may move it."""
-    camera = mujoco.MjvCamera()
-
-    assert resolve_camera(model_with(), camera) is camera
-
-
-@pytest.mark.parametrize("name", ["frnt", ""])
-def test_an_unknown_name_lists_the_names_there_are(name: str) -> None:
-    """An empty name is not the nameless camera."""
-    with pytest.raises(UnknownName, match=r"front, side\..*-1") as caught:
-        resolve_camera(model_with(FRONT_AND_SIDE), name)
-
-    assert (caught.value.kind, caught.value.name) == ("camera", name)
-    assert caught.value.available == ["front", "side"]
-
-
-@pytest.mark.parametrize("number", [-2, 3])
-def test_a_number_out_of_range_names_the_range(number: int) -> None:
-    """-1 is the free camera, 2 the last of three."""
-    with pytest.raises(InvalidArgument, match=rf"number {number}\b.* from -1 .* to 2"):
-        resolve_camera(model_with(FRONT_AND_SIDE), number)
-
-
-@pytest.mark.parametrize("camera", [True, 0.0, None, ["front"]])
-def test_anything_else_is_no_camera(camera: Any) -> None:
-    """True is not camera 1."""
-    with pytest.raises(InvalidArgument, match="A camera is a name, a number or"):
+@pytest.mark.parametrize(
+    ("camera", "said"),
+    [
+        ("frnt", r"front, side\..*-1"),
+        # An empty name is not the nameless camera, and True not camera 1.
+        ("", r"front, side\..*-1"),
+        (-2, r"number -2\b.* from -1 .* to 2"),
+        (3, r"number 3\b.* from -1 .* to 2"),
+        *((other, "A camera is a name, a number or") for other in (True, 0.0, None)),
+    ],
+)
+def test_an_unknown_camera_names_those_there_are(camera: Any, said: str) -> None:
+    """One clear error each."""
+    with pytest.raises(InvalidArgument, match=said) as caught:
         resolve_camera(model_with(FRONT_AND_SIDE), camera)
+    if isinstance(caught.value, UnknownName):
+        assert caught.value.available == ["front", "side"]
 
 
 def test_wrappers_are_opened() -> None:
-    """dm_control's objects hold MuJoCo's as `.ptr`."""
-    model = model_with(FRONT_AND_SIDE)
+    """dm_control's objects hold MuJoCo's as `.ptr`; what is no model is named."""
+    model = model_with()
     data = mujoco.MjData(model)
-
-    assert raw_model(Wrapper(model)) is model
-    assert raw_model(model) is model
-    assert raw_data(Wrapper(data)) is data
-    assert raw_data(data) is data
-    assert camera_names(Wrapper(model)) == ["front", "side"]
-    assert resolve_camera(Wrapper(model), "side").fixedcamid == 2
-    assert tracking_camera(Wrapper(model)) is None
-
-
-def test_what_is_no_model_is_named() -> None:
-    """Data where a model belongs is an error, not a crash."""
-    data = mujoco.MjData(model_with())
-
+    assert raw_model(Wrapper(model)) is raw_model(model) is model
+    assert raw_data(Wrapper(data)) is raw_data(data) is data
     with pytest.raises(InvalidArgument, match=r"MjModel.*got mujoco.*MjData"):
         raw_model(data)
     with pytest.raises(InvalidArgument, match=r"MjData.*got .*Wrapper"):
         raw_data(Wrapper(3))
 
 
-def test_no_camera_follows_anything() -> None:
-    """A fixed camera on a robot moves with it but does not follow it."""
-    assert tracking_camera(model_with(FRONT_AND_SIDE, '<camera name="eye"/>')) is None
+PART = '<camera name="trunk" mode="track"/>'
+ROBOT = '<camera name="robot" mode="trackcom"/>'
+ARM = """
+    <body><joint/><geom size=".1"/>
+      <body><joint type="slide"/><geom size=".1"/>
+        <camera name="hand" mode="track"/>
+      </body>
+    </body>
+"""
 
 
-def test_the_first_camera_that_follows_is_chosen() -> None:
-    """In the model's order, after those that do not follow."""
-    inside = '<camera name="b" mode="trackcom"/><camera name="a" mode="trackcom"/>'
-
-    assert tracking_camera(model_with(FRONT_AND_SIDE, inside)) == "b"
-
-
-def test_following_the_robot_comes_before_following_a_part() -> None:
-    """`trackcom` before `track`, which is all that some models have."""
-    part = '<camera name="trunk" mode="track"/>'
-
-    assert tracking_camera(model_with("", part)) == "trunk"
-    robot = '<camera name="robot" mode="trackcom"/>'
-    assert tracking_camera(model_with("", part + robot)) == "robot"
-
-
-def test_a_camera_on_the_hand_of_a_fixed_arm_follows_no_robot() -> None:
-    """It would show a close-up; dm_control's reacher and manipulator have one."""
-    arm = """
-        <body><joint/><geom size=".1"/>
-          <body><joint type="slide"/><geom size=".1"/>
-            <camera name="hand" mode="track"/>
-          </body>
-        </body>
-    """
-
-    assert tracking_camera(model_with(arm)) is None
-    robot = '<camera name="robot" mode="track"/>'
-    assert tracking_camera(model_with(arm, robot)) == "robot"
-
-
-def test_a_nameless_camera_that_follows_is_a_number() -> None:
-    """The number can be resolved again."""
-    model = model_with(FRONT_AND_SIDE, '<camera mode="trackcom"/>')
-
-    assert tracking_camera(model) == 3
-    assert resolve_camera(model, 3).fixedcamid == 3
-
-
-def test_labels_of_cameras() -> None:
-    """A name where there is one, else a number, else where a free camera is."""
-    model = model_with('<camera name="above"/>')
-    free = mujoco.MjvCamera()
-    free.distance = 3
-    fixed = mujoco.MjvCamera()
-    fixed.type = mujoco.mjtCamera.mjCAMERA_FIXED
-    fixed.fixedcamid = 0
-    assert camera_label(model, "above") == "above"
-    assert camera_label(model, 0) == "above"
-    assert camera_label(model, -1) == -1
-    assert camera_label(model, fixed) == "above"
-    label = camera_label(model, free)
-    assert isinstance(label, dict)
-    assert label["distance"] == 3
+@pytest.mark.parametrize(
+    ("cameras", "inside", "found"),
+    [
+        # A fixed camera on a robot moves with it but does not follow it.
+        (FRONT_AND_SIDE, '<camera name="eye"/>', None),
+        (FRONT_AND_SIDE, ROBOT + '<camera name="a" mode="trackcom"/>', "robot"),
+        # The robot comes before a part, which is all that some models have.
+        ("", PART, "trunk"),
+        ("", PART + ROBOT, "robot"),
+        # The hand of a fixed arm, as of dm_control's reacher, would be a close-up.
+        (ARM, "", None),
+        (ARM, PART, "trunk"),
+        (FRONT_AND_SIDE, '<camera mode="trackcom"/>', 3),
+    ],
+)
+def test_the_camera_that_follows_the_robot(
+    cameras: str, inside: str, found: str | int | None
+) -> None:
+    """By name, or by number where it has none."""
+    assert tracking_camera(model_with(cameras, inside)) == found

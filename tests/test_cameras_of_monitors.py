@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 import pytest
 from recordings import frames_of, manifest_of
@@ -83,23 +82,6 @@ def test_manifest_and_metadata_name_all_videos(tmp_path: Path, render: str) -> N
 
 
 @pytest.mark.parametrize("render", WAYS)
-def test_further_videos_name_the_first_and_their_second_name(
-    tmp_path: Path, render: str
-) -> None:
-    """Whoever has one file finds the others."""
-    record(tmp_path, camera=CAMERAS[render], render=render, name_prefix="rl")
-    [first, further] = sorted(
-        tmp_path.glob("openaigym.*.mp4"), key=lambda p: len(str(p))
-    )
-    about = json.loads(further.with_suffix(".meta.json").read_text())
-    assert about["first_video"] == first.name
-    assert (tmp_path / about["also_named"]).samefile(further)
-    about = json.loads(first.with_suffix(".meta.json").read_text())
-    assert about["further_videos"] == [further.name]
-    assert (tmp_path / "rl-episode-0.mp4").samefile(first)
-
-
-@pytest.mark.parametrize("render", WAYS)
 def test_cameras_side_by_side_are_one_video(tmp_path: Path, render: str) -> None:
     """The grid has the very frames of both."""
     cameras = CAMERAS[render]
@@ -147,33 +129,6 @@ def test_another_picture_than_renders_own_is_never_live(
         mjrec.Monitor(made, tmp_path / "run", render="live", **options)
     assert not (tmp_path / "run").exists()
     made.close()
-
-
-@pytest.mark.dm_control
-@pytest.mark.parametrize("options", [{"height": 4000}, {"camera": mujoco.MjvCamera()}])
-def test_what_physics_does_not_draw_is_never_live(
-    tmp_path: Path, options: dict[str, Any]
-) -> None:
-    """A picture larger than the model's buffer, and a camera that it does not know."""
-    from dm_control import suite
-
-    made = suite.load("cheetah", "run")
-    with pytest.raises(mjrec.NoPictures, match="Leave render= out"):
-        mjrec.Monitor(made, tmp_path / "run", env_id="c", render="live", **options)
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.thorough
-def test_clips_have_gymnasiums_names_besides(tmp_path: Path) -> None:
-    """By the number of the step that they begin before."""
-    record(
-        tmp_path,
-        camera="track",
-        name_prefix="rl-video",
-        step_trigger=lambda step: step == 1,
-    )
-    [own] = tmp_path.glob("openaigym.*.mp4")
-    assert (tmp_path / "rl-video-step-1.mp4").samefile(own)
 
 
 @pytest.mark.parametrize(

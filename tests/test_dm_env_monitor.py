@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import hashlib
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +21,6 @@ from mjrec import (  # noqa: E402  after importorskip
     InvalidArgument,
     NoPictures,
     ResetNotAllowed,
-    UnknownName,
 )
 
 pytestmark = pytest.mark.dm_control
@@ -169,52 +167,3 @@ def test_records_dm_control(cheetah: Any, tmp_path: Path) -> None:
     assert metadata["env_id"] == "dm_control/cheetah-run"
     assert metadata["gl_renderer"]
     assert metadata["camera"] == -1
-
-
-def test_pictures_are_those_of_physics_render(cheetah: Any, tmp_path: Path) -> None:
-    """Default size and camera; the frame hash is that of the same call."""
-    with mjrec.Monitor(cheetah, tmp_path) as env:
-        env.reset()
-        expected = hashlib.sha256(env.physics.render().tobytes()).hexdigest()
-    [path] = tmp_path.glob("*.framehash")
-    assert path.read_text().splitlines()[-1].endswith(expected)
-
-
-@pytest.mark.thorough
-def test_camera_by_name(cheetah: Any, tmp_path: Path) -> None:
-    """A named camera is used and named; an unknown one lists the names there are."""
-    with pytest.raises(UnknownName, match="side"):
-        mjrec.Monitor(cheetah, tmp_path / "new", camera="top")
-    assert not (tmp_path / "new").exists()
-    with mjrec.Monitor(cheetah, tmp_path, camera="side", width=32, height=32) as env:
-        env.reset()
-    assert metadata_of(tmp_path, 0)["camera"] == "side"
-
-
-def test_trajectory_names_what_makes_the_episode_again(
-    cheetah: Any, tmp_path: Path
-) -> None:
-    """The task, where the user names it, its random state, and observations."""
-    before = cheetah.task.random.get_state()[1].tolist()
-    with mjrec.Monitor(
-        cheetah,
-        tmp_path,
-        workers=0,
-        observations=True,
-        env_id="dm_control/cheetah-run",
-    ) as env:
-        # dm_env's reset takes no seed, so the monitor is told.
-        env.seed = 11
-        first = env.reset().observation
-        env.step(zeros(env))
-    [path] = tmp_path.glob("*.h5")
-    trajectory = mjrec.load_trajectory(path)
-    assert trajectory.environment["framework"] == "dm_control"
-    assert trajectory.environment["id"] == "dm_control/cheetah-run"
-    facts = trajectory.facts
-    assert facts["seed"] == 11
-    assert facts["random_state"]["state"]["key"] == before
-    assert trajectory.observations is not None
-    parts = np.concatenate(list(first.values()))
-    np.testing.assert_array_equal(trajectory.observations[0], parts)
-    assert [name for name, _ in facts["observation_parts"]] == list(first)

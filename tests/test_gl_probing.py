@@ -9,7 +9,9 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,26 +51,12 @@ def test_egl_renders_and_says_with_what() -> None:
     assert sum(device.in_use for device in answer.devices) == 1
 
 
-def test_osmesa_renders() -> None:
-    """A real picture by OSMesa, where its library can be had."""
-    answer = probe("osmesa")
-    if not answer.renders:
-        pytest.skip(f"{answer.cause} {answer.fix}")
-    assert answer.software
-
-
-def test_a_measured_answer_is_kept() -> None:
-    """The second question is answered without another child process."""
-    first = probe("egl", measure=True)
-    assert probe("egl") is first
-    assert probe("egl", measure=True) is first
-
-
-def test_another_environment_is_another_question(
+def test_an_answer_is_kept_for_its_environment(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An answer is not used again after a variable has changed."""
-    assert probe("egl").renders
+    """The second question starts no child process, unless a variable has changed."""
+    first = probe("egl", measure=True)
+    assert probe("egl") is probe("egl", measure=True) is first
     monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "99")
     assert not probe("egl").renders
 
@@ -82,12 +70,6 @@ def test_another_environment_is_another_question(
             "egl",
             {"PYOPENGL_PLATFORM": "glx"},
             "PYOPENGL_PLATFORM (glx) contradicts MUJOCO_GL (egl)",
-            "unset PYOPENGL_PLATFORM",
-        ),
-        (
-            "osmesa",
-            {"PYOPENGL_PLATFORM": "egl"},
-            "PYOPENGL_PLATFORM (egl) contradicts MUJOCO_GL (osmesa)",
             "unset PYOPENGL_PLATFORM",
         ),
         (
@@ -134,15 +116,12 @@ def test_vendor_file_of_a_library_that_is_missing(tmp_path: Path) -> None:
     assert f"libgone.so.0, named in {file}, cannot be loaded" in answer.cause
 
 
-@pytest.mark.parametrize(
-    ("backend", "library"), [("egl", "libEGL.so"), ("osmesa", "libOSMesa.so")]
-)
-def test_damaged_library(backend: str, library: str, tmp_path: Path) -> None:
+def test_damaged_library(tmp_path: Path) -> None:
     """A library that is there and broken is told from one that is missing."""
     # PyOpenGL tries every number.
-    for name in [library, *(f"{library}.{number}" for number in range(10))]:
+    for name in ["libEGL.so", *(f"libEGL.so.{number}" for number in range(10))]:
         (tmp_path / name).touch()
-    answer = probe_with(backend, LD_LIBRARY_PATH=str(tmp_path))
+    answer = probe_with("egl", LD_LIBRARY_PATH=str(tmp_path))
     assert "library is there and cannot be loaded" in answer.cause
     assert "file too short" in answer.cause
 
@@ -157,38 +136,34 @@ def test_driver_that_draws_nothing() -> None:
     assert "The driver draws, and draws wrongly." in answer.cause
 
 
-def test_crash_of_the_driver(tmp_path: Path) -> None:
-    """A crash ends the child only, and is an answer."""
-    variables = python_that_starts_with(tmp_path, "import ctypes; ctypes.string_at(0)")
-    answer = probe_with("egl", **variables)
-    assert "The driver crashed (SIGSEGV)" in answer.cause
+@pytest.mark.parametrize(
+    ("code", "cause"),
+    [
+        ("import ctypes; ctypes.string_at(0)", "The driver crashed (SIGSEGV)"),
+        # What nobody has explained yet is shown as it was said.
+        ("raise SystemExit('the moon is in another quarter')", "the moon is in"),
+    ],
+)
+def test_the_end_of_the_child_is_an_answer(
+    tmp_path: Path, code: str, cause: str
+) -> None:
+    """A crash ends the child only."""
+    answer = probe_with("egl", **python_that_starts_with(tmp_path, code))
+    assert cause in answer.cause
 
 
-def test_hang_ends_with_where_it_hangs() -> None:
-    """The child ends itself, and the traceback of its wait is kept."""
-    answer = probe_environment({**os.environ, "MUJOCO_GL": "egl"}, timeout=0.02)
-    assert "The driver hangs" in answer.cause
-    assert "most recent call first" in answer.output
-
-
-def test_hang_that_no_traceback_ends(
+def test_hang_ends_with_where_it_hangs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A child that is deaf to its own clock is killed."""
-    monkeypatch.setattr(probing, "_GRACE", 0.2)
-    variables = python_that_starts_with(tmp_path, "import signal; signal.pause()")
-    environ = {**os.environ, "MUJOCO_GL": "egl", **variables}
-    answer = probe_environment(environ, timeout=0.2)
+    """The child ends itself; one that is deaf to its own clock is killed."""
+    environ = {**os.environ, "MUJOCO_GL": "egl"}
+    answer = probe_environment(environ, timeout=0.02)
     assert "The driver hangs" in answer.cause
+    assert "most recent call first" in answer.output
+    monkeypatch.setattr(probing, "_GRACE", 0.2)
+    environ |= python_that_starts_with(tmp_path, "import signal; signal.pause()")
+    answer = probe_environment(environ, timeout=0.2)
     assert "no answer within 0.2 seconds" in answer.output
-
-
-def test_unknown_failure_keeps_its_words(tmp_path: Path) -> None:
-    """What nobody has explained yet is shown as it was said."""
-    code = "raise SystemExit('the moon is in the wrong quarter')"
-    answer = probe_with("egl", **python_that_starts_with(tmp_path, code))
-    assert "the moon is in the wrong quarter" in answer.cause
-    assert answer.fix == ""
 
 
 def test_software_on_a_machine_with_a_gpu_is_odd(
@@ -213,33 +188,24 @@ def test_software_on_a_machine_with_a_gpu_is_odd(
 # --- What a picture must show -------------------------------------------------------
 
 
-def scene_picture() -> np.ndarray:
-    """What the probe's scene looks like, roughly."""
-    picture = np.full((480, 480, 3), 60, np.uint8)
-    picture[250:350, 50:160] = (255, 0, 0)
-    picture[250:350, 320:430] = (0, 0, 255)
-    picture[125:210, 200:280] = (0, 255, 0)
-    return picture
-
-
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
         (np.zeros_like, r"Every pixel of the picture is \(0, 0, 0\)"),
-        (lambda p: np.full_like(p, 200), "Every pixel"),
         (lambda p: p[:, ::-1], "red on the left"),
-        (lambda p: p[::-1], "red on the left"),
-        (lambda p: p[..., ::-1], "red on the left"),
         (lambda p: np.random.default_rng(0).integers(0, 255, p.shape), "on the left"),
     ],
-    ids=["black", "constant", "mirrored", "upside-down", "BGR", "noise"],
+    ids=["black", "mirrored", "noise"],
 )
-def test_a_bad_picture_is_found_out(spoil: object, said: str) -> None:
+def test_a_bad_picture_is_found_out(spoil: Callable[[Any], Any], said: str) -> None:
     """A context that works and a picture that is wrong is a failure."""
-    gl_probe.check_picture(scene_picture())
-    assert callable(spoil)
+    picture = np.full((480, 480, 3), 60, np.uint8)
+    picture[250:350, 50:160] = (255, 0, 0)
+    picture[250:350, 320:430] = (0, 0, 255)
+    picture[125:210, 200:280] = (0, 255, 0)
+    gl_probe.check_picture(picture)
     with pytest.raises(gl_probe.WrongPicture, match=said):
-        gl_probe.check_picture(spoil(scene_picture()))
+        gl_probe.check_picture(spoil(picture))
 
 
 # --- Libraries that are not there ---------------------------------------------------

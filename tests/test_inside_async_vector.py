@@ -81,20 +81,6 @@ def test_each_worker_records_its_own(tmp_path: Path, context: str, mode: Any) ->
     assert not list(tmp_path.glob(".*"))
 
 
-def test_many_begin_at_the_same_time(make_corridor: Any, tmp_path: Path) -> None:
-    """Six monitors that make and resume one directory disturb none of the others."""
-    target = tmp_path / "a" / "b"
-
-    def make() -> Any:
-        return mjrec.Monitor(make_corridor(), target, False, resume=True)
-
-    env = AsyncVectorEnv([make] * 6)
-    play(env, 8)
-    env.close()
-    lengths = mjrec.load_results(target)["episode_lengths"]
-    assert list(lengths) == [3] * 12
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     ("context", "ending"), [("fork", "kill"), ("spawn", "kill"), ("fork", "raise")]

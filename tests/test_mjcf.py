@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment, make_mjcf
 from mjrec.environments.options import EnvironmentOptions
-from mjrec.simulation.mjcf import MjcfSimulation, load_mjcf
+from mjrec.simulation.mjcf import load_mjcf
 
 # A red ball on a rail with a motor, a free one, and a green one far from both.
 MODEL = """
@@ -40,110 +40,74 @@ MODEL = """
 """
 FIXED = '<camera name="fixed" pos="0 53 0" xyaxes="-1 0 0 0 0 1"/>'
 FOLLOWER = '<camera name="follow" mode="trackcom" pos="0 -2 0" xyaxes="1 0 0 0 0 1"/>'
+Write = Callable[..., Path]
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Callable[..., Path]:
+def write(tmp_path: Path) -> Write:
     def write_model(
         *, timestep: float = 0.002, cameras: str = "", follower: str = ""
     ) -> Path:
-        path = tmp_path / "rail.xml"
-        path.write_text(
-            MODEL.format(timestep=timestep, cameras=cameras, follower=follower)
-        )
+        path = tmp_path / "my rail (2).xml"
+        options = {"timestep": timestep, "cameras": cameras, "follower": follower}
+        path.write_text(MODEL.format(**options))
         return path
 
     return write_model
 
 
-@pytest.mark.parametrize("timestep", [0.002, 0.0033, 0.01, 0.0166667, 0.0041667])
-def test_there_are_sixty_frames_to_the_second(
-    write: Callable[..., Path], timestep: float
-) -> None:
-    """No frame is more than half a timestep off, and nothing adds up."""
-    simulation = MjcfSimulation(load_mjcf(write(timestep=timestep)))
-    assert simulation.frame_rate == 60
-    for frame in range(1, 301):
-        simulation.advance(np.zeros(2))
-        # A hundred-thousandth is the rounding of 1/60 and 1/240 to these digits.
-        off = abs(simulation.data.time - frame / 60)
-        assert off <= timestep / 2 + 1e-5 * frame / 60
+@pytest.mark.parametrize("timestep", [0.002, 0.0033, 0.0166667, 0.0041667])
+def test_there_are_sixty_frames_to_the_second(write: Write, timestep: float) -> None:
+    """No frame is more than half a timestep off, and nothing adds up; each episode."""
+    env = MjcfEnvironment(write(timestep=timestep))
+    assert env.metadata["render_fps"] == 60
+    assert env.control_timestep() == pytest.approx(1 / 60)
+    for _ in range(2):
+        env.reset()
+        for frame in range(1, 301):
+            env.step(np.zeros(2))
+            # A hundred-thousandth is the rounding of 1/60 and 1/240 to these digits.
+            off = abs(env.simulation.data.time - frame / 60)
+            assert off <= timestep / 2 + 1e-5 * frame / 60
 
 
-def test_a_long_timestep_makes_one_frame_a_step(write: Callable[..., Path]) -> None:
+def test_a_long_timestep_makes_one_frame_a_step(write: Write) -> None:
     """A simulation slower than 60 steps a second plays at its own rate."""
     env = MjcfEnvironment(write(timestep=0.025))
     assert env.simulation.frame_rate == Fraction(40)
-    assert env.metadata["render_fps"] == 40
-    assert env.control_timestep() == 0.025
+    assert (env.metadata["render_fps"], env.control_timestep()) == (40, 0.025)
     env.reset()
     env.step(np.zeros(2))
     assert env.simulation.data.time == 0.025
 
 
-def test_the_environment_declares_sixty_frames(write: Callable[..., Path]) -> None:
-    """The rate is the same whole number whatever the first step happens to last."""
-    env = MjcfEnvironment(write(timestep=0.01))
-    assert env.metadata["render_fps"] == 60
-    assert env.control_timestep() == pytest.approx(1 / 60)
-    assert MjcfEnvironment.metadata["render_fps"] == 60
-
-
 # States have no bounds, and the actuators' ranges are the author's.
 @pytest.mark.filterwarnings("ignore:.*Box (action|observation) space:UserWarning")
-def test_the_environment_keeps_gymnasiums_contract(write: Callable[..., Path]) -> None:
-    """Gymnasium's own checker finds nothing to say."""
+def test_the_environment_keeps_gymnasiums_contract(write: Write) -> None:
+    """Actions are the controls in their ranges, observations positions and speeds."""
     check_env(MjcfEnvironment(write()), skip_render_check=True)
-
-
-def test_actions_are_the_controls_within_their_ranges(
-    write: Callable[..., Path],
-) -> None:
-    """An actuator without limits has none in the action space either."""
-    space = MjcfEnvironment(write()).action_space
-    assert isinstance(space, gymnasium.spaces.Box)
-    assert space.low.tolist() == [-2, -np.inf]
-    assert space.high.tolist() == [3, np.inf]
-
-
-def test_observations_are_positions_and_velocities(write: Callable[..., Path]) -> None:
-    """The motor moves the ball."""
     env = MjcfEnvironment(write())
-    first, _ = env.reset(seed=3)
-    assert first.tolist() == [0, 0]
+    space = env.action_space
+    assert isinstance(space, gymnasium.spaces.Box)
+    assert (space.low.tolist(), space.high.tolist()) == ([-2, -np.inf], [3, np.inf])
+    assert env.reset(seed=3)[0].tolist() == [0, 0]
     for _ in range(10):
-        observation, reward, terminated, truncated, info = env.step(np.array([1, 0]))
+        observation, *rest = env.step(np.array([1, 0]))
     data = env.simulation.data
     assert observation.tolist() == [data.qpos[0], data.qvel[0]]
     assert observation[0] > 0.01
-    assert (reward, terminated, truncated, info) == (0.0, False, False, {})
-
-
-def test_a_reset_is_the_initial_state_again(write: Callable[..., Path]) -> None:
-    """The frames of a second episode lie where those of the first lay."""
-    env = MjcfEnvironment(write(timestep=0.01))
-
-    def times() -> list[float]:
-        env.reset()
-        return [
-            env.step(np.ones(2)) and float(env.simulation.data.time) for _ in range(7)
-        ]
-
-    assert times() == times()
+    assert rest == [0.0, False, False, {}]
 
 
 def test_a_model_without_actuators_is_simulated(tmp_path: Path) -> None:
     """A passive model takes empty actions."""
     path = tmp_path / "falling.mjcf"
-    path.write_text(
-        '<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody>'
-        "</mujoco>"
-    )
+    body = '<body><freejoint/><geom size=".1"/></body>'
+    path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     env = MjcfEnvironment(path)
     env.reset()
     assert env.action_space.shape == (0,)
-    observation, *_ = env.step(env.action_space.sample())
-    assert observation[2] < 0
+    assert env.step(env.action_space.sample())[0][2] < 0
 
 
 def test_an_unstable_simulation_ends_where_it_was_sound(
@@ -160,19 +124,19 @@ def test_an_unstable_simulation_ends_where_it_was_sound(
     )
     env = MjcfEnvironment(path)
     env.reset()
-    sound, *_ = env.step([0.0])
+    sound, *_ = env.step(np.array([0.0]))
     time = env.simulation.data.time
-    observation, _, terminated, truncated, info = env.step([1.0])
+    observation, _, terminated, truncated, info = env.step(np.array([1.0]))
     assert (terminated, truncated) == (True, False)
     assert "unstable" in info["unstable"]
     assert observation.tolist() == sound.tolist()
     assert env.simulation.data.time == time > 0
     env.reset()
-    assert env.step([0.0])[2] is False
+    assert env.step(np.array([0.0]))[2] is False
 
 
 @pytest.mark.parametrize("action", [[0.0], [0, np.nan], [0, np.inf], np.zeros((2, 1))])
-def test_what_is_no_control_is_refused(write: Callable[..., Path], action: Any) -> None:
+def test_what_is_no_control_is_refused(write: Write, action: Any) -> None:
     """MuJoCo would go on with other controls, or raise something obscure."""
     env = MjcfEnvironment(write())
     env.reset()
@@ -180,65 +144,48 @@ def test_what_is_no_control_is_refused(write: Callable[..., Path], action: Any) 
         env.step(action)
 
 
-def test_episodes_end_after_max_steps(write: Callable[..., Path]) -> None:
-    """A model has no end of its own: 1000 steps, or as many as were asked for."""
-    for asked, expected in ((None, 1000), (7, 7)):
-        env = make_mjcf(write(), EnvironmentOptions(max_steps=asked, pictures=False))
-        env.reset()
-        steps, truncated = 0, False
-        while not truncated:
-            _, _, terminated, truncated, _ = env.step(np.zeros(2))
-            steps += 1
-            assert not terminated
-        assert steps == expected
+@pytest.mark.parametrize(("asked", "expected"), [(None, 1000), (7, 7)])
+def test_episodes_end_after_max_steps(
+    write: Write, asked: int | None, expected: int
+) -> None:
+    """A model has no end of its own; its id in recordings is the file's name."""
+    env = make_mjcf(write(), EnvironmentOptions(max_steps=asked, pictures=False))
+    env.reset()
+    ends = [env.step(np.zeros(2))[2:4] for _ in range(expected)]
+    assert ends == [(False, False)] * (expected - 1) + [(False, True)]
+    assert env.spec is not None
+    assert env.spec.id == "mjcf/my_rail__2_"
 
 
-def test_pictures_show_the_camera_that_follows(write: Callable[..., Path]) -> None:
-    """The ball stays in the middle of the picture however far it goes."""
-    env = MjcfEnvironment(
-        write(cameras=FIXED, follower=FOLLOWER),
-        render_mode="rgb_array",
-        height=32,
-        width=48,
-    )
+def test_frames_show_the_camera_that_follows_or_the_first(write: Write) -> None:
+    """The ball stays in the middle of the frame however far it goes."""
+    size: Any = {"render_mode": "rgb_array", "height": 32, "width": 48}
+    env = MjcfEnvironment(write(cameras=FIXED, follower=FOLLOWER), **size)
     assert env.camera == "follow"
     env.reset()
     for _ in range(60):
-        env.step([3, 0])
+        env.step(np.array([3, 0]))
     assert env.simulation.data.qpos[0] > 1
-    picture = env.render()
-    assert picture.shape == (32, 48, 3)
-    assert picture.dtype == np.uint8
-    red, green, _ = picture[16, 24]
-    assert red > 100 > green
+    frame = env.render()
+    assert frame.shape == (32, 48, 3)
+    assert frame[16, 24, 0] > 100 > frame[16, 24, 1]
     env.close()
     env.close()
+    with pytest.raises(mjrec.UnknownName, match=r"'nose'.*fixed, follow"):
+        MjcfEnvironment(env.path, camera="nose")
 
-
-def test_where_nothing_follows_the_first_camera_shows(
-    write: Callable[..., Path],
-) -> None:
-    """The author's camera is better than MuJoCo's free one; a named one is best."""
     path = write(cameras=FIXED)
-    env = MjcfEnvironment(path, render_mode="rgb_array", height=32, width=32)
-    assert env.camera == "fixed"
+    env = MjcfEnvironment(path, **size)
     env.reset()
-    red, green, _ = env.render()[16, 16]
-    assert green > 100 > red
+    frame = env.render()
+    assert frame[16, 24, 1] > 100 > frame[16, 24, 0]
     env.close()
-    assert MjcfEnvironment(path, camera=-1).camera == -1
-    assert MjcfEnvironment(write()).camera == -1
+    cameras = [env, MjcfEnvironment(path, camera=-1), MjcfEnvironment(write())]
+    assert [each.camera for each in cameras] == ["fixed", -1, -1]
+    assert (cameras[1].height, cameras[1].width) == (480, 480)
 
 
-def test_the_default_size_is_480_by_480(write: Callable[..., Path]) -> None:
-    """As large as Gymnasium's own pictures."""
-    env = MjcfEnvironment(write(), render_mode="rgb_array")
-    env.reset()
-    assert env.render().shape == (480, 480, 3)
-    env.close()
-
-
-def test_without_pictures_nothing_is_rendered(write: Callable[..., Path]) -> None:
+def test_without_a_render_mode_nothing_is_rendered(write: Write) -> None:
     """Rendering is an error that says how to make the environment."""
     env = MjcfEnvironment(write())
     env.reset()
@@ -246,24 +193,16 @@ def test_without_pictures_nothing_is_rendered(write: Callable[..., Path]) -> Non
         env.render()
     with pytest.raises(mjrec.InvalidArgument, match="render_mode"):
         MjcfEnvironment(write(), render_mode="human")
-
-
-def test_an_unknown_camera_names_those_there_are(write: Callable[..., Path]) -> None:
-    """Known at once, and not at the first picture."""
-    with pytest.raises(mjrec.UnknownName, match=r"'nose'.*fixed, follow"):
-        MjcfEnvironment(write(cameras=FIXED, follower=FOLLOWER), camera="nose")
+    with pytest.raises(mjrec.InvalidArgument, match=r"no more arguments.*frame_skip"):
+        make_mjcf(write(), EnvironmentOptions(kwargs={"frame_skip": 2}))
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
         ("<mujoco><wrld/></mujoco>", "unrecognized element.*wrld"),
-        ("<mujoco><worldbody>", "XML"),
         ("", "XML"),
-        (
-            '<mujoco><asset><mesh name="m" file="nowhere.stl"/></asset></mujoco>',
-            "nowhere.stl",
-        ),
+        ('<mujoco><asset><mesh file="nowhere.stl"/></asset></mujoco>', "nowhere.stl"),
     ],
 )
 def test_a_bad_file_gives_mujocos_reason_and_its_own_name(
@@ -275,18 +214,3 @@ def test_a_bad_file_gives_mujocos_reason_and_its_own_name(
     with pytest.raises(mjrec.UnreadableFile, match=f"bad.xml: .*{reason}") as caught:
         load_mjcf(path)
     assert "\n" not in str(caught.value)
-
-
-def test_recordings_name_the_file(tmp_path: Path) -> None:
-    """The spec's id keeps recordings of two files apart, whatever they are called."""
-    path = tmp_path / "my robot (2).xml"
-    path.write_text("<mujoco/>")
-    env = make_mjcf(path, EnvironmentOptions(pictures=False))
-    assert env.spec is not None
-    assert env.spec.id == "mjcf/my_robot__2_"
-
-
-def test_a_file_takes_no_more_arguments(write: Callable[..., Path]) -> None:
-    """All there is to say stands in the file."""
-    with pytest.raises(mjrec.InvalidArgument, match=r"no more arguments.*frame_skip"):
-        make_mjcf(write(), EnvironmentOptions(kwargs={"frame_skip": 2}))

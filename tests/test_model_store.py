@@ -245,9 +245,8 @@ def test_sources_of_another_model_are_not_stored(directory: Path, other: str) ->
         ('file="m.obj"', 'file="gone.obj"'),
         ("<asset>", '<extension><plugin plugin="mujoco.pid"/></extension><asset>'),
         ("<mujoco>", "<mujoco"),
-        ("<mujoco>", '<!DOCTYPE m [<!ENTITY a "b">]><mujoco>'),
     ],
-    ids=["absolute", "missing", "plugin", "broken", "entities"],
+    ids=["absolute", "missing", "plugin", "broken"],
 )
 def test_what_cannot_be_stored_safely_is_left_out(
     mjcf: Path, old: str, new: str
@@ -272,11 +271,6 @@ def foreign(directory: Path, members: dict[str, str | bytes]) -> Any:
     return from_source(directory, facts)
 
 
-def test_a_plain_foreign_zip_is_compiled(directory: Path) -> None:
-    """What the refusals below are refusals of."""
-    assert foreign(directory, {"source/main.xml": SPHERE}).ngeom == 1
-
-
 SECRET = "<mujoco><include file='{}'/></mujoco>"
 
 
@@ -291,7 +285,6 @@ SECRET = "<mujoco><include file='{}'/></mujoco>"
             },
             "plain relative",
         ),
-        ({"source/main.xml": SPHERE, "source/../../x": ""}, "called"),
         (
             {"source/main.xml": "<mujoco><extension>< plugin/></extension></mujoco>"},
             "plugin",
@@ -299,11 +292,9 @@ SECRET = "<mujoco><include file='{}'/></mujoco>"
         ({"source/main.xml": SECRET.format("../" * 9 + "secret.xml")}, "outside"),
         ({"source/main.xml": SECRET.format("../secret.xml")}, "secret.xml"),
         ({"source/main.xml": SECRET.format("..\\\\secret.xml")}, "plain relative"),
-        ({"source/main.xml": SPHERE, "source//x": ""}, "plain relative"),
         ({"source/main.xml": "<robot name='r'/>"}, "not MJCF"),
         ({"source/main.xml": SPHERE.encode("utf-16")}, "utf-8"),
         ({"source/other.xml": SPHERE}, "main.xml"),
-        ({"contents.json": "[]", "source/main.xml": SPHERE}, "format"),
         ({"contents.json": '{"format": 2}'}, "format"),
     ],
     default=4,
@@ -312,6 +303,7 @@ def test_a_hostile_zip_reads_and_writes_nothing_elsewhere(
     directory: Path, members: dict[str, str | bytes], said: str
 ) -> None:
     """One clear error that names the file."""
+    assert foreign(directory, {"source/main.xml": SPHERE}).ngeom == 1
     with pytest.raises(UnreadableFile, match=said):
         foreign(directory, members)
 
@@ -373,16 +365,11 @@ def test_a_damaged_file_is_one_clear_error(
     "name", ["../openaigym.model.0123456789abcdef.zip", "/etc/passwd", 7, "model.zip"]
 )
 def test_facts_cannot_name_a_file_elsewhere(directory: Path, name: object) -> None:
-    """Only a model's name, in the recording's directory."""
-    facts = stored(directory, sphere())
-    for kind in ("mjb", "xml"):
-        with pytest.raises(UnreadableFile, match="which is no name"):
-            load_model(directory, {**facts, kind: name})
-
-
-def test_a_missing_model_says_where_it_belongs(directory: Path) -> None:
-    """The recording was copied without it."""
+    """Only a model's name, in the recording's directory, where it may be missing."""
     facts = stored(directory, sphere())
     (directory / facts["mjb"]).unlink()
     with pytest.raises(UnreadableFile, match="belongs beside the recording"):
         load_model(directory, facts)
+    for kind in ("mjb", "xml"):
+        with pytest.raises(UnreadableFile, match="which is no name"):
+            load_model(directory, {**facts, kind: name})

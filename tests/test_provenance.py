@@ -184,15 +184,3 @@ def test_the_first_on_the_path_counts(
         monkeypatch.syspath_prepend(tmp_path / version)
     assert importlib.metadata.version("gripper") == "2.0"
     assert installed_packages()["Gripper"]["version"] == "2.0"
-
-
-def test_names_in_other_scripts_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of directories on the path, in whatever locale the child runs."""
-    monkeypatch.setenv("LC_ALL", "C")
-    monkeypatch.setenv("PYTHONUTF8", "0")
-    place = tmp_path / "Größe 重み: 1"
-    install(place, "1.0")
-    monkeypatch.syspath_prepend(place)
-    assert installed_packages()["Gripper"]["version"] == "1.0"

@@ -264,16 +264,6 @@ def test_frames_in_any_order_have_the_same_infinite_planes() -> None:
 # --- what changes in the model -------------------------------------------------------
 
 
-def test_small_changes_show_at_once(renderer: SceneRenderer, table: Simulation) -> None:
-    """Environments recolour sites while they run."""
-    model, data = table
-    before = renderer.render(data)
-    model.site_rgba[0] = (1, 0, 1, 1)
-    after = renderer.render(data)
-    assert not np.array_equal(before, after)
-    assert np.array_equal(after, drawn_anew(model, data))
-
-
 def change_texture(model: mujoco.MjModel) -> None:
     model.mat_texid[0][model.mat_texid[0] >= 0] = model.texture("plain").id
 
@@ -290,16 +280,20 @@ def change_texture(model: mujoco.MjModel) -> None:
     ],
     ids=["hills", "paint", "roof", "plane", "texture", "sharpness"],
 )
-def test_changes_that_a_context_keeps_show_when_told(
+def test_what_changes_in_the_model_shows(
     renderer: SceneRenderer, table: Simulation, change: Any
 ) -> None:
-    """After `model_changed` the frame is the one of a new renderer."""
+    """At once, or, of what a context keeps, after `model_changed`."""
     model, data = table
     before = renderer.render(data)
+    model.site_rgba[0] = (1, 0, 1, 1)
+    recoloured = renderer.render(data)
+    assert not np.array_equal(before, recoloured)
+    assert np.array_equal(recoloured, drawn_anew(model, data))
     change(model)
     mujoco.mj_forward(model, data)
     expected = drawn_anew(model, data)
-    assert not np.array_equal(before, expected)
+    assert not np.array_equal(recoloured, expected)
     renderer.model_changed()
     assert np.array_equal(renderer.render(data), expected)
 
@@ -367,17 +361,13 @@ def test_renderers_take_turns_on_any_thread(
 # --- its life ------------------------------------------------------------------------
 
 
-def test_a_closed_renderer_says_so(table: Simulation) -> None:
-    """Closing twice is allowed, drawing afterwards is not."""
+def test_a_renderer_that_is_closed_or_forgotten(table: Simulation) -> None:
+    """Closing twice is allowed, drawing afterwards is not; nothing keeps it alive."""
     renderer = SceneRenderer(table[0], **SIZE)
     renderer.close()
     renderer.close()
     with pytest.raises(ClosedError):
         renderer.render(table[1])
-
-
-def test_a_forgotten_renderer_frees_its_context(table: Simulation) -> None:
-    """Garbage collection is enough."""
     renderer = SceneRenderer(table[0], **SIZE)
     context = weakref.ref(renderer._canvas._context)  # type: ignore[type-var]
     del renderer

@@ -17,9 +17,9 @@ from mjrec.errors import InvalidArgument, NoPictures, UnreadableFile
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.trajectory import packed, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
-from mjrec.rendering.drawing import Drawing, trajectory_drawing
 from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.views import View
+from mjrec.rendering.worker import Drawing, trajectory_drawing
 from mjrec.simulation.renderer import Canvas, SceneRenderer
 
 

@@ -91,11 +91,10 @@ def draw_otherwise(monkeypatch: pytest.MonkeyPatch, body: str) -> None:
     code = f"""
 import logging, os, pathlib, signal, sys, threading, time
 import mjrec.rendering.worker as worker
-from mjrec.rendering import drawing
-draw = drawing.Drawing.draw
+draw = worker.Drawing.draw
 def draw_otherwise(self, index, **rest):
 {textwrap.indent(textwrap.dedent(body), "    ")}
-drawing.Drawing.draw = draw_otherwise
+worker.Drawing.draw = draw_otherwise
 worker.main()
 """
     use_process(monkeypatch, code)

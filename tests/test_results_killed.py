@@ -269,14 +269,3 @@ def test_an_episode_in_doubt_shows_no_video(
     episodes = list(mjrec.iter_episodes(tmp_path))
     assert [each.episode_id for each in episodes] == numbers
     assert [each.video is not None for each in episodes] == shown
-
-
-def test_a_journal_alone_is_a_monitors(tmp_path: Path, corridor: Any) -> None:
-    """It is found, not overwritten without a word, and cleared."""
-    journal = write_journal(tmp_path, "0.7", 1)
-    assert mjrec.detect_monitor_files(tmp_path) == [str(journal)]
-    assert mjrec.detect_training_manifests(tmp_path) == []
-    with pytest.raises(mjrec.ExistingRecordings, match=journal.name):
-        mjrec.Monitor(corridor, tmp_path, video_callable=False)
-    with mjrec.Monitor(corridor, tmp_path, video_callable=False, force=True):
-        assert not journal.exists()

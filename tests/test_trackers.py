@@ -8,11 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from finished_files import episode
 
 import mjrec.trackers
 from mjrec.errors import InvalidArgument
-from mjrec.trackers.services import group_of, scalars_of
 
 # As if a package were not installed; everything else is there.
 LACK = """
@@ -71,11 +69,3 @@ def test_run_and_how_to_make_one_exclude_each_other() -> None:
     """Nobody can tell which is meant."""
     with pytest.raises(InvalidArgument, match="got a run and project, tags"):
         mjrec.trackers.WandbTracker(object(), project="p", tags=["a"])
-
-
-def test_scalars_are_plain_numbers() -> None:
-    """Success stands there only where something is known of it."""
-    assert scalars_of(episode(2)) == {"return": 3.0, "length": 10.0}
-    assert scalars_of(episode(2, success=False))["success"] == 0.0
-    assert group_of(episode(type="e")) == "evaluation"
-    assert group_of(None) == group_of(episode()) == "training"

@@ -14,19 +14,16 @@ from typing import Any
 
 import pytest
 from finished_files import Finished, episode, record
-from full_disk import file_size_limit
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import mjrec
 from mjrec.errors import (
     DirectoryNotWritable,
     EncoderError,
-    FileNotWritten,
     UnreadableFile,
 )
 from mjrec.trackers import TensorBoardTracker
-from mjrec.trackers.preview import animated_gif
+from mjrec.trackers.tensorboard import animated_gif
 
 
 @pytest.fixture
@@ -91,28 +88,13 @@ def test_video_is_played_as_a_gif_of_the_file(finished: Finished) -> None:
         inside, outside = (4 * step + 1, 16), (min(4 * step + 7, 47), 16)
         assert shown.getpixel(inside)[0] > 150
         assert shown.getpixel(outside)[0] < 60
+    # A long one lasts as long, with fewer frames.
+    long = animated_gif(finished.video.path, frame_count=11, fps=Fraction(1, 25))
+    with Image.open(io.BytesIO(long)) as opened:
+        assert opened.n_frames <= 100
     [text] = events.Tensors("training/video_file")
     assert finished.video.path.name.encode() in text.tensor_proto.string_val[0]
     assert text.step == 10
-
-
-def test_monitor_tells_it_everything(
-    tmp_path: Path, make_corridor: Any, play: Callable[..., None]
-) -> None:
-    """Episodes as they end, and each video."""
-    with mjrec.Monitor(
-        make_corridor(3),
-        tmp_path,
-        lambda number: number != 1,
-        trackers=TensorBoardTracker(),
-    ) as env:
-        play(env, 3)
-    [directory] = (tmp_path / "tensorboard").iterdir()
-    events = read(directory)
-    assert [e.step for e in events.Scalars("training/return")] == [3, 6, 9]
-    assert [e.step for e in events.Images("training/video")] == [3, 9]
-    [manifest] = tmp_path.glob("*.manifest.json")
-    assert directory.name in manifest.name
 
 
 def test_runs_are_told_apart(finished: Finished, tmp_path: Path) -> None:
@@ -162,27 +144,3 @@ def test_damaged_files_are_named(finished: Finished, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")
     with pytest.raises(DirectoryNotWritable, match="taken"):
         TensorBoardTracker(tmp_path / "taken").begin(run)
-
-
-def test_gif_of_a_long_video_is_bounded(finished: Finished) -> None:
-    """It lasts as long, with fewer pictures."""
-    gif = animated_gif(finished.video.path, frame_count=11, fps=Fraction(1, 25))
-    with Image.open(io.BytesIO(gif)) as image:
-        assert image.n_frames <= 100
-
-
-def test_full_disk_is_named_and_tears_nothing(finished: Finished) -> None:
-    """What came before is read, and so is what comes when there is room again."""
-    tracker, run = TensorBoardTracker(), finished.run
-    tracker.begin(run)
-    tracker.episode(run, episode(0))
-    [path] = (run.directory / "tensorboard" / "0.4711").iterdir()
-    with (
-        file_size_limit(path.stat().st_size + 20),
-        pytest.raises(FileNotWritten, match="tfevents"),
-    ):
-        tracker.episode(run, episode(1))
-    tracker.episode(run, episode(2))
-    tracker.end(run)
-    returns = read(path.parent).Scalars("training/return")
-    assert [event.step for event in returns] == [10, 30]

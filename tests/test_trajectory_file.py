@@ -33,7 +33,7 @@ from trajectories_by_hand import new_logs
 from trajectory_contents import TrajectoryContent, content_of
 
 import mjrec.formats.trajectory_file as trajectory_file
-from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
+from mjrec.errors import ClosedError, FileNotWritten, UnreadableFile
 from mjrec.formats import trajectory_hdf5
 from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import ModelChange, added_up, packed, row_dtype
@@ -130,24 +130,13 @@ def test_an_episode_that_was_killed_says_so(path: Path) -> None:
     assert read(finish_trajectory(path, facts=known)).facts == {**FACTS, **known}
 
 
-def test_ranges_of_snapshots_are_the_same_in_both_forms(path: Path) -> None:
-    """Nothing is read beyond their number."""
-    record(path, 200)
-    with open_trajectory(path) as reader:
-        rows = reader.snapshots(0, 201)
-    with open_trajectory(finish_trajectory(path)) as reader:
-        for start, stop in [(0, 0), (0, 8), (30, 34), (70, 102), (200, 201)]:
-            part = reader.snapshots(start, stop)
-            assert part.tobytes() == rows[start:stop].tobytes()
-        with pytest.raises(InvalidArgument, match="has 201 snapshots"):
-            reader.snapshots(200, 202)
-
-
 def test_plain_h5py_finds_every_array_by_its_name(path: Path) -> None:
     """With the format of HDF5 1.10, and no filter that is not built in."""
     record(path)
     content = read(path)
-    with h5py.File(finish_trajectory(path)) as file:
+    finish_trajectory(path)
+    # HDF5 refuses a file that is open in one process in two different ways.
+    with open_trajectory(path), h5py.File(path) as file, open_trajectory(path):
         assert set(file) == {
             *("states", "actions", "rewards", "terminated", "truncated"),
             *("observations", "frame_steps", "snapshots", "model_changes"),
@@ -174,16 +163,6 @@ def test_the_same_log_makes_the_same_file(path: Path, tmp_path: Path) -> None:
     record(path)
     other = shutil.copytree(tmp_path, tmp_path / "copy") / path.name
     assert finish_trajectory(path).read_bytes() == finish_trajectory(other).read_bytes()
-
-
-def test_the_user_may_have_the_file_open_as_well(path: Path) -> None:
-    """HDF5 refuses a file that is open in one process in two different ways."""
-    record(path)
-    finish_trajectory(path)
-    with h5py.File(path), open_trajectory(path) as reader:
-        assert reader.frame_count == 41
-    with open_trajectory(path), h5py.File(path) as file:
-        assert len(file["frame_steps"]) == 41
 
 
 def test_the_example_of_the_specification_runs(
@@ -309,9 +288,9 @@ def test_a_killed_finish_is_done_again(path: Path, where: str) -> None:
     assert process.returncode == -signal.SIGKILL
     assert len(list(list_paths(path.parent))) == 1
     assert path.exists() == (where == "before the removal")
-    found = finish_trajectory(path).stat()
+    found = finish_trajectory(path).stat().st_mtime_ns
     check(read(path), 40)
-    assert finish_trajectory(path).stat() == found
+    assert finish_trajectory(path).stat().st_mtime_ns == found
     assert list(list_paths(path.parent)) == []
 
 

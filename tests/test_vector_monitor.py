@@ -3,11 +3,8 @@ from __future__ import annotations
 
 import functools
 import gc
-import hashlib
 import json
 import pickle
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +21,6 @@ from vector_environments import (
     NEXT_STEP,
     SAME_STEP,
     VectorCorridor,
-    hashes_at,
     metadata_at,
     path_of,
     play,
@@ -40,7 +36,6 @@ from mjrec import (
     ResetNeeded,
     ResetNotAllowed,
 )
-from mjrec.recorder.tracking import Tracker
 
 LENGTHS = (2, 3)
 
@@ -56,22 +51,6 @@ def corridors(make_corridor: Any) -> Any:
         return SyncVectorEnv(each, autoreset_mode=mode)
 
     return make
-
-
-def hoppers(mode: Any, *, max_episode_steps: int = 3, count: int = 2) -> Any:
-    return gymnasium.make_vec(
-        "Hopper-v5",
-        num_envs=count,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": mode},
-        render_mode="rgb_array",
-        width=64,
-        height=64,
-        max_episode_steps=max_episode_steps,
-    )
-
-
-# --- whole episodes, each of its own ---------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -130,25 +109,6 @@ def test_statistics_are_those_of_gymnasium(tmp_path: Path, mode: Any) -> None:
     assert len(ours) == expected[mode]
 
 
-def test_terminal_frames_are_those_of_render(tmp_path: Path) -> None:
-    """In SAME_STEP the deferred frames are byte for byte those of one environment."""
-    with mjrec.Monitor(hoppers(SAME_STEP), tmp_path) as env:
-        play(env, 3, seed=7)
-    alone = gymnasium.make("Hopper-v5", render_mode="rgb_array", width=64, height=64)
-    actions = gymnasium.vector.utils.batch_space(alone.action_space, 2)
-    actions.seed(7)
-    drawn = [actions.sample() for _ in range(3)]
-    for index, monitor in enumerate(env.monitors):
-        alone.reset(seed=7 + index)
-        frames = [alone.render()]
-        for action in drawn:
-            alone.step(action[index])
-            frames.append(alone.render())
-        expected = [hashlib.sha256(frame.tobytes()).hexdigest() for frame in frames]
-        assert hashes_at(path_of(monitor, 0, "framehash")) == expected
-    alone.close()
-
-
 def test_sub_environments_share_one_budget_of_tails(tmp_path: Path) -> None:
     """Each of 64 is recorded, and their logs' tails have 4 MiB together."""
     make = functools.partial(gymnasium.make, "InvertedPendulum-v5", max_episode_steps=2)
@@ -164,62 +124,6 @@ def test_sub_environments_share_one_budget_of_tails(tmp_path: Path) -> None:
     for monitor in env.monitors:
         name = f"openaigym.trajectory.{monitor.infix}.episode000000.h5"
         assert len(mjrec.load_trajectory(tmp_path / name).actions) == 2
-
-
-def test_numbers_and_schedules_are_each_ones_own(
-    corridors: Any, tmp_path: Path
-) -> None:
-    """Of 5 and 3 episodes the chosen ones have videos, in manifests of their own."""
-    wanted: list[int] = []
-    with mjrec.Monitor(
-        corridors(SAME_STEP), tmp_path, lambda n: wanted.append(n) or n == 1
-    ) as env:
-        play(env, 10)
-        assert [m.episode_id for m in env.monitors] == [6, 4]
-    assert sorted(wanted) == [0, 0, 1, 1, 2, 2, 3, 3, 4, 5]
-    for monitor in env.monitors:
-        path = tmp_path / f"openaigym.manifest.{monitor.infix}.manifest.json"
-        [[video, _]] = metadata_at(path)["videos"]
-        assert video == path_of(monitor, 1, "mp4").name
-
-
-# --- one rendering for all ---------------------------------------------------------
-
-
-@pytest.mark.thorough
-def test_one_process_renders_for_all(tmp_path: Path) -> None:
-    """Several sub-environments with ended episodes start one server."""
-    before = children()
-    with mjrec.Monitor(hoppers(SAME_STEP, count=3), tmp_path) as env:
-        play(env, 3, seed=1)
-        assert len(children() - before) == 1
-    assert children() == before
-    assert all(path_of(monitor, 0, "mp4").exists() for monitor in env.monitors)
-
-
-@pytest.mark.thorough
-def test_one_that_closes_leaves_the_others_their_rendering(tmp_path: Path) -> None:
-    """The service stops with the last."""
-    with mjrec.Monitor(hoppers(SAME_STEP), tmp_path, lambda n: n < 2) as env:
-        play(env, 3, seed=1)
-        env.monitors[0].close(wait=False)
-        env.step(env.action_space.sample())
-    assert path_of(env.monitors[1], 1, "mp4").exists()
-
-
-def test_whoever_does_not_wait_leaves_videos_pending(tmp_path: Path) -> None:
-    """The manifest of each says which."""
-    env = mjrec.Monitor(hoppers(SAME_STEP), tmp_path, workers=0)
-    play(env, 3, seed=1)
-    env.close(wait=False)
-    for monitor in env.monitors:
-        path = tmp_path / f"openaigym.manifest.{monitor.infix}.manifest.json"
-        pending = metadata_at(path)["mjrec"]["pending"]
-        assert [each["episode_id"] for each in pending] == [0, 1]
-    assert not list(tmp_path.glob("*.mp4"))
-
-
-# --- opening and closing -------------------------------------------------------------
 
 
 def test_closing_puts_the_environments_back(corridors: Any, tmp_path: Path) -> None:
@@ -251,18 +155,6 @@ def test_closing_puts_the_environments_back(corridors: Any, tmp_path: Path) -> N
         assert ('"seed": 40' in journal.read_text()) is (index == 0)
 
 
-def test_closing_the_inner_environment_finishes_the_recordings(
-    corridors: Any, tmp_path: Path
-) -> None:
-    """Whoever closes what is inside the monitor loses nothing."""
-    vector = corridors()
-    env = mjrec.Monitor(vector, tmp_path)
-    play(env, 4)
-    vector.close()
-    assert path_of(env.monitors[1], 0, "mp4").exists()
-    env.close()
-
-
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_failing_constructor_leaves_no_trace(
     make_corridor: Any, tmp_path: Path, names: Any, resume: bool
@@ -285,18 +177,6 @@ def test_a_failing_constructor_leaves_no_trace(
         assert not list(tmp_path.iterdir())
 
 
-def test_recordings_are_resumed_together(corridors: Any, tmp_path: Path) -> None:
-    """All go on after the highest number that is there."""
-    with mjrec.Monitor(corridors(SAME_STEP), tmp_path, False) as env:
-        play(env, 4)
-    with mjrec.Monitor(corridors(SAME_STEP), tmp_path, False, resume=True) as env:
-        env.reset()
-        assert [m.episode_id for m in env.monitors] == [4, 4]
-    with pytest.raises(mjrec.ExistingRecordings):
-        mjrec.Monitor(corridors(), tmp_path)
-    assert mjrec.load_results(tmp_path)["episode_lengths"]
-
-
 def test_forgotten_monitors_are_closed(corridors: Any, tmp_path: Path) -> None:
     """What nobody refers to any more is finished, and the environment closed."""
     vector = corridors()
@@ -308,31 +188,6 @@ def test_forgotten_monitors_are_closed(corridors: Any, tmp_path: Path) -> None:
     assert vector.envs == originals
     assert [each.closed for each in originals] == [1, 1]
     assert len(list(tmp_path.glob("*.manifest.json"))) == 2
-
-
-def test_a_program_that_ends_without_closing_loses_nothing(tmp_path: Path) -> None:
-    """Manifests are there, and what is not rendered is pending."""
-    program = f"""if True:
-        import gymnasium, mjrec
-        vector = gymnasium.make_vec(
-            "Hopper-v5", 2, "sync", max_episode_steps=3, width=64, height=64
-        )
-        env = mjrec.Monitor(vector, {str(tmp_path)!r})
-        env.reset(seed=1)
-        for _ in range(3):
-            env.step(env.action_space.sample())
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    manifests = [metadata_at(p) for p in tmp_path.glob("*.manifest.json")]
-    assert len(manifests) == 2
-    assert all(len(m["mjrec"]["pending"]) + len(m["videos"]) == 1 for m in manifests)
-
-
-# --- errors and wrong use ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("inside", [True, False])
@@ -360,37 +215,11 @@ def test_errors_are_noted_in_all_running_episodes(
         assert said["exception"]["message"] == "the motor burns"
 
 
-def test_an_early_reset_drops_the_episodes(corridors: Any, tmp_path: Path) -> None:
-    """They are no part of the statistics, and their videos are incomplete."""
-    with mjrec.Monitor(corridors(), tmp_path) as env:
-        env.reset()
-        env.step(np.array([0, 0]))
-        play(env, 3)
-    assert env.get_episode_lengths() == [[2], [3]]
-    assert metadata_at(path_of(env.monitors[0], 0, "meta.json"))["complete"] is False
-
-
-def test_an_early_reset_can_be_forbidden(corridors: Any, tmp_path: Path) -> None:
-    """It is refused before anything is reset; those that are over may be reset."""
-    with mjrec.Monitor(
-        corridors(DISABLED), tmp_path, False, allow_early_reset=False
-    ) as env:
-        env.reset()
-        for _ in range(2):
-            env.step(np.array([0, 0]))
-        with pytest.raises(ResetNotAllowed, match=r"\[1\]"):
-            env.reset()
-        assert [m.episode_id for m in env.monitors] == [1, 1]
-        env.reset(options={"reset_mask": np.array([True, False])})
-        assert [m.episode_id for m in env.monitors] == [2, 1]
-
-
-@pytest.mark.parametrize("mode", [None, "NextStep"])
-def test_an_unknown_autoreset_mode_is_refused(tmp_path: Path, mode: Any) -> None:
+def test_an_unknown_autoreset_mode_is_refused(tmp_path: Path) -> None:
     """The error says what to set; nothing is made."""
     target = tmp_path / "run"
     with pytest.raises(InvalidArgument, match="autoreset_mode"):
-        mjrec.Monitor(VectorCorridor(mode=mode), target)
+        mjrec.Monitor(VectorCorridor(mode=None), target)
     assert not target.exists()
 
 
@@ -406,22 +235,6 @@ def test_sub_environments_of_different_names_need_a_common_one(
         play(env, 2)
 
 
-def test_a_list_that_is_not_stepped_is_noticed(
-    make_corridor: Any, tmp_path: Path
-) -> None:
-    """Nothing would be recorded, and the first reset says so."""
-    vector = VectorCorridor()
-    vector.envs = [make_corridor(), make_corridor()]  # type: ignore[attr-defined]
-    with (
-        mjrec.Monitor(vector, tmp_path) as env,
-        pytest.raises(Error, match="envs"),
-    ):
-        env.reset()
-
-
-# --- seen from outside ---
-
-
 def test_it_draws_once_a_step_and_only_for_videos(tmp_path: Path) -> None:
     """One call of `render` is for all; without a running video there is none."""
     vector = VectorCorridor((3, 3), NEXT_STEP)
@@ -430,7 +243,10 @@ def test_it_draws_once_a_step_and_only_for_videos(tmp_path: Path) -> None:
         assert vector.rendered == 4
         for _ in range(8):
             env.step(np.array([0, 0]))
+        # Arguments of the environment's own `close` are passed on.
+        env.close(reason="done")
     assert vector.rendered == 4
+    assert vector.closings == [{"reason": "done"}]
 
 
 def test_trajectories_hold_what_can_be_seen(tmp_path: Path) -> None:
@@ -453,20 +269,6 @@ def test_trajectories_hold_what_can_be_seen(tmp_path: Path) -> None:
     assert second.rewards.tolist() == [0.5] * 3
     assert second.observations[:, 0].tolist() == [0, 1, 2, 3]
     assert second.terminated.tolist() == [False, False, True]
-
-
-def test_success_is_read_from_the_final_info(tmp_path: Path) -> None:
-    """Trackers are told what the environment says of an episode that is over."""
-    told = []
-
-    class Listening(Tracker):
-        def episode(self, run: Any, episode: Any) -> None:
-            told.append((run.env_index, episode.success))
-
-    vector = VectorCorridor(LENGTHS, SAME_STEP)
-    with mjrec.Monitor(vector, tmp_path, False, trackers=Listening()) as env:
-        play(env, 3)
-    assert told == [(0, True), (1, True)]
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -503,26 +305,22 @@ def test_a_list_of_seeds_is_told_one_by_one(tmp_path: Path) -> None:
 
 
 def test_a_masked_reset_leaves_the_others_alone(tmp_path: Path) -> None:
-    """Their episodes go on."""
-    with mjrec.Monitor(VectorCorridor(LENGTHS, DISABLED), tmp_path) as env:
+    """Their episodes go on. Others are refused before anything is reset, if asked."""
+    with mjrec.Monitor(
+        VectorCorridor(LENGTHS, DISABLED), tmp_path, allow_early_reset=False
+    ) as env:
         env.reset()
         for _ in range(2):
             env.step(np.array([0, 0]))
         with pytest.raises(ResetNeeded):
             env.step(np.array([0, 0]))
+        with pytest.raises(ResetNotAllowed, match=r"\[1\]"):
+            env.reset()
         env.reset(options={"reset_mask": np.array([True, False])})
+        assert [m.episode_id for m in env.monitors] == [2, 1]
         env.step(np.array([0, 0]))
     assert env.get_episode_lengths() == [[2], [3]]
     assert shown(path_of(env.monitors[1], 0, "mp4"), step=16) == [0, 1, 2, 3]
-
-
-def test_the_environment_is_closed_as_asked(tmp_path: Path) -> None:
-    """Arguments of its own `close` are passed on."""
-    vector = VectorCorridor()
-    env = mjrec.Monitor(vector, tmp_path, False)
-    env.close(reason="done")
-    env.close()
-    assert vector.closings == [{"reason": "done"}]
 
 
 def test_pictures_must_be_one_for_each(tmp_path: Path) -> None:

@@ -4,9 +4,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import hashlib
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +24,7 @@ from vector_environments import (
 )
 
 import mjrec
-from mjrec import InvalidArgument, NoPictures
+from mjrec import InvalidArgument
 from mjrec.frames import grid_frame
 
 LENGTHS = (2, 3, 2)
@@ -101,20 +98,6 @@ def test_the_frame_that_a_reset_hides_is_said_to_be_missing(
         assert (said["complete"], said["length"]) == (True, 2)
 
 
-def test_a_second_reset_replaces_the_picture(tmp_path: Path) -> None:
-    """It leaves no video of its own; one of others adds no frame."""
-    vector = VectorCorridor((3, 2), DISABLED)
-    with mjrec.Monitor(vector, tmp_path, lambda n: n == 0, tiled=True) as env:
-        env.reset()
-        play(env, 2)
-        env.reset(options={"reset_mask": np.array([False, True])})
-        play(env, 6)
-    [path] = tmp_path.glob("*.tiled.mp4")
-    assert path == path_of(env.monitors[0], 0, "tiled.mp4")
-    assert len(frames_of(path)) == 3
-    assert not list(tmp_path.glob(".*"))
-
-
 @pytest.mark.parametrize("how", ["reset", "close", "error"])
 def test_a_video_that_is_cut_off_says_so(
     corridors: Any, tmp_path: Path, how: str
@@ -135,17 +118,6 @@ def test_a_video_that_is_cut_off_says_so(
     assert said["complete"] is False
     assert said["reason"] == {"error": "exception"}.get(how, how)
     assert (said["length"], said["frame_count"]) == (1, 2)
-
-
-def test_the_last_picture_is_taken_at_a_lower_rate(
-    corridors: Any, tmp_path: Path
-) -> None:
-    """With `max_fps` the terminal picture is there too."""
-    vector = VectorCorridor((5, 5), NEXT_STEP)
-    with mjrec.Monitor(vector, tmp_path, tiled=True, max_fps=5) as env:
-        play(env, 5)
-    said = metadata_at(path_of(env.monitors[0], 0, "tiled.meta.json"))
-    assert said["frame_count"] == 4
 
 
 def drawn_by(env: Any) -> Any:
@@ -173,20 +145,6 @@ def test_pixels_are_those_of_each_environment(tmp_path: Path) -> None:
     assert hashes_at(path)[1:] == expected
 
 
-# --- what cannot be ---------------------------------------------------------------
-
-
-def test_it_needs_pictures_of_all(tmp_path: Path) -> None:
-    """Deferred rendering needs none, and a tiled video does."""
-    vector = gymnasium.make_vec("Hopper-v5", 2, "sync")
-    originals = list(vector.envs)
-    with pytest.raises(NoPictures, match='render_mode="rgb_array"'):
-        mjrec.Monitor(vector, tmp_path / "run", tiled=True)
-    assert vector.envs == originals
-    assert not list(tmp_path.iterdir())
-    vector.close()
-
-
 def test_a_bad_picture_can_be_tolerated(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -202,40 +160,3 @@ def test_a_bad_picture_can_be_tolerated(
     assert "64x32, 64x48" in caplog.text
     assert not list(tmp_path.glob("*.tiled.mp4"))
     assert path_of(env.monitors[1], 0, "mp4").exists()
-
-
-@pytest.mark.parametrize(
-    "choice", [{"keep": "best:1"}, {"step_trigger": lambda n: n == 0}]
-)
-def test_it_follows_whole_episodes(tmp_path: Path, choice: dict[str, Any]) -> None:
-    """What is chosen afterwards, or by steps, it cannot follow."""
-    with pytest.raises(InvalidArgument, match="video_callable"):
-        mjrec.Monitor(VectorCorridor(), tmp_path / "run", tiled=True, **choice)
-    assert not list(tmp_path.iterdir())
-
-
-KILLED = """
-import os, signal, sys
-
-import mjrec
-from vector_environments import VectorCorridor
-
-env = mjrec.Monitor(VectorCorridor((2, 3)), sys.argv[1], lambda _: True, tiled=True)
-env.reset()
-for _ in range(4):
-    env.step(env.action_space.sample())
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_recovering_lists_what_a_killed_process_had_finished(tmp_path: Path) -> None:
-    """The tiled video of each episode, with the others of the first."""
-    subprocess.run(
-        [sys.executable, "-c", KILLED, str(tmp_path)],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
-        check=False,
-    )
-    mjrec.recover(tmp_path)
-    listed = {Path(video).name for video, _ in mjrec.load_results(tmp_path)["videos"]}
-    assert listed == {path.name for path in tmp_path.glob("*.mp4")}
-    assert sum(name.endswith("video000000.tiled.mp4") for name in listed) == 1

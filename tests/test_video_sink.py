@@ -15,6 +15,7 @@ from recordings import frames_of
 from mjrec import FileNotWritten
 from mjrec.annotation import Caption
 from mjrec.formats.unfinished_video import note_path, read_note
+from mjrec.formats.video_metadata import StepRuns, timing_facts
 from mjrec.formats.video_sink import VideoSink
 from mjrec.frames import Frame
 
@@ -116,3 +117,24 @@ def test_text_has_the_same_end(tmp_path: Path) -> None:
     assert names(tmp_path) == ["v.json", "v.meta.json"]
     sink.discard()
     assert names(tmp_path) == []
+
+
+def test_steps_are_runs_and_timing_is_in_exact_fractions() -> None:
+    """The last frame is always taken; a step may have several; thirds stay thirds."""
+    assert StepRuns([0, 4, 8, 10], stride=4).ranges == [[0, 8], [10, 10]]
+    assert StepRuns([0, 1, 1, 2]).ranges == [[0, 1], [1, 2]]
+    facts = timing_facts(
+        StepRuns([0, 2, 4], stride=2),
+        fps=Fraction(100, 3),
+        timestep=Fraction(3, 400),
+        stride=2,
+    )
+    assert facts == {
+        "fps": "100/3",
+        "timestep": "3/400",
+        # Simulated seconds in a second of video.
+        "playback_speed": 0.5,
+        "stride": 2,
+        "frame_count": 3,
+        "frame_steps": [[0, 4]],
+    }

@@ -11,7 +11,6 @@ import select
 import signal
 import subprocess
 import sys
-import threading
 import tracemalloc
 from collections.abc import Iterator
 from fractions import Fraction
@@ -36,7 +35,6 @@ from mjrec.errors import (
     UnknownName,
 )
 from mjrec.formats.ffmpeg import (
-    FfmpegProcess,
     every_frame_arguments,
     ffmpeg_executable,
     run_ffmpeg,
@@ -437,27 +435,6 @@ def test_an_interrupted_close_can_be_called_again(
     assert sorted(one.name for one in out.iterdir()) == ["a.framehash", "a.mp4"]
 
 
-@pytest.mark.usefixtures("no_process_stays")
-def test_close_on_the_encoders_thread_leaves_the_rest_to_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As when a garbage collection there ends the writer's owner."""
-    write, closes = FfmpegProcess.write, threading.Event()
-
-    def write_and_close(process: FfmpegProcess, data: Any) -> None:
-        write(process, data)
-        video.close()
-        closes.set()
-
-    video = VideoWriter(tmp_path / "a.mp4", fps=40)
-    monkeypatch.setattr(FfmpegProcess, "write", write_and_close)
-    video.write(numbered(1))
-    assert closes.wait(30)
-    assert not video.closed
-    video.close()
-    assert [number_of(frame) for frame in read(video.path)] == [1]
-
-
 def test_memory_does_not_grow_with_the_video(tmp_path: Path) -> None:
     """Two thousand frames of 48 KiB, made faster than encoded, need a few MiB."""
     frame = scene(0, height=128, width=128)
@@ -487,24 +464,6 @@ def wait_for_end(pid: int) -> None:
         assert select.select([handle], [], [], 60)[0], "the encoder runs on"
     finally:
         os.close(handle)
-
-
-def test_a_killed_parent_leaves_a_playable_temporary_file(tmp_path: Path) -> None:
-    """After SIGKILL the encoder finishes what it was given, by itself."""
-    code = (
-        "before = children()\n"
-        "video = VideoWriter('a.mp4', fps=40)\n"
-        "for number in range(100):\n"
-        "    video.write(scene(number, height=240, width=320))\n"
-        "print(*(children() - before), flush=True)\n"
-        "os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    child = run_child(code, cwd=tmp_path)
-    assert child.returncode == -signal.SIGKILL, child.stderr
-    wait_for_end(int(child.stdout))
-    (left,) = tmp_path.iterdir()
-    assert left.name.startswith(".a.mp4.")
-    assert 30 < len(read(left)) <= 100
 
 
 @pytest.mark.usefixtures("default_signals")

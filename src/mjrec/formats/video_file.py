@@ -154,16 +154,13 @@ class Encoding:
             )
             on_failure.pop_all()
 
-    def finish(self) -> VideoFile | None:
+    def finish(self) -> VideoFile:
         """Complete the file, check it and give it its name.
 
-        Each part can be done again, where Ctrl-C came in between. None on the encoder's
-        own thread, which cannot wait for itself.
+        Each part can be done again, where Ctrl-C came in between.
         """
         self.is_ending = True
         self.thread.close()
-        if not self._input_ended:
-            return None
         self._process.wait()
         if not self._file.file_sha256:
             self._file = self._checked()

@@ -190,8 +190,7 @@ class VideoWriter:
         """Finish the file: encode what waits, count the frames again, give the name.
 
         Idempotent. After Ctrl-C has interrupted it no more frames are taken, and
-        another call goes on. On the thread that encodes, where a garbage collection may
-        call it, it leaves the rest to another call.
+        another call goes on.
 
         Raises:
             EncoderError: ffmpeg failed or died. Nothing is left of the video.
@@ -205,8 +204,6 @@ class VideoWriter:
             except Exception:
                 self.abort()
                 raise
-            if self.result is None:
-                return
         self.closed = True
 
     def abort(self) -> None:

@@ -17,7 +17,6 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import GLError, InvalidArgument
@@ -34,26 +33,9 @@ _UUIDS = ("GPU-", "MIG-")
 _DOCTOR = "`mjrec doctor` shows EGL's devices; `nvidia-smi -L` shows the GPUs."
 
 
-@dataclass(frozen=True, kw_only=True)
-class GivenGpu:
-    """What came of rendering on a given GPU.
-
-    Attributes:
-        gpu: the one that was given, as an entry of `CUDA_VISIBLE_DEVICES`; empty where
-            that variable names none.
-        device: EGL's device that draws; None where it is not the given GPU, or nobody
-            can tell.
-        gl_renderer: what draws, in OpenGL's words; empty where nothing does.
-        warning: why it does not draw on that GPU, and what to do; empty if it does.
-    """
-
-    gpu: str
-    device: EglDevice | None = None
-    gl_renderer: str = ""
-    warning: str = ""
-
-
-def render_on_given_gpu(gpu: str | None = None, *, required: bool = False) -> GivenGpu:
+def render_on_given_gpu(
+    gpu: str | None = None, *, required: bool = False
+) -> EglDevice | None:
     """Let this process, and its children, render on the GPU that it was given.
 
     Afterwards `MUJOCO_EGL_DEVICE_ID` names EGL's device of that GPU, and `MUJOCO_GL`
@@ -68,6 +50,9 @@ def render_on_given_gpu(gpu: str | None = None, *, required: bool = False) -> Gi
             entry of that variable, where it is set, else CUDA's first GPU.
         required: whether it is an error if that GPU cannot be drawn on.
 
+    Returns:
+        EGL's device that draws; None where it is not the given GPU, or EGL cannot tell.
+
     Raises:
         InvalidArgument: `gpu` is no entry, or several.
         UnknownName: `MUJOCO_GL` names no backend that there is.
@@ -77,22 +62,18 @@ def render_on_given_gpu(gpu: str | None = None, *, required: bool = False) -> Gi
     """
     entry = _entry(gpu)
     _refuse_latecomers()
-    found, number = _found(entry, os.environ)
-    if found.warning and required:
-        raise GLError(found.warning)
-    if found.warning:
-        _LOG.warning("%s", found.warning)
-    if found.device is not None:
-        os.environ[_CHOSEN] = str(number)
-        if not rendering_is_off(os.environ):
-            set_backend("egl")
-        _LOG.info(
-            "Rendering on GPU %s: EGL device %d%s, %s.",
-            *(entry, found.device.index),
-            f" ({found.device.uuid})" if found.device.uuid else "",
-            found.gl_renderer,
-        )
-    return found
+    try:
+        device, number = _found(entry, os.environ)
+    except GLError as error:
+        if required:
+            raise
+        _LOG.warning("%s", error)
+        return None
+    os.environ[_CHOSEN] = str(number)
+    if not rendering_is_off(os.environ):
+        set_backend("egl")
+    _LOG.info("Rendering on GPU %s: EGL's %s.", entry, _shown(device))
+    return device
 
 
 def visible_gpus(
@@ -190,39 +171,37 @@ def _refuse_latecomers() -> None:
         )
 
 
-def _found(gpu: str, environ: Mapping[str, str]) -> tuple[GivenGpu, int | None]:
-    """Return what came of it, and the number for `MUJOCO_EGL_DEVICE_ID`."""
+def _found(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice, int]:
+    """Return EGL's device of a GPU, and what `MUJOCO_EGL_DEVICE_ID` has to be for it.
+
+    Raises:
+        GLError: it cannot be drawn on.
+    """
     if not gpu:
-        warning = (
+        raise GLError(
             "This process was given no GPU for rendering: CUDA_VISIBLE_DEVICES names "
             "none. Ask whoever starts it for one."
         )
-        return GivenGpu(gpu=gpu, warning=warning), None
     asked = f"GPU {gpu} was given for rendering"
     backend = None if rendering_is_off(environ) else backend_in_environment(environ)
     if backend not in (None, "egl"):
-        warning = (
+        raise GLError(
             f"{asked}, and MUJOCO_GL={backend} cannot be told on which GPU to render: "
             "unset MUJOCO_GL, or set it to egl."
         )
-        return GivenGpu(gpu=gpu, warning=warning), None
     device, alone = _device(gpu, environ)
     if device is None:
-        warning = f"{asked}, and {_lack_of_device(alone)}"
-        return GivenGpu(gpu=gpu, gl_renderer=alone.gl_renderer, warning=warning), None
+        raise GLError(f"{asked}, and {_lack_of_device(alone)}")
     tried = alone
     for number, tried in _tries(device, gpu, alone, environ):
-        used = [each for each in tried.devices if each.in_use]
-        if not tried.renders or tried.software or not used:
-            continue
-        if used[0].index == device.index:
-            found = GivenGpu(gpu=gpu, device=used[0], gl_renderer=tried.gl_renderer)
-            return found, number
+        for used in tried.devices:
+            is_it = used.in_use and used.index == device.index
+            if is_it and tried.renders and not tried.software:
+                return used, number
     why = f"it does not render. {tried.cause} {tried.fix}".strip()
     if tried.renders:
         why = "mujoco draws on another device whatever MUJOCO_EGL_DEVICE_ID is."
-    warning = f"{asked}, which is EGL's {_shown(device)}, and {why} {_DOCTOR}"
-    return GivenGpu(gpu=gpu, warning=warning), None
+    raise GLError(f"{asked}, which is EGL's {_shown(device)}, and {why} {_DOCTOR}")
 
 
 def _device(gpu: str, environ: Mapping[str, str]) -> tuple[EglDevice | None, Probe]:

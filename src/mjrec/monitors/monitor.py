@@ -193,38 +193,16 @@ def Monitor(  # noqa: N802  named as the class that it was in gym
 
     When it raises, `env` is as it was, and no file is left.
     """
+    # First of all: the arguments by their names, before there are others.
+    options = dict(locals())
+    for name in ("env", "directory", "camera", "height", "width", "env_id"):
+        del options[name]
     if allow_early_reset is None:
-        allow_early_reset = _monitor_class(env).allows_early_reset
+        options["allow_early_reset"] = _monitor_class(env).allows_early_reset
     return monitored(
         env,
         directory,
-        RecorderOptions(
-            video_callable=video_callable,
-            force=force,
-            resume=resume,
-            write_upon_reset=write_upon_reset,
-            uid=uid,
-            mode=mode,
-            fps=fps,
-            max_fps=max_fps,
-            quality=quality,
-            render=render,
-            workers=workers,
-            trajectory_callable=trajectory_callable,
-            observations=observations,
-            on_error=on_error,
-            strict=strict,
-            keep=keep,
-            step_trigger=step_trigger,
-            video_length=video_length,
-            name_prefix=name_prefix,
-            episode_info=episode_info,
-            annotate=annotate,
-            tiled=tiled,
-            trackers=trackers,
-            policy_file=policy_file,
-            allow_early_reset=allow_early_reset,
-        ),
+        RecorderOptions(**options),
         camera=camera,
         height=height,
         width=width,

@@ -90,9 +90,8 @@ class TiledVideo:
         self._options = options
         self._env = env
         self._video: VideoRecorder | None = None
-        # The episode that the frames are of, and how far it has come.
+        # The episode that the frames are of.
         self._episode_id = -1
-        self._progress: dict[str, Any] = {}
         self._ending: dict[str, Any] | None = None
 
     @property
@@ -103,7 +102,7 @@ class TiledVideo:
     def take_last(self) -> None:
         """Take the frame of the last step, if it was left out."""
         if self._video is not None and self._ending is None:
-            self._videos(self._video).take_last()
+            self._live(self._video).take_last()
 
     def after_reset(self) -> None:
         """Follow the first sub-environment, which has just been reset."""
@@ -126,18 +125,17 @@ class TiledVideo:
         is_over = terminated or truncated
         self._ending = None
         if self._video is not None:
-            stats = self._first.stats_recorder
-            self._progress = {"length": stats.steps, "reward": stats.rewards}
+            stats, said = self._first.stats_recorder, self._video.metadata
+            said.update(length=stats.steps, reward=stats.rewards)
             if is_over:
-                self._progress["length"] = stats.episode_lengths[-1]
-                self._progress["reward"] = stats.episode_rewards[-1]
+                said["length"] = stats.episode_lengths[-1]
+                said["reward"] = stats.episode_rewards[-1]
             if episode_id != self._episode_id:
                 # SAME_STEP: the first tile shows the next episode already.
-                self._video.metadata["final_frame"] = "missing"
-            self._videos(self._video).take(is_there=True, last=is_over)
+                said["final_frame"] = "missing"
+            self._live(self._video).take(is_there=True, last=is_over)
         if is_over:
-            flags = {"terminated": terminated, "truncated": truncated}
-            self._end({"complete": True, **flags})
+            self._end(complete=True, terminated=terminated, truncated=truncated)
         if episode_id != self._episode_id:
             self._begin(episode_id)
 
@@ -152,34 +150,33 @@ class TiledVideo:
 
     def _begin(self, episode_id: int) -> None:
         self._episode_id = episode_id
-        self._progress = {"length": 0, "reward": 0.0}
         self._ending = None
-        video = self._first.video_recorder
-        if video is None or not video.enabled:
-            return
+        of_first = self._first.video_recorder
         infix = Infix.parse(self._first.infix)
-        assert infix is not None
-        options = self._options
+        if of_first is None or not of_first.enabled or infix is None:
+            return
+        name = f"{video_prefix(infix, episode_id)}.tiled"
         self._video = VideoRecorder(
             self._tiles,
-            base_path=self._first.directory
-            / f"{video_prefix(infix, episode_id)}.tiled",
+            base_path=self._first.directory / name,
             metadata={
                 **self._first._recorder.run.live_facts(),
                 "tiled": True,
                 "sub_environments": len(self._tiles.sources),
+                "length": 0,
+                "reward": 0.0,
             },
-            fps=options.fps,
-            max_fps=options.max_fps,
+            fps=self._options.fps,
+            max_fps=self._options.max_fps,
             frame_hashes=True,
             clock=functools.partial(simulation_time, self._env),
             declared=functools.partial(declared_rate, self._env),
             facts=self._tiles.facts,
-            strict=options.strict,
+            strict=self._options.strict,
         )
-        self._videos(self._video).begin()
+        self._live(self._video).begin()
 
-    def _videos(self, video: VideoRecorder) -> LiveVideos:
+    def _live(self, video: VideoRecorder) -> LiveVideos:
         return LiveVideos([video], tolerates=self._tolerates)
 
     def _tolerates(self, error: Exception) -> bool:
@@ -189,11 +186,11 @@ class TiledVideo:
         return True
 
     def _end_early(self, reason: str) -> None:
-        self._end({"complete": False, **(self._ending or {"reason": reason})})
+        self._end(complete=False, **(self._ending or {"reason": reason}))
 
-    def _end(self, facts: Mapping[str, Any]) -> None:
+    def _end(self, **facts: Any) -> None:
         if self._video is not None:
-            self._videos(self._video).end({**facts, **self._progress}, self._list)
+            self._live(self._video).end(facts, self._list)
 
     def _list(self, video: VideoRecorder) -> None:
         self._video = None

@@ -38,35 +38,32 @@ class LiveVideos:
         self._on_picture_error = on_picture_error
 
     def begin(self) -> None:
-        """Take the pictures of a reset."""
-        for recorder in self.recorders:
-            self._try(recorder, recorder.capture_frame)
+        """Take the frames of a reset."""
+        self._each(VideoRecorder.capture_frame)
 
     def take(self, *, is_there: bool, last: bool) -> None:
-        """Take the pictures of a step.
+        """Take the frames of a step.
 
         Args:
             is_there: False where the environment has reset itself already.
             last: the episode is over.
         """
-        for recorder in self.recorders:
-            if not recorder.functional:
-                continue
-            if not is_there:
-                recorder.metadata["final_frame"] = "missing"
-                continue
-            try:
-                self._try(recorder, recorder.capture_frame)
-                if last:
-                    self._try(recorder, recorder.capture_last)
-            except Exception as error:
-                self._on_picture_error(error)
-                raise
+        if not is_there:
+            for recorder in self.recorders:
+                if recorder.functional:
+                    recorder.metadata["final_frame"] = "missing"
+            return
+        try:
+            self._each(VideoRecorder.capture_frame)
+            if last:
+                self.take_last()
+        except Exception as error:
+            self._on_picture_error(error)
+            raise
 
     def take_last(self) -> None:
-        """Take the pictures of the last step, where they were left out."""
-        for recorder in self.recorders:
-            self._try(recorder, recorder.capture_last)
+        """Take the frames of the last step, where they were left out."""
+        self._each(VideoRecorder.capture_last)
 
     def give_up(self, reason: str) -> None:
         """Take no more pictures, and say why; those that were taken stay."""
@@ -94,8 +91,7 @@ class LiveVideos:
         names the others: it comes last, also where ending another one raises.
 
         Args:
-            facts: what is known of the episode, for the metadata; of its end what the
-                first call says.
+            facts: what is known of the episode, for the metadata.
             on_closed: called with each that is closed.
         """
         first, *others = self.recorders
@@ -112,13 +108,14 @@ class LiveVideos:
         if first.finished and first.path is not None and "also_named" in first.metadata:
             give_second_names(Path(first.path))
 
-    def _try(self, recorder: VideoRecorder, capture: Callable[[], None]) -> None:
-        try:
-            capture()
-        except Exception as error:
-            if not self._tolerates(error):
-                raise
-            recorder.give_up(str(error))
+    def _each(self, capture: Callable[[VideoRecorder], None]) -> None:
+        for recorder in self.recorders:
+            try:
+                capture(recorder)
+            except Exception as error:
+                if not self._tolerates(error):
+                    raise
+                recorder.give_up(str(error))
 
     def _end_one(
         self,
@@ -128,8 +125,7 @@ class LiveVideos:
     ) -> None:
         if recorder.closed:
             return
-        said = _OF_THE_END if "complete" in recorder.metadata else ()
-        recorder.metadata.update({k: v for k, v in facts.items() if k not in said})
+        recorder.metadata.update(facts)
         try:
             recorder.close()
         except Error as error:
@@ -138,10 +134,6 @@ class LiveVideos:
         finally:
             if recorder.closed:
                 on_closed(recorder)
-
-
-# What an end that is taken up again must not say otherwise.
-_OF_THE_END = ("complete", "reason", "exception", "terminated", "truncated")
 
 
 def _name_further_videos(first: VideoRecorder, others: Sequence[VideoRecorder]) -> None:

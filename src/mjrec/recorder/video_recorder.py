@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import tempfile
@@ -320,21 +321,15 @@ class VideoRecorder:
             return
         self._timestep = _time_of_a_step(self._first, (step, self._clock()))
         self._frames_per_step = max(frames, 1)
-        fps = self._fps
-        leaves_out = self._may_leave_out and self._max_fps is not None
-        if fps is None or leaves_out:
-            rate = self._real_time(frames)
-            if leaves_out:
-                self._stride = stride_for(rate, self._max_fps)
-            fps = fps or rate / self._stride
-        if self._stride > 1:
-            self._steps = StepRuns([self._first[0]], stride=self._stride)
-        self._open(fps)
-
-    def _real_time(self, frames: int) -> Fraction:
+        real_time: Callable[[], Fraction] = self._declared
         if self._timestep is not None and frames:
-            return rate_from_timestep(float(self._timestep / frames))
-        return self._declared()
+            timestep = float(self._timestep / frames)
+            real_time = functools.partial(rate_from_timestep, timestep)
+        if self._may_leave_out and self._max_fps is not None:
+            self._stride = stride_for(real_time(), self._max_fps)
+            if self._stride > 1:
+                self._steps = StepRuns([self._first[0]], stride=self._stride)
+        self._open(self._fps or real_time() / self._stride)
 
     def _open(self, fps: Fraction) -> None:
         assert self.path is not None
@@ -436,7 +431,7 @@ def declared_rate(env: object) -> Fraction:
         return rate_from_timestep(timestep)
     fps = (getattr(env, "metadata", None) or {}).get("render_fps")
     if fps is not None:
-        return _checked(fps, env)
+        return to_rate(fps, name=f'metadata["render_fps"] of {type(env).__name__}')
     logger.warning(
         "%s does not say how fast its videos are to play (no control timestep, no "
         "render_fps): %d frames a second are taken. Give fps= to choose.",
@@ -444,16 +439,6 @@ def declared_rate(env: object) -> Fraction:
         _DEFAULT_RATE,
     )
     return _DEFAULT_RATE
-
-
-def _checked(fps: Any, env: object) -> Fraction:
-    try:
-        return to_rate(fps)
-    except InvalidArgument as error:
-        raise InvalidArgument(
-            f'metadata["render_fps"] of {type(env).__name__} is no rate: {error} '
-            "Give fps= to choose another."
-        ) from error
 
 
 def _declared_timestep(env: object) -> float | None:

@@ -172,7 +172,8 @@ class _DeadMonitor:
                     if is_ours:
                         report.remove(part)
         now = self._now()
-        if has_news and _has_recordings(now):
+        has_recordings = any(not path.name.startswith(".") for path in now.paths)
+        if has_news and has_recordings:
             self._complete_journal([*self._missing_episodes(now), *_clips(now)])
             written = write_manifest_and_stats(
                 self._directory, self._infix, is_own=True
@@ -348,16 +349,6 @@ class _DeadMonitor:
             rest = f", {pending} pending: mjrec render" if pending else ""
             what = f"{count} {'video' if count == 1 else 'videos'}{rest}"
             self._report.note(manifest_name(self._infix), what)
-
-
-def _has_recordings(now: Leftovers) -> bool:
-    files = now.files
-    return any(
-        (
-            *(files.journal, files.manifest, files.stats, files.trajectories),
-            *(files.videos, files.metadata, now.in_flight),
-        )
-    )
 
 
 def _clips(now: Leftovers) -> Iterator[_Line]:

@@ -20,7 +20,7 @@ import selectors
 import struct
 import sys
 import time
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -177,7 +177,7 @@ class WorkerPool:
     def frames_of(
         self, drawing: Mapping[str, Any], indices: Sequence[int]
     ) -> Iterator[Frame]:
-        """Return the frames of anything that `drawing.open_drawing` opens.
+        """Return the frames of anything that `worker.open_drawing` opens.
 
         As `frames`. Frames that an earlier call has not given yet are given up.
         """
@@ -246,8 +246,8 @@ class WorkerPool:
         """Tell a worker what to draw, and start it if need be."""
         self._start(worker)
         assert worker.child is not None
-        runs = _runs(self._indices[position] for position in worker.owes)
-        order = json.dumps({"drawing": self._drawing, "runs": runs})
+        indices = [int(self._indices[position]) for position in worker.owes]
+        order = json.dumps({"drawing": self._drawing, "indices": indices})
         worker.patience.renew()
         # One that has died is noticed when it is listened to.
         with contextlib.suppress(OSError):
@@ -474,20 +474,6 @@ def _received(pipe: int, size: int) -> Generator[None, None, bytearray]:
             raise EOFError
         missing = missing[count:]
     return content
-
-
-def _runs(indices: Iterable[int]) -> list[tuple[int, int, int]]:
-    """Return first, step and count of each even run in `indices`."""
-    runs: list[tuple[int, int, int]] = []
-    for index in map(int, indices):
-        first, step, count = runs[-1] if runs else (0, 0, 0)
-        if count == 1:
-            runs[-1] = (first, index - first, 2)
-        elif count > 1 and index == first + step * count:
-            runs[-1] = (first, step, count + 1)
-        else:
-            runs.append((index, 0, 1))
-    return runs
 
 
 def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-import shutil
 import tempfile
-import weakref
 from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -96,7 +95,7 @@ def render(
         chosen = chosen_frames(reader.frame_count, facts, max_fps)
     is_trusted = bool(getattr(trajectory, "trust_models", False))
     pool = WorkerPool(workers, trust_models=is_trusted)
-    return _Frames(pool, lambda: pool.frames(path, chosen.indices, view))
+    return _started(pool, lambda: pool.frames(path, chosen.indices, view))
 
 
 def render_states(
@@ -155,14 +154,15 @@ def render_states(
     )
     rows = check_states(model, states, spec)
     pool = WorkerPool(workers)
-    directory = Path(tempfile.mkdtemp(prefix="mjrec-states-"))
+    temporary = tempfile.TemporaryDirectory(prefix="mjrec-states-")
+    directory = Path(temporary.name)
     drawing = {"states": str(directory), "spec": int(spec), "view": view.as_json()}
 
     def begin() -> Iterator[Frame]:
         save_states(directory, model, rows)
         return pool.frames_of(drawing, range(len(rows)))
 
-    return _Frames(pool, begin, directory=directory)
+    return _started(pool, begin, temporary)
 
 
 def _path(trajectory: Any) -> Path:
@@ -175,41 +175,22 @@ def _path(trajectory: Any) -> Path:
     return Path(path)
 
 
-class _Frames:
-    """An iterator that takes its workers and its files with it when it ends."""
+def _started(
+    pool: WorkerPool,
+    begin: Callable[[], Iterator[Frame]],
+    *resources: contextlib.AbstractContextManager[Any],
+) -> Iterator[Frame]:
+    """Return an iterator that takes its workers and its files with it when it ends."""
 
-    def __init__(
-        self,
-        pool: WorkerPool,
-        begin: Callable[[], Iterator[Frame]],
-        *,
-        directory: Path | None = None,
-    ) -> None:
-        # In a forked child the files are not its to remove, nor the processes to end.
-        self._leave = weakref.finalize(self, _leave, pool, directory, os.getpid())
-        try:
-            self._frames = begin()
-        except BaseException:
-            self._leave()
-            raise
+    def frames() -> Iterator[Any]:
+        with contextlib.ExitStack() as stack:
+            for resource in (*resources, pool):
+                stack.enter_context(resource)
+            drawn = begin()
+            # Here it stands when the caller gets it: only what has begun is cleaned up.
+            yield None
+            yield from drawn
 
-    def __iter__(self) -> Iterator[Frame]:
-        return self
-
-    def __next__(self) -> Frame:
-        try:
-            return next(self._frames)
-        except BaseException:
-            self._leave()
-            raise
-
-    def close(self) -> None:
-        """End the workers; nothing more is given. Idempotent."""
-        self._leave()
-        self._frames = iter(())
-
-
-def _leave(pool: WorkerPool, directory: Path | None, owner: int) -> None:
-    pool.close()
-    if directory is not None and os.getpid() == owner:
-        shutil.rmtree(directory, ignore_errors=True)
+    iterator = frames()
+    next(iterator)
+    return iterator

@@ -3,11 +3,11 @@
 
 On its standard input it is told one JSON object a line::
 
-    {"drawing": {...}, "runs": [[1, 2, 250]]}
+    {"drawing": {...}, "indices": [1, 3, 5]}
 
-`drawing` is what `open_drawing` takes; `runs` are the frames, as first number, step and
-count. What it says begins with a `pool.HEADER`. It is the bytes of a frame,
-`(height, width, 3) uint8`, or a JSON object::
+`drawing` is what `open_drawing` takes; `indices` are the frames. What it says begins
+with a `pool.HEADER`. It is the bytes of a frame, `(height, width, 3) uint8`, or a JSON
+object::
 
     {"size": [48, 64], "gl": {...}}         before the frames of a job
     {"error": {...}}                        instead of a frame and all that would follow
@@ -28,18 +28,248 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..child_python import carried, say_stacks_when_asked, take_standard_output
+from ..errors import InvalidArgument
+from ..frames import Frame, grid_frame, grid_shape
+from ..simulation.cameras import Camera, camera_from_members, is_tracking
 from ..simulation.gl_probe import draw_test_scene
-from ..simulation.renderer import Canvas
-from .drawing import open_drawing
+from ..simulation.recorded_scene import GivenStates, RecordedScene
+from ..simulation.renderer import Canvas, SceneRenderer
+from ..simulation.warnings import log_mujoco_warnings
 from .pool import FRAME, HEADER, TEXT, TRY
+from .recorded_facts import check_has_frames, open_for_rendering
+from .views import PlainCamera, View
 
 _NICE = 10
+
+
+class Drawing:
+    """Frames of a scene, known by their numbers, from 0.
+
+    Each is the same whatever was drawn before. MuJoCo's visualiser remembers: an
+    infinite plane is drawn around the place where the cameras stood in the frame
+    before, and a camera that tracks a body goes a part of the way to it in each frame.
+    So the cameras are brought to where they would be.
+
+    Args:
+        scene: what is drawn.
+        cameras: whose frames they are, in a grid where there are several. All draw
+            with one context.
+        acquired: what `close` frees.
+    """
+
+    def __init__(
+        self,
+        scene: RecordedScene | GivenStates,
+        cameras: Iterable[_CameraReplay],
+        acquired: contextlib.ExitStack,
+    ) -> None:
+        self._scene = scene
+        self._cameras = list(cameras)
+        self._acquired = acquired
+        # The frame whose cameras the renderers have in mind.
+        self._last: int | None = None
+        self._context_is_old = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """`(height, width)` of the frames."""
+        height, width = self._cameras[0].renderer.size
+        rows, columns = grid_shape(len(self._cameras))
+        return rows * height, columns * width
+
+    @property
+    def gl_facts(self) -> dict[str, Any]:
+        """Who draws, and on which device: `gl_context.current_gl_facts`."""
+        return self._cameras[0].renderer.gl_facts
+
+    def draw(self, index: int, *, out: Frame | None = None) -> Frame:
+        """Return a frame, in `out` if that is given.
+
+        Raises:
+            InvalidArgument: there is no such frame.
+            UnreadableFile: the file is damaged.
+            GLError: the driver hangs.
+        """
+        if not 0 <= index < self._scene.count:
+            raise InvalidArgument(
+                f"There is no picture {index}: there are {self._scene.count}, numbered "
+                "from 0."
+            )
+        last, self._last = self._last, None
+        if last is None or index != last + 1:
+            self._prepare(index, last)
+        self._bring_to(index)
+        if self._context_is_old:
+            self._cameras[0].renderer.model_changed()
+            self._context_is_old = False
+        frame = self._render(out)
+        self._last = index
+        return frame
+
+    def close(self) -> None:
+        """Free what was acquired for this drawing. Idempotent."""
+        self._acquired.close()
+
+    def _render(self, out: Frame | None) -> Frame:
+        if len(self._cameras) == 1:
+            return self._cameras[0].renderer.render(self._scene.data, out=out)
+        grid = grid_frame(
+            [camera.renderer.render(self._scene.data) for camera in self._cameras]
+        )
+        if out is None:
+            return grid
+        np.copyto(out, grid)
+        return out
+
+    def _prepare(self, index: int, last: int | None) -> None:
+        """Bring the cameras to where they are before a frame."""
+        start = max(0, index - 1)
+        if any(camera.is_following for camera in self._cameras):
+            start = 0 if last is None or last >= index else last + 1
+        if start == 0:
+            for camera in self._cameras:
+                camera.begin()
+        for earlier in range(start, index):
+            self._bring_to(earlier)
+            for camera in self._cameras:
+                camera.renderer.look(self._scene.data)
+
+    def _bring_to(self, index: int) -> None:
+        self._context_is_old |= self._scene.bring_to(index)
+
+
+class _CameraReplay:
+    """One camera's renderer, brought to any frame as if all before had been drawn.
+
+    Args:
+        renderer: of its frames.
+        camera: what it draws with; None where the recording moves that.
+        before: where the two cameras of its scene stand before the first frame.
+    """
+
+    def __init__(self, renderer: SceneRenderer, camera: Any, before: ArrayLike) -> None:
+        self.renderer = renderer
+        self.is_following = is_tracking(camera)
+        self._before = before
+        self._camera = camera
+        self._start = camera.lookat.copy() if self.is_following else None
+
+    def begin(self) -> None:
+        """Go to before the first frame."""
+        self.renderer.camera_positions = self._before
+        if self.is_following:
+            self._camera.lookat[:] = self._start
+
+
+def trajectory_drawing(
+    path: Path,
+    view: View,
+    *,
+    cameras: Sequence[PlainCamera | None] | None = None,
+    canvas: Canvas | None = None,
+) -> Drawing:
+    """Return the frames that `env.render()` would have given in a recorded episode.
+
+    Args:
+        path: of the trajectory; its model is looked for beside it.
+        view: what of them is to be other than recorded.
+        cameras: several in place of that of the view; None among them is as recorded.
+            A frame is then all that they show, in a grid.
+        canvas: what to draw with; something new, if None.
+
+    Raises:
+        UnreadableFile: of the trajectory or its model.
+        NoPictures: it has no snapshots.
+        UnknownName, InvalidArgument: its model has no such camera, or a size that the
+            driver cannot draw.
+        GLError: nothing can be drawn here.
+    """
+    with contextlib.ExitStack() as opened:
+        reader = opened.enter_context(open_for_rendering(path, is_vetted=True))
+        check_has_frames(reader)
+        facts = reader.facts
+        scene = RecordedScene(reader)
+        model, recorded = scene.model, scene.view
+        look: dict[str, Any] = {
+            "height": recorded.height if view.height is None else view.height,
+            "width": recorded.width if view.width is None else view.width,
+            "quality": view.quality
+            or (facts.get("video") or {}).get("quality", "full"),
+        }
+        shared = canvas or opened.enter_context(contextlib.closing(Canvas()))
+
+        def replay(asked: PlainCamera | None) -> _CameraReplay:
+            # Of a camera as recorded it is known how the frames have moved it.
+            camera = None if asked is None else _camera(model, asked)
+            renderer = SceneRenderer(
+                model,
+                camera=recorded.camera if camera is None else camera,
+                scene_option=recorded.option,
+                max_geom=recorded.max_geom,
+                fresh=recorded.fresh,
+                canvas=shared,
+                **look,
+            )
+            before = scene.previous_cameras if asked is None else np.zeros((2, 3))
+            return _CameraReplay(renderer, camera, before)
+
+        wanted = [view.camera] if cameras is None else cameras
+        return Drawing(scene, [replay(asked) for asked in wanted], opened.pop_all())
+
+
+def states_drawing(
+    directory: Path, spec: int, view: View, *, canvas: Canvas
+) -> Drawing:
+    """Return the frames of given states, with all that is computed from them.
+
+    Args:
+        directory: where `save_states` wrote them.
+        spec: which components a state has.
+        view: how they are to be drawn, with nothing left open.
+        canvas: what to draw with.
+
+    Raises:
+        UnknownName, InvalidArgument, GLError: as `trajectory_drawing`.
+    """
+    scene = GivenStates(directory, spec)
+    camera = _camera(scene.model, view.camera)
+    look: dict[str, Any] = {
+        "height": view.height,
+        "width": view.width,
+        "quality": view.quality,
+    }
+    renderer = SceneRenderer(scene.model, camera=camera, canvas=canvas, **look)
+    replay = _CameraReplay(renderer, camera, np.zeros((2, 3)))
+    return Drawing(scene, [replay], contextlib.ExitStack())
+
+
+def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
+    """Return what is described, for a worker, in plain JSON.
+
+    Args:
+        drawing: `trajectory` (a path), or `states` (a directory) and `spec`; and
+            `view`; and, of a trajectory, `cameras`.
+        canvas: what to draw with.
+    """
+    log_mujoco_warnings()
+    view = View(**drawing["view"])
+    if "trajectory" in drawing:
+        path, cameras = Path(drawing["trajectory"]), drawing.get("cameras")
+        return trajectory_drawing(path, view, cameras=cameras, canvas=canvas)
+    states = Path(drawing["states"])
+    return states_drawing(states, drawing["spec"], view, canvas=canvas)
+
+
+def _camera(model: Any, camera: Any) -> Camera:
+    return camera_from_members(model, camera) if isinstance(camera, dict) else camera
 
 
 def main() -> None:
@@ -78,10 +308,9 @@ def _draw(order: Mapping[str, Any], canvas: Canvas, answers: _Answers) -> None:
     with contextlib.closing(open_drawing(order["drawing"], canvas)) as drawing:
         answers.say(size=drawing.size, gl=drawing.gl_facts)
         frame = np.empty((*drawing.size, 3), np.uint8)
-        for first, step, count in order["runs"]:
-            for place in range(count):
-                drawing.draw(first + step * place, out=frame)
-                answers.send(FRAME, frame.data.cast("B"))
+        for index in order["indices"]:
+            drawing.draw(index, out=frame)
+            answers.send(FRAME, frame.data.cast("B"))
 
 
 class _Answers:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from ..formats.monitor_directory import (
 )
 from ..formats.render_failures import forget_failure, reason_of
 from ..formats.spans import FINISHED, is_in_flight
-from ..formats.stats_file import StatsFile, read_stats_file, write_stats_file
+from ..formats.stats_file import StatsFile, write_stats_file
 from ..formats.video_metadata import (
     finished_videos,
     is_broken,
@@ -45,7 +45,7 @@ from ..formats.video_metadata import (
 from ..formats.video_names import tiled_name, with_part
 from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles
-from .run import Run, named_video
+from .run import Run
 
 _FORMAT_VERSION = 1
 
@@ -137,10 +137,16 @@ def write_manifest_and_stats(
         name = name if old is None else old.stats
         is_new_stats = False
         if stats is None:
-            stats = _stats_of(results)
-            is_new_stats = stats is not None and _saved(directory / name) != stats
-            if stats is not None and is_new_stats:
-                write_stats_file(directory / name, stats)
+            try:
+                stats = results.stats()
+            except UnreadableFile:
+                # They may be gone, and no journal be there.
+                if results.files.journal is not None:
+                    raise
+            else:
+                is_new_stats = stats != results.saved
+                if is_new_stats:
+                    write_stats_file(directory / name, stats)
         if run is None:
             run = results.run
             if not run.facts and old is not None:
@@ -149,9 +155,7 @@ def write_manifest_and_stats(
         is_new_manifest = old is None or _as_read(manifest) != old
         if is_new_manifest:
             write_manifest(directory / manifest_name(infix), manifest)
-        written = Written(manifest, stats, is_new_manifest, is_new_stats)
-        _forget_failures(directory, results.details.get("pending") or (), written)
-    return written
+    return Written(manifest, stats, is_new_manifest, is_new_stats)
 
 
 @contextlib.contextmanager
@@ -169,23 +173,6 @@ def manifest_lock(directory: Path, infix: Infix) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-def _stats_of(results: MonitorResults) -> StatsFile | None:
-    """Return the statistics; None where they are gone, and the journal too."""
-    try:
-        return results.stats()
-    except UnreadableFile:
-        if results.files.journal is not None:
-            raise
-        return None
-
-
-def _saved(path: Path) -> StatsFile | None:
-    try:
-        return read_stats_file(path)
-    except UnreadableFile:
-        return None
 
 
 def _as_read(manifest: Manifest) -> Manifest:
@@ -286,11 +273,17 @@ def _pending(directory: Path, infix: Infix, run: Run) -> list[Mapping[str, Any]]
         {key: clip[key] for key in ("episode_id", "clip", "video")}
         for clip in sorted(clips, key=lambda clip: str(clip["video"]))
     ]
-    return [
-        _with_reason(directory, entry)
-        for entry in entries
-        if _is_recorded(directory, entry) and not is_done(directory / entry["video"])
-    ]
+    waiting: list[Mapping[str, Any]] = []
+    for entry in entries:
+        names = [entry["video"], *([entry["clip"]] if "clip" in entry else [])]
+        if is_done(directory / entry["video"]):
+            for name in names:
+                forget_failure(directory / name)
+        elif _is_recorded(directory, entry):
+            reasons = filter(None, (reason_of(directory / name) for name in names))
+            reason = next(reasons, None)
+            waiting.append(entry if reason is None else {**entry, "reason": reason})
+    return waiting
 
 
 def _is_recorded(directory: Path, entry: Mapping[str, Any]) -> bool:
@@ -300,23 +293,3 @@ def _is_recorded(directory: Path, entry: Mapping[str, Any]) -> bool:
     except UnreadableFile:
         # It may be in the list that cannot be read.
         return True
-
-
-def _with_reason(directory: Path, entry: Mapping[str, Any]) -> Mapping[str, Any]:
-    reason = reason_of(directory / entry["video"])
-    if reason is None and "clip" in entry:
-        reason = reason_of(directory / entry["clip"])
-    return entry if reason is None else {**entry, "reason": reason}
-
-
-def _forget_failures(
-    directory: Path, before: Sequence[Mapping[str, Any]], written: Written
-) -> None:
-    """Remove what was said of videos that are not pending any more."""
-    waiting = {entry["video"] for entry in written.pending}
-    for entry in before:
-        video = named_video(entry)
-        if video is not None and video not in waiting:
-            forget_failure(directory / video)
-            if ClipPart.parse(str(entry.get("clip"))) is not None:
-                forget_failure(directory / str(entry["clip"]))

@@ -176,14 +176,15 @@ def _env_info(directory: Path, monitors: Sequence[_Kept]) -> dict[str, Any]:
     if not known:
         return {"gym_version": GYM_VERSION}
     newest = max(known, key=lambda each: _last_time(each.stats))
-    infos = {Path(each.path).name: each.env_info or {} for each in known}
-    if any(info != newest.env_info for info in infos.values()):
-        keys = dict.fromkeys(key for info in infos.values() for key in info)
+    values: dict[str, list[str]] = {}
+    for each in known:
+        values.setdefault(repr(dict(each.env_info or {})), []).append(each.path)
+    if len(values) > 1:
         logger.warning(
             "The monitors of %s recorded different things: %s. Their results are "
             "merged; env_info is that of %s.",
             directory,
-            "; ".join(filter(None, (_difference(key, infos) for key in keys))),
+            "; ".join(f"{Path(p[0]).name} has {value}" for value, p in values.items()),
             Path(newest.path).name,
         )
     return dict(newest.env_info or {})
@@ -192,15 +193,6 @@ def _env_info(directory: Path, monitors: Sequence[_Kept]) -> dict[str, Any]:
 def _last_time(stats: StatsFile) -> float:
     times = [*stats.timestamps, stats.initial_reset_timestamp or -math.inf]
     return max((time for time in times if not math.isnan(time)), default=-math.inf)
-
-
-def _difference(key: str, infos: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return which values a key has, and a file for each; empty where it has one."""
-    values: dict[str, str] = {}
-    for name, info in infos.items():
-        values.setdefault(repr(info[key]) if key in info else "missing", name)
-    listed = ", ".join(f"{value} in {name}" for value, name in values.items())
-    return f"{key} is {listed}" if len(values) > 1 else ""
 
 
 def _videos(directory: Path, monitors: Sequence[_Kept]) -> list[tuple[str, str]]:

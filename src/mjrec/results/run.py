@@ -92,8 +92,8 @@ class Run:
         for entry in details.get("pending") or ():
             if "clip" in entry:
                 run.note("clip", entry)
-            elif (video := named_video(entry)) is not None:
-                run.filmed.add(episode_of(video) or 0)
+            elif (number := episode_of(str(entry.get("video")))) is not None:
+                run.filmed.add(number)
         run.deferred = set(run.filmed)
         metadata = [
             *(about for _, about in manifest.videos),
@@ -157,9 +157,3 @@ class Run:
             self.filmed.add(number)
         if recording == "deferred":
             self.deferred.add(number)
-
-
-def named_video(entry: Mapping[str, Any]) -> str | None:
-    """Return the video of this directory that a pending entry names, if it does."""
-    name = entry.get("video")
-    return name if isinstance(name, str) and episode_of(name) is not None else None

@@ -139,6 +139,12 @@ _INDICES = {
     "light_texid": "ntex",
 }
 
+# The visualiser looks these up in tables of its own, without a look at their bounds.
+_KINDS = {
+    "option.label": int(mujoco.mjtLabel.mjNLABEL),
+    "option.frame": int(mujoco.mjtFrame.mjNFRAME),
+}
+
 # Where a model's files were when it was compiled, and a checksum that nothing here
 # depends on.
 _PLACES = re.compile(r"paths|npaths|nbuffer|signature|\w+_(path|contenttype)adr")
@@ -253,6 +259,11 @@ def _set(struct: Any, name: str, value: NDArray[Any], *, field: str) -> None:
                 f"model, and the recorded one has some from {value.min()} to "
                 f"{value.max()}."
             )
+    if field in _KINDS and value.item() not in range(_KINDS[field]):
+        raise InvalidArgument(
+            f"The field {field} has to be from 0 to {_KINDS[field] - 1} in MuJoCo "
+            f"{mujoco.__version__}, got {value}."
+        )
     if isinstance(present, np.ndarray):
         present[...] = value
         return

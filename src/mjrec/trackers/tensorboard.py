@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable
@@ -10,10 +11,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..formats.ffmpeg import run_ffmpeg
 from ..formats.json_fields import field, integer, read_object, text, unreadable
 from ..recorder.tracking import FinishedEpisode, FinishedVideo, Run, Tracker
 from ..worker_thread import WorkerThread
-from .preview import animated_gif
 from .services import group_of, name_of, require, scalars_of
 
 if TYPE_CHECKING:
@@ -21,6 +22,14 @@ if TYPE_CHECKING:
 
 # Videos that wait for their previews.
 _MOST_WAITING = 100
+_MOST_BYTES = 2 << 20
+# Of the longer side, in pixels. The last is small enough for any hundred pictures.
+_SIDES = (320, 160, 80)
+_MOST_PICTURES = 100
+# In hundredths of a second, the format's unit.
+_SHORTEST_DELAY = 5
+# So many frames hold forty key frames and more, which are decoded in no time.
+_MANY_FRAMES = 10_000
 
 
 class TensorBoardTracker(Tracker):
@@ -147,3 +156,52 @@ class _TensorBoardRun:
                 self._previews.close()
         finally:
             self._file.close()
+
+
+def animated_gif(path: Path, *, frame_count: int, fps: Fraction) -> bytes:
+    """Return a video as a GIF of at most 100 pictures and two megabytes.
+
+    It lasts as long as the video, and is played again and again; a long one shows few
+    pictures a second. The longer side has 320 pixels at most.
+
+    Args:
+        path: the video.
+        frame_count: how many frames it has.
+        fps: how many a second.
+
+    Raises:
+        EncoderError: ffmpeg failed, or hangs.
+    """
+    delay = _delay(frame_count, fps)
+    for side in _SIDES:
+        gif = _convert(path, side=side, delay=delay, frame_count=frame_count)
+        if len(gif) <= _MOST_BYTES:
+            break
+    return gif
+
+
+def _delay(frame_count: int, fps: Fraction) -> int:
+    longest = math.ceil(100 * frame_count / fps / _MOST_PICTURES)
+    return max(_SHORTEST_DELAY, math.ceil(100 / fps), longest)
+
+
+def _convert(path: Path, *, side: int, delay: int, frame_count: int) -> bytes:
+    skipping = ["-skip_frame", "nokey"] if frame_count >= _MANY_FRAMES else []
+    # A palette of the video's own, of which only what changes is stored.
+    filters = (
+        # Up, so that even the shortest video has a picture.
+        f"fps=100/{delay}:round=up,"
+        f"scale=min(iw\\,{side}):min(ih\\,{side})"
+        ":force_original_aspect_ratio=decrease:flags=area,"
+        "split[pictures][counted];[counted]palettegen=stats_mode=diff[palette];"
+        "[pictures][palette]paletteuse=dither=bayer:bayer_scale=4:diff_mode=rectangle"
+    )
+    return run_ffmpeg(
+        [
+            *("-hide_banner", "-loglevel", "error", "-nostdin"),
+            *(*skipping, "-threads", "1", "-i", f"file:{path}"),
+            *("-an", "-filter_complex", filters, "-frames:v", str(_MOST_PICTURES)),
+            *("-loop", "0", "-f", "gif", "pipe:1"),
+        ],
+        what=f"No preview could be made of {path}.",
+    )
