@@ -35,7 +35,7 @@ from mjrec.formats.monitor_directory import (
     stats_prefix,
     trajectory_prefix,
 )
-from mjrec.formats.stats_file import StatsFile, write_stats_file
+from mjrec.formats.manifest import StatsFile, write_stats_file
 
 TASK = "InvertedPendulum-v5"
 

@@ -21,8 +21,7 @@ from typing import Any
 from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry, read_journal
 from ..formats.json_fields import json_object
-from ..formats.manifest import Manifest, read_manifest
-from ..formats.stats_file import StatsFile, read_stats_file
+from ..formats.manifest import Manifest, StatsFile, read_manifest, read_stats_file
 from .monitor_files import MonitorFiles
 from .run import Run
 
