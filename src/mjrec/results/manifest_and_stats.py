@@ -153,11 +153,7 @@ def write_manifest_and_stats(
                 is_new_stats = stats != results.saved
                 if is_new_stats:
                     write_stats_file(directory / name, stats)
-        if run is None:
-            run = results.run
-            if not run.facts and old is not None:
-                run = Run.of_manifest(old)
-        manifest = _manifest(directory, infix, run, stats_name=name)
+        manifest = _manifest(directory, infix, run or results.run, stats_name=name)
         is_new_manifest = old is None or _as_read(manifest) != old
         if is_new_manifest:
             write_manifest(directory / manifest_name(infix), manifest)
