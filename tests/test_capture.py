@@ -3,22 +3,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import dataclasses
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from touch_grid import TOUCH_GRID
 
-from mjrec.errors import ClosedError, PicturesDiffer
+from mjrec.errors import PicturesDiffer
 from mjrec.simulation.capture import Capture, EpisodeStart
 from mjrec.simulation.captured_arrays import read_state
 from mjrec.simulation.fields import apply_fields
@@ -124,17 +119,6 @@ def simulation(new: Callable[..., Simulation]) -> Simulation:
     return new()
 
 
-def test_a_state_is_the_integration_state(simulation: Simulation) -> None:
-    """Byte for byte."""
-    simulation.begin()
-    for _ in range(3):
-        simulation.step()
-        state = np.empty(len(read_state(simulation.model, simulation.data)))
-        simulation.states.capture_state(state)
-        expected = read_state(simulation.model, simulation.data)
-        assert state.tobytes() == expected.tobytes()
-
-
 def test_rows_can_be_gathered_while_only_the_state_changes(
     new: Callable[..., Simulation],
 ) -> None:
@@ -158,14 +142,6 @@ def test_rows_can_be_gathered_while_only_the_state_changes(
     still.states.model_changed()
     assert not start.is_current()
     assert still.begin().words is not None
-
-
-def test_rows_are_not_gathered_where_a_closer_look_is_needed(
-    simulation: Simulation,
-) -> None:
-    """Nothing tells here whether the view has moved."""
-    start = simulation.begin()
-    assert (start.words, start.is_current()) == (None, False)
 
 
 def test_changes_of_model_and_view_are_told_once(simulation: Simulation) -> None:
@@ -270,16 +246,6 @@ def test_a_recompiled_model_is_another_one(simulation: Simulation) -> None:
     assert simulation.begin().model == first.model
 
 
-def test_other_data_of_the_same_model_is_followed(simulation: Simulation) -> None:
-    """Captures are of the data that the environment has at that moment."""
-    simulation.begin()
-    simulation.data = mujoco.MjData(simulation.model)
-    simulation.data.qpos[0] = 0.75
-    mujoco.mj_forward(simulation.model, simulation.data)
-    assert simulation.capture() is None
-    assert np.array_equal(simulation.captured("geom_xpos"), simulation.data.geom_xpos)
-
-
 @pytest.mark.parametrize(
     "flag", ["CONTACTPOINT", "CONTACTFORCE", "CONTACTSPLIT", "ISLAND"]
 )
@@ -331,13 +297,6 @@ def test_an_obstacle_is_a_refusal_and_in_mid_episode_an_error(
     obstacles.append("there is an arrow")
     with pytest.raises(PicturesDiffer, match=r'there is an arrow.*render="live"'):
         simulation.capture()
-
-
-def test_a_plugin_that_draws_is_refused_by_name(
-    new: Callable[..., Simulation],
-) -> None:
-    """Before it has drawn anything."""
-    assert "mujoco.sensor.touch_grid draws" in (new(TOUCH_GRID).begin().refusal or "")
 
 
 def test_a_field_that_is_forgotten_is_refused(
@@ -402,18 +361,6 @@ def test_an_infinite_plane_remembers_the_camera_before(simulation: Simulation) -
     assert simulation.begin_scene()["previous_cameras"] is None
 
 
-@pytest.mark.parametrize(("plane", "fresh"), [("2 2 1", False), ("0 0 1", True)])
-def test_only_infinite_planes_in_scenes_that_stay_remember(
-    new: Callable[..., Simulation], plane: str, fresh: bool
-) -> None:
-    """A plane with edges does not, nor does a scene that is made for each frame."""
-    simulation = new(fresh=fresh)
-    simulation.compile(BALL, plane=plane)
-    simulation.begin()
-    simulation.capture()
-    assert simulation.begin_scene()["previous_cameras"] is None
-
-
 def track(simulation: Simulation) -> None:
     simulation.camera.type = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
     simulation.camera.trackbodyid = 1
@@ -444,94 +391,3 @@ def test_nothing_is_written_to_the_simulation(simulation: Simulation) -> None:
     simulation.begin()
     simulation.capture()
     assert everything() == before
-
-
-def test_an_episode_is_the_same_with_and_without_captures(
-    new: Callable[..., Simulation],
-) -> None:
-    """Observations of a real environment do not depend on being recorded."""
-
-    def observations(*, recorded: bool) -> list[bytes]:
-        with gymnasium.make("HalfCheetah-v5") as env:
-            base: Any = env.unwrapped
-            observation, _ = env.reset(seed=3)
-            found = [observation.tobytes()]
-            simulation = new()
-            simulation.model, simulation.data = base.model, base.data
-            if recorded:
-                assert simulation.begin().refusal is None
-            env.action_space.seed(0)
-            for _ in range(20):
-                observation, *_ = env.step(env.action_space.sample())
-                found.append(observation.tobytes())
-                if recorded:
-                    assert simulation.capture() is None
-            return found
-
-    assert observations(recorded=True) == observations(recorded=False)
-
-
-@pytest.mark.dm_control
-def test_dm_controls_objects_are_as_good_as_mujocos(
-    new: Callable[..., Simulation],
-) -> None:
-    """Its wrappers are seen through."""
-    suite = pytest.importorskip("dm_control.suite")
-    physics = suite.load("cartpole", "balance").physics
-    simulation = new(fresh=True)
-    simulation.model, simulation.data = physics.model, physics.data
-    assert simulation.begin().refusal is None
-    physics.step()
-    assert simulation.capture() is None
-    expected = physics.data.ptr.geom_xpos
-    assert np.array_equal(simulation.captured("geom_xpos"), expected)
-
-
-def test_what_belongs_around_a_reset_is_passed_on(
-    new: Callable[..., Simulation],
-) -> None:
-    """It is the environment's own affair."""
-    inside = []
-
-    @contextlib.contextmanager
-    def resetting() -> Iterator[None]:
-        inside.append(1)
-        yield
-
-    with new(resetting=resetting).states.resetting(), new().states.resetting():
-        assert inside
-
-
-def test_calls_out_of_turn_are_errors(simulation: Simulation) -> None:
-    """Nothing can be captured before an episode begins, or after the end."""
-    states = simulation.states
-    for _ in range(2):
-        with pytest.raises(ClosedError, match="begin_episode"):
-            states.capture_state(np.empty(8))
-        with pytest.raises(ClosedError, match="begin_episode"):
-            states.changed_fields()
-        with pytest.raises(ClosedError, match="begin_episode"):
-            states.capture_snapshot(np.zeros(8, np.uint64))
-        simulation.begin()
-        states.close()
-    states.close()
-    unopened = Capture(lambda: (simulation.model, simulation.data), view=states._view)
-    with pytest.raises(ClosedError, match="open"):
-        unopened.begin_episode()
-
-
-def test_no_opengl_is_needed() -> None:
-    """Not even its library is loaded."""
-    code = f"""
-import os, pathlib, sys, tempfile
-os.environ["MUJOCO_GL"] = "disable"
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-from test_capture import Simulation
-simulation = Simulation(pathlib.Path(tempfile.mkdtemp()))
-assert simulation.begin().refusal is None
-simulation.capture()
-simulation.states.finish()
-maps = open("/proc/self/maps").read()
-assert "libEGL" not in maps and "libOSMesa" not in maps, "OpenGL was loaded"
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

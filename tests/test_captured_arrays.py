@@ -12,7 +12,7 @@ import pytest
 
 from mjrec.formats.trajectory import columns_of
 from mjrec.simulation.captured_arrays import read_state, state_dtype, state_words
-from mjrec.simulation.raw_memory import WORDS, can_be_gathered, words_of
+from mjrec.simulation.raw_memory import WORDS
 
 # Something of every component but plugins'.
 FULL = """
@@ -87,38 +87,3 @@ def test_components_are_where_mujoco_puts_them() -> None:
     assert sum(map(len, parts.values())) == len(row)
     # The forces on the world are part of every state.
     assert state_dtype(simulated("<mujoco/>")[0]).names == ("time", "xfrc_applied")
-
-
-def gathered(words: Any) -> bytes:
-    """Gather a row between two others, as recorders do, which stay as they are."""
-    slots = np.full((3, len(words)), 77, np.uint64)
-    WORDS.take(words, None, slots[1], "clip")
-    assert (slots[[0, 2]] == 77).all()
-    return slots[1].tobytes()
-
-
-def test_an_array_that_ends_within_a_word_takes_the_whole_word() -> None:
-    """The next one begins with a word; what lies between is nobody's."""
-    memory = np.frombuffer(bytearray(range(1, 49)), np.uint8)
-    head, tail = memory[:13], memory[24:32]
-    found = gathered(words_of([head, tail]))
-    assert (found[:13], found[16:]) == (head.tobytes(), tail.tobytes())
-
-
-@pytest.mark.parametrize(
-    ("array", "can_be"),
-    [
-        (np.zeros((3, 2)), True),
-        (np.zeros((3, 2)).T, False),
-        (np.zeros(6)[::2], False),
-        (np.zeros(16, np.uint8)[8:], True),
-        (np.zeros(16, np.uint8)[4:], False),
-        (np.zeros(16, np.uint8)[4:4], True),
-        (np.zeros(3, np.uint8), True),
-    ],
-)
-def test_what_does_not_begin_with_a_word_cannot_be_gathered(
-    array: Any, can_be: bool
-) -> None:
-    """Nor what has gaps; an array without elements is no obstacle."""
-    assert can_be_gathered([np.zeros(1), array]) == can_be

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
-from mjrec.simulation import change_detection as module
 from mjrec.simulation.change_detection import Looks
 from mjrec.simulation.fields import (
     array_names,
@@ -40,7 +38,6 @@ RICH = """
 </mujoco>
 """
 MESH = '<mesh name="m" builtin="sphere" params="5"/>'
-WAITING = {"tex_data", "hfield_data", "mesh_vert", "body_mass"}
 
 
 @pytest.fixture
@@ -85,13 +82,6 @@ def change(struct: Any, name: str) -> None:
         setattr(holder, last, value + 1)
 
 
-def test_nothing_has_changed_at_first(looks: Looks) -> None:
-    """A model that nobody touched gives nothing, however one looks."""
-    assert looks.changed() is None
-    assert looks.changed(anything=True) is None
-    assert looks.since_stored() == {}
-
-
 def test_a_change_of_any_field_is_noticed(model: mujoco.MjModel, looks: Looks) -> None:
     """Every array with elements, every member of `opt`, `vis` and `stat`: by name."""
     arrays = [name for name in array_names() if getattr(model, name).size]
@@ -124,30 +114,6 @@ def test_every_member_of_a_view_is_watched(model: mujoco.MjModel, which: str) ->
         assert looks.changed() is None
 
 
-def test_another_view_is_no_change(model: mujoco.MjModel, looks: Looks) -> None:
-    """Nor is what has become of the same one between episodes."""
-    other = view()
-    other.camera.distance = 7
-    looks.follow(other)
-    assert looks.changed() is None
-    other.camera.distance = 8
-    looks.follow(other)
-    assert looks.changed() is None
-
-
-def test_what_is_not_drawn_anew_waits_for_a_reset(
-    model: mujoco.MjModel, looks: Looks
-) -> None:
-    """What has to be uploaded, and physics: found when everything is looked at."""
-    names = {name for name in WAITING if getattr(model, name).size}
-    for name in names:
-        change(model, name)
-    assert looks.changed() is None
-    assert (looks.changed(anything=True) or {}).keys() == names
-    assert looks.changed(anything=True) is None
-    assert looks.since_stored().keys() == names
-
-
 def test_a_change_is_told_once_and_going_back_is_one(
     model: mujoco.MjModel, looks: Looks
 ) -> None:
@@ -162,37 +128,3 @@ def test_a_change_is_told_once_and_going_back_is_one(
     model.geom_rgba[1] = 0.75
     assert looks.since_stored().keys() == {"geom_rgba"}
     assert looks.changed() is None, "what a reset has told is no news"
-
-
-def test_not_a_number_is_as_good_as_any_value(model: mujoco.MjModel) -> None:
-    """A NaN that stays is no change."""
-    model.geom_rbound[0] = np.nan
-    looks = following(model)
-    assert looks.changed() is None
-    model.geom_rbound[1] = np.nan
-    assert (looks.changed() or {}).keys() == {"geom_rbound"}
-
-
-def test_the_same_model_in_another_wrapper_is_the_same(
-    model: mujoco.MjModel, looks: Looks
-) -> None:
-    """What counts is the memory, not the Python object."""
-    assert looks.is_of(mujoco.MjData(model).model)
-    assert not looks.is_of(copy.copy(model))
-
-
-def test_a_few_comparisons_do(looks: Looks) -> None:
-    """The structs, a few groups of arrays, camera and option."""
-    assert len(looks.present) < 9
-
-
-def test_arrays_that_do_not_lie_together_are_watched_one_by_one(
-    model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """If a MuJoCo has its arrays here and there it only takes longer."""
-    monkeypatch.setattr(module, "_lie_together", lambda *_: False)
-    looks = following(model)
-    model.site_rgba[0] = 0.125
-    model.opt.timestep = 0.5
-    assert (looks.changed() or {}).keys() == {"site_rgba", "opt.timestep"}
-    assert looks.since_stored().keys() == {"site_rgba", "opt.timestep"}

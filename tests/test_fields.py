@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fields of a model, read and set by their names."""
+"""Fields of a model and of a view, read and set by their names."""
 
 from __future__ import annotations
 
 import copy
+import json
 from typing import Any
 
 import mujoco
@@ -17,6 +18,7 @@ from mjrec.simulation.fields import (
     read_fields,
     struct_names,
 )
+from mjrec.simulation.view import SceneView, view_from_facts
 
 XML = """
 <mujoco>
@@ -35,81 +37,44 @@ def model() -> mujoco.MjModel:
 
 
 def test_what_was_read_can_be_set_in_another_model(model: mujoco.MjModel) -> None:
-    """Arrays and members of structs go from one model to its copy."""
+    """Arrays and members of structs; a single number is an array of no dimension."""
+    assert len(read_fields(model, [*array_names(), *struct_names()])) > 450
     other = copy.copy(model)
     model.site_pos[0] = (1, 2, 3)
     model.tex_data[:] = 7
     model.geom_matid[0] = 1
     model.opt.gravity[:] = 0
     model.opt.timestep = 0.125
-    model.opt.disableflags = 3
     model.vis.headlight.ambient[:] = 0.25
     model.vis.global_.fovy = 60
-    model.stat.extent = 5
     names = ["site_pos", "tex_data", "geom_matid", "opt.gravity", "opt.timestep"]
-    names += ["opt.disableflags", "vis.headlight.ambient", "vis.global_.fovy"]
-    names += ["stat.extent"]
+    names += ["vis.headlight.ambient", "vis.global_.fovy"]
     fields = read_fields(model, names)
+    assert fields["opt.timestep"].shape == ()
     model.site_pos[0] = 9
     apply_fields(other, fields)
     assert other.site_pos.tolist() == [[1, 2, 3]]
-    assert other.vis.global_.fovy == 60
     after = read_fields(other, names)
     for name in names:
         assert np.array_equal(after[name], fields[name]), name
-
-
-def test_a_single_number_is_an_array_without_dimensions(model: mujoco.MjModel) -> None:
-    """So that a recording holds arrays only."""
-    fields = read_fields(model, ["opt.timestep", "vis.global_.offwidth"])
-    assert {value.shape for value in fields.values()} == {()}
-    apply_fields(model, {"vis.global_.offwidth": np.array(123.0)})
-    assert model.vis.global_.offwidth == 123
-
-
-def test_fields_of_the_view_go_to_camera_and_option(model: mujoco.MjModel) -> None:
-    """And are left out where there is no view to set them in."""
-    fields = {
-        "camera.lookat": np.array([1.0, 2, 3]),
-        "camera.type": np.array(1),
-        "option.flags": np.zeros_like(mujoco.MjvOption().flags),
-        "option.label": np.array(2),
-    }
-    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
-    apply_fields(model, fields)
-    apply_fields(model, fields, camera=camera, option=option)
-    assert camera.lookat.tolist() == [1, 2, 3]
-    assert camera.type == 1
-    assert option.label == 2
-    assert not option.flags.any()
-
-
-def test_all_fields_have_names(model: mujoco.MjModel) -> None:
-    """The names come from the bindings, whichever version it is."""
-    assert {"geom_rgba", "tex_data", "hfield_data", "body_mass"} <= {*array_names()}
-    members = {"opt.gravity", "opt.timestep", "vis.rgba.haze", "stat.center"}
-    assert members <= {*struct_names()}
-    assert len(read_fields(model, [*array_names(), *struct_names()])) > 450
 
 
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
         ("site_colour", np.zeros(4), "has no model field 'site_colour'"),
-        ("__class__", np.zeros(1), "has no model field"),
         ("opt.__class__", np.zeros(1), "has no model field"),
-        ("vis.rgba.bv", np.zeros(4), "has no model field"),
         ("site_pos", np.zeros((2, 3)), r"shape \(1, 3\) here"),
         ("opt.timestep", np.zeros(2), r"shape \(\) here"),
         ("site_pos", np.array([["a", "b", "c"]]), "belongs to another model"),
         ("geom_dataid", np.array([7]), "what the model consists of"),
-        ("body_geomadr", np.array([7]), "what the model consists of"),
         ("geom_type", np.array([7]), "what the model consists of"),
         ("geom_matid", np.array([2]), "indices from -1 to 1"),
         ("geom_matid", np.array([-2]), "indices from -1 to 1"),
         ("geom_matid", np.array([np.nan]), "whole numbers"),
         ("vis.quality.shadowsize", np.array(np.nan), "whole numbers"),
         ("vis.quality.shadowsize", np.array(2**40), "cannot be 1099511627776"),
+        ("option.label", np.array(1 << 30), "has to be from 0 to"),
     ],
 )
 def test_what_cannot_be_set_is_refused(
@@ -117,4 +82,56 @@ def test_what_cannot_be_set_is_refused(
 ) -> None:
     """A file may name anything: MuJoCo would read foreign memory at a wrong index."""
     with pytest.raises(InvalidArgument, match=words):
-        apply_fields(model, {name: value})
+        apply_fields(model, {name: value}, option=mujoco.MjvOption())
+
+
+@pytest.fixture
+def view() -> SceneView:
+    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+    camera.lookat[:] = (0.1, 1 / 3, -7)
+    camera.fixedcamid = 4
+    option.flags[int(mujoco.mjtVisFlag.mjVIS_RANGEFINDER)] = False
+    option.label = 3
+    more = {"max_geom": 1000, "fresh": True, "height": 48, "width": 64}
+    return SceneView(camera=camera, option=option, label="side", **more)
+
+
+def test_facts_are_json_and_come_back_as_the_same_view(view: SceneView) -> None:
+    """To the last bit, and with every member there is."""
+    facts = json.loads(json.dumps(view.facts()))
+    again = view_from_facts(facts)
+    assert again.camera.lookat.tobytes() == view.camera.lookat.tobytes()
+    assert again.option.flags.tolist() == view.option.flags.tolist()
+    assert again.facts() == facts
+    assert {"flags", "label", "frame", "bvh_depth"} <= facts["option"].keys()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("camera", None),
+        ("camera", {"type": 0}),
+        ("max_geom", 0),
+        ("max_geom", 1 << 40),
+        ("height", "48"),
+        ("camera.lookat", [0, 1]),
+        ("camera.lookat", ["a", "b", "c"]),
+        ("camera.type", None),
+        ("option.flags", [True]),
+        ("option.label", -1),
+        ("option.frame", 0.5),
+        ("option.frame", 1 << 30),
+    ],
+)
+def test_facts_that_cannot_be_are_refused_by_name(
+    view: SceneView, name: str, value: Any
+) -> None:
+    """They may come from a file."""
+    facts = view.facts()
+    struct, _, member = name.partition(".")
+    if member:
+        facts[struct][member] = value
+    else:
+        facts[struct] = value
+    with pytest.raises(InvalidArgument, match=name):
+        view_from_facts(facts)

@@ -70,12 +70,3 @@ def test_what_is_in_flight_is_read_directly(tmp_path: Path, started: list[str]) 
     """Nothing in a log is packed."""
     mjrec.load_trajectory(write_log(tmp_path))
     assert started == []
-
-
-def test_in_a_sandbox_there_is_no_other(
-    tmp_path: Path, started: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Verifying reads in one already."""
-    monkeypatch.setenv("MJREC_SANDBOX", "1")
-    mjrec.load_trajectory(finished(tmp_path))
-    assert started == []

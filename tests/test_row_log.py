@@ -88,14 +88,6 @@ def test_rows_are_there_when_they_are_counted_and_when_all_is_closed(
     assert names(path.parent) == [path.name]
 
 
-def killed_in_a_row(log: RowLog) -> None:
-    """With half of it filled."""
-    if log.count == 3 * CAPACITY + 2:
-        log.make_room()
-        log.slots[log.count % CAPACITY, : WORDS // 2] = 5
-        kill_self()
-
-
 def killed_in_the_middle_of_a_write(log: RowLog) -> None:
     """With some rows of a full tail in the log, and half of one."""
     if log.count == 3 * CAPACITY:
@@ -135,7 +127,7 @@ def killed_in_a_close(log: RowLog) -> None:
 
 
 MOMENTS = [
-    *(killed_in_a_row, killed_in_the_middle_of_a_write, killed_after_a_write),
+    *(killed_in_the_middle_of_a_write, killed_after_a_write),
     *(killed_in_the_next_slot, killed_in_a_close),
 ]
 
@@ -159,63 +151,6 @@ def test_a_killed_process_loses_no_counted_row(
     # Without a tail a row counts as soon as it is in the log.
     is_written = not mapped and moment is killed_after_a_write
     check(path, counted + is_written)
-
-
-def test_a_reader_beside_a_writer_never_sees_a_wrong_row(path: Path) -> None:
-    """Whatever the tail does between any two of its looks."""
-    count = 60_000
-
-    def record(_: Callable[[], object]) -> None:
-        while not path.with_suffix(".go").exists():
-            pass
-        add(log, count)
-        log.close()
-        os._exit(0)
-
-    log = RowLog(path, WORDS, tail_bytes=SMALL)
-    process = os.fork()
-    if process == 0:
-        try:
-            record(lambda: None)
-        finally:
-            os._exit(1)
-    reader = RowLogReader(path, SIZE)
-    path.with_suffix(".go").touch()
-    seen = looks = 0
-    while seen < count:
-        before, seen = seen, reader.count
-        assert before <= seen <= count
-        # Some of them are about to be written over.
-        for first in (before, max(0, seen - CAPACITY - 2), max(0, seen - 3)):
-            found = reader.read(first, seen).view(np.uint64)
-            np.testing.assert_array_equal(found, rows(first, seen))
-        looks += seen > before
-    assert os.waitpid(process, 0)[1] == 0
-    assert looks > 10
-    reader.close()
-    log.release()
-    check(path, count)
-
-
-def test_only_file_systems_that_are_known_are_mapped(path: Path) -> None:
-    """That of processes is none of these; that in memory is."""
-    found = {}
-    for name in ("/proc/self/status", "/dev/shm"):
-        descriptor = os.open(name, os.O_RDONLY)
-        found[name] = row_log._may_be_mapped(descriptor)
-        os.close(descriptor)
-    assert found == {"/proc/self/status": False, "/dev/shm": True}
-
-
-def test_a_full_disk_is_an_error_when_the_tail_is_made(path: Path) -> None:
-    """And no SIGBUS later; nothing is left, and it can be tried again."""
-    with (
-        file_size_limit(TAIL_HEAD),
-        pytest.raises(FileNotWritten, match=rf"{path.name}: File too large"),
-    ):
-        RowLog(path, WORDS)
-    assert list(path.parent.iterdir()) == []
-    RowLog(path, WORDS).close()
 
 
 def test_a_full_disk_costs_no_row_where_nothing_is_mapped(
@@ -263,34 +198,6 @@ def test_an_interrupted_write_is_taken_up_again(
     check(path, 3 * CAPACITY)
 
 
-def set_counter(path: Path, count: int) -> None:
-    with tail_path(path).open("r+b") as tail:
-        tail.write(struct.pack("=Q", count))
-
-
-@pytest.mark.parametrize("count", [0, 2 * CAPACITY - 1])
-def test_rows_of_the_log_count_beyond_a_stale_counter(path: Path, count: int) -> None:
-    """After a crash of the machine the tail may be older than the log."""
-    log = RowLog(path, WORDS, tail_bytes=SMALL)
-    add(log, 2 * CAPACITY)
-    log.make_room()
-    set_counter(path, count)
-    check(path, 2 * CAPACITY)
-
-
-@pytest.mark.parametrize("count", [3 * CAPACITY, 1 << 40, (1 << 64) - 1])
-def test_a_counter_beyond_what_can_be_is_not_believed(path: Path, count: int) -> None:
-    """No memory is taken for what is not there, and what is there is read."""
-    log = RowLog(path, WORDS, tail_bytes=SMALL)
-    add(log, CAPACITY + 5)
-    set_counter(path, count)
-    reader = RowLogReader(path, SIZE)
-    assert reader.count == 2 * CAPACITY
-    found = reader.read(0, CAPACITY + 5).view(np.uint64)
-    np.testing.assert_array_equal(found, rows(0, CAPACITY + 5))
-    reader.close()
-
-
 @pytest.mark.parametrize(
     "head",
     [
@@ -310,17 +217,3 @@ def test_a_tail_of_something_else_is_passed_over(path: Path, head: bytes) -> Non
     log.close()
     tail_path(path).write_bytes(head.ljust(len(head) and TAIL_HEAD + SMALL, b"\0"))
     check(path, 5)
-
-
-def test_a_log_that_was_cut_is_an_error(path: Path) -> None:
-    """Of the rows that are not there any more."""
-    log = RowLog(path, WORDS)
-    add(log, 9)
-    log.close()
-    reader = RowLogReader(path, SIZE)
-    os.truncate(path, 5 * SIZE + 1)
-    assert reader.count == 5
-    np.testing.assert_array_equal(reader.read(0, 5).view(np.uint64), rows(0, 5))
-    with pytest.raises(ValueError, match="last rows are not there"):
-        reader.read(4, 6)
-    reader.close()

@@ -7,7 +7,6 @@ import copy
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from mjrec.errors import InvalidArgument
 from mjrec.formats.trajectory import packed
 from mjrec.simulation import self_check
 from mjrec.simulation.captured_arrays import (
-    has_limited_tendons,
     needs_constraints,
     read_state,
     snapshot_dtype,
@@ -235,37 +233,6 @@ def test_a_skin_is_restored() -> None:
     assert any("skin" in text for text in differences_of(model, data, drop="xquat"))
 
 
-@pytest.mark.parametrize("name", ["HalfCheetah-v5", "Humanoid-v5"])
-def test_an_environments_picture_lags_its_state_and_is_restored(name: str) -> None:
-    """After a step the positions belong to the state before its last substep."""
-    with gymnasium.make(name) as env:
-        env.reset(seed=1)
-        for _ in range(5):
-            env.step(env.action_space.sample())
-        simulation: Any = env.unwrapped
-        assert differences_of(simulation.model, simulation.data) == []
-
-
-@pytest.mark.parametrize(
-    ("xml", "field"),
-    [
-        (TENDONS, "tendon_rgba"),
-        (TENDONS, "ten_length"),
-        (TENDONS, "wrap_xpos"),
-        (SENSORS, "sensordata"),
-        (FLEX, "flexvert_xpos"),
-        (THINGS, "geom_xmat"),
-        (THINGS, "light_xdir"),
-    ],
-)
-def test_what_a_snapshot_holds_is_needed(xml: str, field: str) -> None:
-    """Without one of its arrays the scene is another one: the test above can fail."""
-    model, data = simulated(xml)
-    if field == "tendon_rgba" and not has_limited_tendons(model):
-        pytest.skip("this MuJoCo mixes no colours")
-    assert differences_of(model, data, drop=field)
-
-
 FLAGS = [[name] for name in mujoco.mjtVisFlag.__members__][:-1]
 # Flags that show something only together with another one.
 FLAGS += [["mjVIS_ACTUATOR", "mjVIS_ACTIVATION"], ["mjVIS_INERTIA", "mjVIS_SCLINERTIA"]]
@@ -292,32 +259,6 @@ def test_every_flag_frame_and_label_is_exact_or_refused(shown: list[str]) -> Non
         assert differences_of(model, data, option) == []
     else:
         assert shown[0] in reason
-
-
-def test_joints_are_shown_where_none_has_a_limit() -> None:
-    """Only the colour of a joint at its limit comes from the constraints."""
-    option = mujoco.MjvOption()
-    option.flags[int(mujoco.mjtVisFlag.mjVIS_JOINT)] = True
-    model, data = simulated(THINGS)
-    assert needs_constraints(model, option) is None
-    assert differences_of(model, data, option) == []
-    model.jnt_limited[0] = True
-    assert "mjVIS_JOINT" in (needs_constraints(model, option) or "")
-
-
-def test_what_is_refused_could_not_be_exact() -> None:
-    """Contacts are gone in fresh data: the refusal has a reason."""
-    option = mujoco.MjvOption()
-    option.flags[int(mujoco.mjtVisFlag.mjVIS_CONTACTPOINT)] = True
-    assert differences_of(*simulated(THINGS), option)
-
-
-def test_a_snapshot_has_what_the_model_has() -> None:
-    """Nothing empty is in it, and skins, rays and tendons add what they need."""
-    assert {*(snapshot_dtype(*simulated(THINGS)).names or ())} == {
-        *("geom_xpos", "geom_xmat", "site_xpos", "site_xmat"),
-        *("cam_xpos", "cam_xmat", "light_xpos", "light_xdir", "subtree_com"),
-    }
 
 
 def test_a_tendons_spring_that_has_yielded_is_restored() -> None:
@@ -399,18 +340,6 @@ def test_a_slack_cable_is_not_mixed_although_its_limit_is_active() -> None:
     check_like_drawn(model, data)
 
 
-def test_only_limited_spatial_tendons_without_material_have_other_colours() -> None:
-    """A model without any needs no colours recorded."""
-    joint = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body>
-    </worldbody><tendon><fixed limited="true" range="0 1"><joint joint="j" coef="1"/>
-    </fixed></tendon></mujoco>"""
-    assert not has_limited_tendons(mujoco.MjModel.from_xml_string(joint))
-    assert not has_limited_tendons(hanging("<spatial")[0])
-    assert not has_limited_tendons(hanging(f'{LIMITED} material="m"')[0])
-    assert not has_limited_tendons(mujoco.MjModel.from_xml_string("<mujoco/>"))
-    assert has_limited_tendons(hanging("<spatial", LIMITED)[0])
-
-
 # --- the check that a snapshot suffices ----------------------------------------------
 
 
@@ -423,6 +352,8 @@ def test_only_limited_spatial_tendons_without_material_have_other_colours() -> N
         (THINGS, "cam_xpos", "pos of light 0"),
         (FLEX, "flexvert_xpos", "pos of geom"),
         (TENDONS, "wrap_xpos", "geoms instead of"),
+        (TENDONS, "tendon_rgba", "rgba of geom"),
+        (SENSORS, "sensordata", "geom"),
     ],
 )
 def test_a_field_that_is_forgotten_is_noticed(xml: str, field: str, words: str) -> None:

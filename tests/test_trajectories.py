@@ -187,18 +187,6 @@ def test_each_state_follows_from_the_one_before(
         np.testing.assert_array_equal(state(model, data), trajectory.states[k + 1])
 
 
-def test_the_warm_start_is_part_of_the_state(tmp_path: Path) -> None:
-    """Without it the heap goes on otherwise: what the test above is worth."""
-    trajectory = mjrec.load_trajectory(Recording(tmp_path, model_of("heap")).path)
-    model = trajectory.model()
-    data = mujoco.MjData(model)
-    trajectory.set_state(data, 5)
-    data.qacc_warmstart[:] = 0
-    data.ctrl[:] = trajectory.component("ctrl")[6]
-    mujoco.mj_step(model, data, nstep=SUBSTEPS)
-    assert (state(model, data) != trajectory.states[6]).any()
-
-
 def test_the_model_is_that_of_the_step(tmp_path: Path) -> None:
     """Step 0 is what the reset set; later changes hold from their steps on."""
     model = model_of("heap")
@@ -231,51 +219,6 @@ def test_steps_that_are_not_there_are_refused(tmp_path: Path) -> None:
             trajectory.model(step)
 
 
-def test_data_of_another_model_is_refused(tmp_path: Path) -> None:
-    """Nothing is set in it."""
-    trajectory = mjrec.load_trajectory(Recording(tmp_path, model_of("heap")).path)
-    data = mujoco.MjData(model_of("half_cheetah"))
-    with pytest.raises(InvalidArgument, match="qpos: 15, and this model has 9"):
-        trajectory.set_state(data, 0)
-
-
-def test_a_killed_recording_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
-    """To its last whole row, and it is incomplete."""
-    recording = Recording(tmp_path, model_of("heap"))
-    [spans], [rows] = tmp_path.glob("*.spans"), tmp_path.glob("*.log")
-    spans.write_bytes(spans.read_bytes()[: spans.read_bytes().index(b'{"end"')])
-    rows.write_bytes(rows.read_bytes()[: rows.stat().st_size // 2])
-    trajectory = mjrec.load_trajectory(recording.path)
-    assert not trajectory.complete
-    assert len(trajectory.states) == 6
-    np.testing.assert_array_equal(trajectory.states, recording.states[:6])
-    assert trajectory.frame_steps.tolist() == [0, 2, 4]
-    assert "incomplete" in repr(trajectory)
-
-
-def test_rows_that_never_reached_the_disk_are_counted(tmp_path: Path) -> None:
-    """As after a crash of the machine: pages without what was written into them."""
-    recording = Recording(tmp_path, model_of("heap"))
-    [rows] = tmp_path.glob("*.log")
-    whole = bytearray(rows.read_bytes())
-    size = len(whole) // 13
-    whole[9 * size : 10 * size] = bytes(size)
-    rows.write_bytes(whole)
-    trajectory = mjrec.load_trajectory(recording.path)
-    assert len(trajectory.states) == 9
-    assert trajectory.dropped == 4
-
-
-def test_a_log_that_was_finished_meanwhile_goes_on(tmp_path: Path) -> None:
-    """Snapshots and model changes are read late."""
-    recording = Recording(tmp_path, model_of("heap"))
-    trajectory = mjrec.load_trajectory(recording.path)
-    finished(recording)
-    assert not list(tmp_path.glob("*.states.*"))
-    assert len(trajectory.snapshots["geom_xpos"]) == 7
-    assert trajectory.model().ngeom == 4
-
-
 def test_a_recording_without_a_simulation_has_no_model(tmp_path: Path) -> None:
     """Its rewards are there all the same."""
     logs, name = new_logs(tmp_path), trajectory_prefix(INFIX, 0)
@@ -297,18 +240,6 @@ def test_a_directory_is_answered_with_what_is_in_it(tmp_path: Path) -> None:
     name = Recording(tmp_path, model_of("heap")).path.name
     with pytest.raises(InvalidArgument, match=f"Name one of .*: {name}\\."):
         mjrec.load_trajectory(tmp_path)
-
-
-@pytest.mark.parametrize("content", [None, b"", b"something else"])
-def test_what_is_no_trajectory_is_one_clear_error(
-    tmp_path: Path, content: bytes | None
-) -> None:
-    """It names the file."""
-    path = tmp_path / "openaigym.trajectory.0.7.episode000000.h5"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(UnreadableFile, match=path.name):
-        mjrec.load_trajectory(path)
 
 
 def test_reading_needs_no_simulator(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import random
 import re
 import shutil
 import signal
@@ -33,12 +32,11 @@ from trajectories_by_hand import new_logs
 from trajectory_contents import TrajectoryContent, content_of
 
 import mjrec.formats.trajectory_file as trajectory_file
-from mjrec.errors import ClosedError, FileNotWritten, InvalidArgument, UnreadableFile
+from mjrec.errors import FileNotWritten, UnreadableFile
 from mjrec.formats import trajectory_hdf5
 from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import ModelChange, added_up, packed, row_dtype
 from mjrec.formats.trajectory_file import (
-    find_trajectory,
     finish_trajectory,
     open_trajectory,
 )
@@ -130,24 +128,13 @@ def test_an_episode_that_was_killed_says_so(path: Path) -> None:
     assert read(finish_trajectory(path, facts=known)).facts == {**FACTS, **known}
 
 
-def test_ranges_of_snapshots_are_the_same_in_both_forms(path: Path) -> None:
-    """Nothing is read beyond their number."""
-    record(path, 200)
-    with open_trajectory(path) as reader:
-        rows = reader.snapshots(0, 201)
-    with open_trajectory(finish_trajectory(path)) as reader:
-        for start, stop in [(0, 0), (0, 8), (30, 34), (70, 102), (200, 201)]:
-            part = reader.snapshots(start, stop)
-            assert part.tobytes() == rows[start:stop].tobytes()
-        with pytest.raises(InvalidArgument, match="has 201 snapshots"):
-            reader.snapshots(200, 202)
-
-
 def test_plain_h5py_finds_every_array_by_its_name(path: Path) -> None:
     """With the format of HDF5 1.10, and no filter that is not built in."""
     record(path)
     content = read(path)
-    with h5py.File(finish_trajectory(path)) as file:
+    finish_trajectory(path)
+    # HDF5 refuses a file that is open in one process in two different ways.
+    with open_trajectory(path), h5py.File(path) as file, open_trajectory(path):
         assert set(file) == {
             *("states", "actions", "rewards", "terminated", "truncated"),
             *("observations", "frame_steps", "snapshots", "model_changes"),
@@ -174,16 +161,6 @@ def test_the_same_log_makes_the_same_file(path: Path, tmp_path: Path) -> None:
     record(path)
     other = shutil.copytree(tmp_path, tmp_path / "copy") / path.name
     assert finish_trajectory(path).read_bytes() == finish_trajectory(other).read_bytes()
-
-
-def test_the_user_may_have_the_file_open_as_well(path: Path) -> None:
-    """HDF5 refuses a file that is open in one process in two different ways."""
-    record(path)
-    finish_trajectory(path)
-    with h5py.File(path), open_trajectory(path) as reader:
-        assert reader.frame_count == 41
-    with open_trajectory(path), h5py.File(path) as file:
-        assert len(file["frame_steps"]) == 41
 
 
 def test_the_example_of_the_specification_runs(
@@ -309,41 +286,10 @@ def test_a_killed_finish_is_done_again(path: Path, where: str) -> None:
     assert process.returncode == -signal.SIGKILL
     assert len(list(list_paths(path.parent))) == 1
     assert path.exists() == (where == "before the removal")
-    found = finish_trajectory(path).stat()
+    found = finish_trajectory(path).stat().st_mtime_ns
     check(read(path), 40)
-    assert finish_trajectory(path).stat() == found
+    assert finish_trajectory(path).stat().st_mtime_ns == found
     assert list(list_paths(path.parent)) == []
-
-
-def test_the_file_of_an_episode_is_found(path: Path, tmp_path: Path) -> None:
-    """Whether it is in flight still or finished; else nothing. A name may be any."""
-    assert find_trajectory(tmp_path, INFIX, 27) is None
-    record(path)
-    assert find_trajectory(tmp_path, INFIX, 27) == path
-    finish_trajectory(path)
-    assert find_trajectory(tmp_path, "0.1", 27) == path
-    assert find_trajectory(tmp_path, INFIX, 28) is None
-    assert find_trajectory(tmp_path, "nonsense", 27) is None
-    check(read(Path(shutil.copy(path, tmp_path / "renamed"))), 40)
-
-
-@pytest.mark.parametrize("is_finished", [True, False])
-def test_a_closed_file_says_so(path: Path, is_finished: bool) -> None:
-    """Closing is idempotent; what is in memory stays."""
-    record(path)
-    if is_finished:
-        finish_trajectory(path)
-    reader = open_trajectory(path)
-    reader.close()
-    reader.close()
-    assert reader.step_count == 40
-    for use in (
-        lambda: reader.states(0, 1),
-        lambda: reader.snapshots(0, 1),
-        lambda: reader.model_changes,
-    ):
-        with pytest.raises(ClosedError, match="is closed"):
-            use()
 
 
 def attribute(name: str, value: Any) -> Callable[[h5py.File], None]:
@@ -409,28 +355,6 @@ def test_a_file_of_another_making_is_refused(
     with pytest.raises(UnreadableFile, match=reason) as error:
         read(path)
     assert error.value.path == path
-
-
-def test_damage_is_noticed(path: Path) -> None:
-    """So is a missing end; or it is a byte that nothing depends on."""
-    record(path)
-    finish_trajectory(path)
-    data = path.read_bytes()
-    for size in [*range(0, 200, 20), len(data) // 2, len(data) - 1]:
-        path.write_bytes(data[:size])
-        with pytest.raises(UnreadableFile, match=path.name):
-            read(path)
-    chance = random.Random(1)
-    for _ in range(60):
-        damaged = bytearray(data)
-        damaged[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
-        path.write_bytes(damaged)
-        try:
-            again = read(path)
-        except UnreadableFile:
-            continue
-        check(again, 40)
-        assert again.facts == {**FACTS, "complete": True, "length": 40}
 
 
 def test_rewards_are_added_up_one_after_the_other() -> None:

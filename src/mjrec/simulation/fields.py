@@ -80,9 +80,22 @@ def read_member(struct: object, name: str) -> NDArray[Any]:
     return np.array(getattr(*holder_of(struct, name)))
 
 
-def read_fields(model: mujoco.MjModel, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Return copies of fields of a model; single numbers as arrays of no dimension."""
-    return {name: read_member(model, name) for name in names}
+def read_fields(
+    model: mujoco.MjModel, names: Iterable[str], **view: Any
+) -> dict[str, NDArray[Any]]:
+    """Return copies of fields; single numbers as arrays of no dimension.
+
+    Args:
+        model: the model.
+        names: of its fields, or those that begin with `camera.` and `option.`.
+        view: the `camera` and the `option`.
+    """
+    values = {}
+    for name in names:
+        struct, _, member = name.partition(".")
+        holder, own = (view[struct], member) if struct in view else (model, name)
+        values[name] = read_member(holder, own)
+    return values
 
 
 def apply_fields(
@@ -137,6 +150,12 @@ _INDICES = {
     ),
     "mat_texid": "ntex",
     "light_texid": "ntex",
+}
+
+# The visualiser looks these up in tables of its own, without a look at their bounds.
+_KINDS = {
+    "option.label": int(mujoco.mjtLabel.mjNLABEL),
+    "option.frame": int(mujoco.mjtFrame.mjNFRAME),
 }
 
 # Where a model's files were when it was compiled, and a checksum that nothing here
@@ -253,6 +272,11 @@ def _set(struct: Any, name: str, value: NDArray[Any], *, field: str) -> None:
                 f"model, and the recorded one has some from {value.min()} to "
                 f"{value.max()}."
             )
+    if field in _KINDS and value.item() not in range(_KINDS[field]):
+        raise InvalidArgument(
+            f"The field {field} has to be from 0 to {_KINDS[field] - 1} in MuJoCo "
+            f"{mujoco.__version__}, got {value}."
+        )
     if isinstance(present, np.ndarray):
         present[...] = value
         return

@@ -16,18 +16,12 @@ import mujoco
 import numpy as np
 
 from ..errors import InvalidArgument
-from .fields import member_names, read_member
+from .fields import apply_fields, empty_model, member_names, read_member
 
 # A scene's memory is a quarter of a kilobyte for each.
 _MOST_GEOMS = 1 << 20
 # OpenGL's own limits are below it.
 _LARGEST = 1 << 16
-
-# The visualiser looks these up in tables of its own, without a look at their bounds.
-_KINDS = {
-    "label": int(mujoco.mjtLabel.mjNLABEL),
-    "frame": int(mujoco.mjtFrame.mjNFRAME),
-}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,12 +68,19 @@ def view_from_facts(facts: Mapping[str, Any]) -> SceneView:
         InvalidArgument: something is missing, or is not what it should be; the facts
             may come from a file.
     """
-    camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
-    _set_struct(camera, facts.get("camera"), "camera")
-    _set_struct(option, facts.get("option"), "option")
+    structs = {"camera": mujoco.MjvCamera(), "option": mujoco.MjvOption()}
+    fields = {}
+    for what, struct in structs.items():
+        values, names = facts.get(what), _names(struct.__class__)
+        if not isinstance(values, Mapping) or values.keys() != {*names}:
+            raise InvalidArgument(
+                f"A {what} needs exactly these values: {', '.join(names)}; "
+                f"got {values!r:.200}."
+            )
+        fields.update({f"{what}.{name}": np.asarray(values[name]) for name in names})
+    apply_fields(empty_model(), fields, **structs)
     return SceneView(
-        camera=camera,
-        option=option,
+        **structs,
         max_geom=_whole(facts, "max_geom", most=_MOST_GEOMS),
         fresh=facts.get("fresh") is True,
         height=_whole(facts, "height"),
@@ -173,34 +174,6 @@ def _struct_facts(struct: Any) -> dict[str, Any]:
     return {
         name: read_member(struct, name).tolist() for name in _names(struct.__class__)
     }
-
-
-def _set_struct(struct: Any, values: object, what: str) -> None:
-    names = _names(struct.__class__)
-    if not isinstance(values, Mapping) or values.keys() != set(names):
-        raise InvalidArgument(
-            f"A {what} needs exactly these values: {', '.join(names)}; "
-            f"got {values!r:.200}."
-        )
-    for name in names:
-        _set_member(struct, name, values[name], what)
-
-
-def _set_member(struct: object, name: str, value: Any, what: str) -> None:
-    present = getattr(struct, name)
-    given = np.asarray(value)
-    if given.dtype.kind not in "iuf" or given.shape != np.shape(present):
-        raise InvalidArgument(
-            f"{name} of a {what} has to be numbers of the shape {np.shape(present)} in "
-            f"MuJoCo {mujoco.__version__}, got {value!r:.200}."
-        )
-    if name in _KINDS and given.item() not in range(_KINDS[name]):
-        raise InvalidArgument(
-            f"{name} of a {what} has to be from 0 to {_KINDS[name] - 1} in MuJoCo "
-            f"{mujoco.__version__}, got {value!r:.200}."
-        )
-    is_array = isinstance(present, np.ndarray)
-    _assign(struct, name, given if is_array else type(present)(given.item()))
 
 
 def _whole(facts: Mapping[str, Any], name: str, *, most: int = _LARGEST) -> int:
