@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from mjrec.engines.jobs import Job, Run, Work
 from mjrec.engines.local import LocalEngine
-from mjrec.engines.work import Job, Work
 
 from .children import call
 from .process_memory import peak_memory
@@ -97,7 +97,7 @@ def hand_out(workers: int, jobs: int) -> list[float]:
     """Return seconds to the first outcome, outcomes per second, and MB of a worker."""
     start = time.perf_counter()
     work = Work(entry=f"{__name__}:{Idle.__name__}")
-    with LocalEngine(workers).begin(work) as run:
+    with Run(LocalEngine(workers), work) as run:
         run.submit(Job(key="first", arguments={}))
         outcome = next(iter(run.results()))
         assert outcome is not None

@@ -1,12 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tests do with a run, of whichever engine."""
+"""What tests do with a run, on whichever engine."""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import select
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
-from mjrec.engines.work import Job, JobOutcome, Run
+from mjrec.engines.jobs import Job, JobOutcome, Run, Work
+
+
+def odd_work(
+    make: str = "make", *, shared: Path | None = None, **settings: Any
+) -> Work:
+    """Return work of `odd_jobs`."""
+    return Work(entry=f"odd_jobs:{make}", settings=settings, shared_directory=shared)
 
 
 def submit(run: Run, *jobs: str, **arguments: Any) -> None:
@@ -35,6 +47,30 @@ def wait_for(path: Path, run: Run) -> int:
     return int(path.read_text())
 
 
+def wait_for_end(pid: int) -> None:
+    """Wait until a process that need not be a child is gone."""
+    with contextlib.suppress(ProcessLookupError):
+        descriptor = os.pidfd_open(pid)
+        ready, _, _ = select.select([descriptor], [], [], 30)
+        os.close(descriptor)
+        assert ready, f"process {pid} goes on"
+
+
 def lines(path: Path) -> list[str]:
     """Return the lines of a file; none where there is no file."""
     return path.read_text().splitlines() if path.exists() else []
+
+
+def run_python(*arguments: str, text: str | None = None, **environ: str) -> str:
+    """Run Python, which finds these helpers, and return what it prints."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", *arguments],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent), **environ},
+        input=text,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout

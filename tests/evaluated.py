@@ -10,7 +10,7 @@ from typing import Any
 
 from recordings import in_flight
 
-from mjrec.engines.work import AGAIN
+from mjrec.engines.worker import AGAIN
 from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.worker import EvaluationWorker

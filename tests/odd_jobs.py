@@ -167,3 +167,14 @@ def make_and_be_told_to_end(
 
     type("Imported", (), {"part": Ends()})
     return OddJobs(settings, payload)
+
+
+def make_and_die_at_first(
+    settings: Mapping[str, Any], payload: bytes | None
+) -> OddJobs:
+    """Two die as they begin, each with a file of its own; others do their jobs."""
+    for number in range(2):
+        with contextlib.suppress(FileExistsError):
+            Path(settings["deaths"], str(number)).touch(exist_ok=False)
+            os._exit(3)
+    return OddJobs(settings, payload)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import re
 from collections.abc import Iterator
@@ -37,6 +38,22 @@ def home_for_ray(home: Path) -> Iterator[None]:
     wait_until(
         lambda: not ray_processes(mark), seconds=30, told=lambda: ray_processes(mark)
     )
+
+
+@contextlib.contextmanager
+def own_ray(*, cpus: int) -> Iterator[Any]:
+    """Have a Ray that this process has started for itself."""
+    ray.init(
+        address="local",
+        num_cpus=cpus,
+        include_dashboard=False,
+        object_store_memory=SMALL_STORE,
+        logging_level=logging.ERROR,
+    )
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
 
 
 @contextlib.contextmanager

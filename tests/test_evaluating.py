@@ -10,9 +10,10 @@ import random
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, Future
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,6 @@ from mjrec import (
     PolicyError,
     UnknownName,
 )
-from mjrec.engines.work import Job, JobOutcome, Work
 from mjrec.evaluation import evaluating
 from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
@@ -189,44 +189,28 @@ def test_an_engine_changes_nothing(tmp_path: Path, engine: Any) -> None:
         }
 
 
-class Wandering:
-    """An engine whose worker does each job as on a machine with another home.
+class Wandering(Executor):
+    """An executor whose worker does each job as on a machine with another home.
 
     Args:
         homes: where these are.
     """
 
-    workers = 1
-    unfinished = 0
-
     def __init__(self, homes: Path) -> None:
         self.homes = homes
-        self.jobs: list[Job] = []
+        self.worker: EvaluationWorker | None = None
 
-    def begin(self, work: Work) -> Self:
-        settings = json.loads(json.dumps(work.settings))
-        self.worker = EvaluationWorker(settings, work.payload)
-        return self
-
-    def submit(self, job: Job) -> None:
-        self.jobs.append(job)
-
-    def results(self, *, patience_s: float | None = None) -> Iterator[JobOutcome]:
-        while self.jobs:
-            job = self.jobs.pop(0)
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setenv("XDG_STATE_HOME", str(self.homes / job.key))
-                value = self.worker(json.loads(json.dumps(job.arguments)))
-            yield JobOutcome(key=job.key, value=json.loads(json.dumps(value)))
-
-    def cancel(self) -> None:
-        self.worker.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.cancel()
+    def submit(
+        self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
+    ) -> Future[Any]:
+        [message] = json.loads(json.dumps(args))
+        if self.worker is None:
+            self.worker = EvaluationWorker(message["work"]["settings"], None)
+        future: Future[Any] = Future()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("XDG_STATE_HOME", str(self.homes / message["key"]))
+            future.set_result({"value": self.worker(message["arguments"])})
+        return future
 
 
 @pytest.mark.dm_control

@@ -51,8 +51,8 @@ CONFINED = {
     "scipy": {"evaluation"},
     "matplotlib": {"reporting"},
     "rich": {"commands", "monitors"},
-    "ray": {"engines.ray_connection", "engines.ray_worker"},
-    "submitit": {"engines.slurm_jobs"},
+    "ray": {"engines.ray"},
+    "submitit": {"engines.slurm_arrays", "engines.slurm_cluster"},
 }
 
 HEAVY = (

@@ -15,9 +15,8 @@ import pytest
 from slurm_cluster import slurm_cluster
 from waiting import wait_until
 
-from mjrec.engines.job_folder import Pace
+from mjrec.engines.jobs import WORK_FOLDER, Job, Run, Work
 from mjrec.engines.slurm import SlurmEngine
-from mjrec.engines.work import WORK_FOLDER, Job, Run, Work
 from mjrec.errors import Error
 
 pytest.importorskip("submitit")
@@ -49,9 +48,7 @@ def asked(*command: str) -> str:
 
 
 def engine(workers: int = 1, **options: Any) -> SlurmEngine:
-    made = SlurmEngine(workers, **options)
-    made._pace = Pace(poll_s=0.05, look_s=0.5, beat_s=0.5)
-    return made
+    return SlurmEngine(workers, **options)
 
 
 def work(place: Path) -> Work:
@@ -86,15 +83,16 @@ def slurm_job() -> str:
 
 def test_jobs_are_done_in_slurm_jobs(tmp_path: Path) -> None:
     """Which are submitted as one array, and have completed at the end."""
-    with engine(3).begin(work(tmp_path)) as run:
+    with Run(engine(3), work(tmp_path)) as run:
         for number in range(50):
             run.submit(Job(key=str(number), arguments={"do": "where"}))
         found = [outcome for outcome in run.results() if outcome is not None]
-        submitted = {path.name for path in (tmp_path / "shared").rglob("submitted/*")}
+        [path] = (tmp_path / "shared").rglob("submitted")
+        submitted = set(lines(path))
     assert len(found) == 50
     assert not [outcome.failure for outcome in found if outcome.failure]
     [array] = {number.partition("_")[0] for number in submitted}
-    assert submitted == {f"{array}_{n}" for n in range(3)}
+    assert submitted == {f"{array}_{n}" for n in range(12)}
     states = asked("squeue", "--noheader", "--states=all", "-j", array, "--format=%T")
     assert set(states.split()) == {"COMPLETED"}
     assert not (tmp_path / "shared").exists()
@@ -105,7 +103,7 @@ def test_a_slurm_job_that_is_ended(
     tmp_path: Path, how: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Files are closed where there is time; what it was at is done in another."""
-    with engine(partition="low").begin(work(tmp_path)) as run:
+    with Run(engine(partition="low"), work(tmp_path)) as run:
         run.submit(hold(tmp_path))
         wait_for(tmp_path / "begun", run)
         first = slurm_job()
@@ -130,7 +128,7 @@ def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(
     monkeypatch.setenv("SLURM_JOB_ID", "9999")
     monkeypatch.setenv("SLURM_MEM_PER_GPU", "1")
     made = engine(setup=[f"env > {tmp_path / 'environ'}"])
-    with made.begin(work(tmp_path)) as run:
+    with Run(made, work(tmp_path)) as run:
         run.submit(Job(key="a", arguments={"do": "echo"}))
         assert next(run.results()) is not None
     given = dict(line.partition("=")[::2] for line in lines(tmp_path / "environ"))
@@ -142,7 +140,7 @@ def test_what_the_drivers_slurm_job_was_given_is_not_passed_on(
 
 def test_what_slurm_refuses(tmp_path: Path) -> None:
     """The error has its words."""
-    with engine(partition="none").begin(work(tmp_path)) as run:
+    with Run(engine(partition="none"), work(tmp_path)) as run:
         run.submit(hold(tmp_path))
         with pytest.raises(Error, match=r"No job could be submitted: .*partition"):
             next(run.results())
@@ -152,8 +150,9 @@ DRIVER = """
 import sys
 from pathlib import Path
 import test_slurm_cluster
+from mjrec.engines.jobs import Run
 place = Path(sys.argv[1])
-run = test_slurm_cluster.engine(2).begin(test_slurm_cluster.work(place))
+run = Run(test_slurm_cluster.engine(2), test_slurm_cluster.work(place))
 run.submit(test_slurm_cluster.hold(place))
 next(run.results())
 """
@@ -169,11 +168,10 @@ def test_the_next_driver_ends_what_a_killed_one_has_left(tmp_path: Path) -> None
         until(lambda: lines(tmp_path / "begun"))
         driver.kill()
     [pid] = lines(tmp_path / "begun")
-    with engine().begin(work(tmp_path)) as run:
-        until(lambda: pid in lines(tmp_path / "closed"))
+    with Run(engine(), work(tmp_path)) as run:
         run.submit(Job(key="a", arguments={"do": "echo"}))
         assert next(run.results()) is not None
-        until(lambda: len(asked("squeue", "--noheader").splitlines()) == 1)
+        until(lambda: pid in lines(tmp_path / "closed"))
     assert not (tmp_path / "shared" / WORK_FOLDER).exists()
 
 

@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Literal
 
 import tyro
 
 from ..engines.choice import engine_from
-from ..engines.work import Engine
 from ..errors import InvalidArgument
 from .help_text import flowing_help
 
@@ -40,7 +40,7 @@ class EngineOptions:
     address: str | None = None
     engine_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
 
-    def chosen(self, workers: int | None) -> Engine | None:
+    def chosen(self, workers: int | None) -> Executor | None:
         """Return the engine that was asked for; None where none was.
 
         Args:

@@ -4,14 +4,44 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 
 from ..errors import InvalidArgument, UnknownName
 from .local import LocalEngine
 from .ray import RayEngine
 from .slurm import SlurmEngine
-from .work import Engine
 
 ENGINES = ("local", "ray", "slurm")
+
+
+def given_engine(engine: Executor | str | None, workers: int | None) -> Executor | None:
+    """Return the engine that a caller names or gives; None where there is none.
+
+    Args:
+        engine: an executor, or the name of one of ours.
+        workers: how many it is to have, where it is a name.
+
+    Raises:
+        UnknownName: there is no engine of that name.
+        InvalidArgument: `engine` is none, or `workers` is no number of workers, or
+            contradicts an executor, which has its own.
+        MissingDependency: what the engine needs is not installed.
+    """
+    if engine is None:
+        return None
+    if isinstance(engine, str):
+        return engine_from(engine, workers=workers)
+    if not isinstance(engine, Executor):
+        raise InvalidArgument(
+            "engine is an executor of concurrent.futures, such as mjrec.LocalEngine(), "
+            f"or the name of one of ours, got {engine!r}."
+        )
+    if workers is not None:
+        raise InvalidArgument(
+            f"workers={workers} and engine={engine!r} were given, and an engine has "
+            "workers of its own: say there how many."
+        )
+    return engine
 
 
 def engine_from(
@@ -22,7 +52,7 @@ def engine_from(
     gpus: float = 0.0,
     require_gpu: bool = False,
     options: Mapping[str, str] | None = None,
-) -> Engine:
+) -> Executor:
     """Return an engine.
 
     Args:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What workers get of GPUs."""
+"""How many workers there are, and what each gets of GPUs."""
 
 from __future__ import annotations
 
@@ -72,3 +72,17 @@ class GpuShare:
             )
         sharing = math.floor(1 / self.each + 1e-9)
         return gpus[seat // sharing % len(gpus)]
+
+
+def check_worker_count(workers: int | None) -> int | None:
+    """Return `workers` if it is a number of workers, or None.
+
+    Raises:
+        InvalidArgument: it is something else.
+    """
+    whole = isinstance(workers, int) and not isinstance(workers, bool)
+    if workers is not None and not (whole and workers >= 1):
+        raise InvalidArgument(
+            f"workers must be a whole number of at least 1, got {workers!r}."
+        )
+    return workers

@@ -13,12 +13,14 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..engines.choice import given_engine
+from ..engines.jobs import WORK_FOLDER, Run, Work
 from ..engines.local import LocalEngine
-from ..engines.work import WORK_FOLDER, Engine, Work
 from ..errors import (
     DirectoryInUse,
     DirectoryNotWritable,
@@ -28,7 +30,7 @@ from ..errors import (
 from ..formats.locks import try_lock
 from ..gl.choice import choose
 from ..provenance import versions
-from ..rendering.engine_jobs import environ_for_drawing, given_engine
+from ..rendering.engine_jobs import environ_for_drawing
 from ..simulation.model_trust import stored_models
 from .chosen_videos import ChosenVideos, drawn_by_workers, render_chosen
 from .dataclass_json import to_json
@@ -87,7 +89,7 @@ def evaluate(
     score_ranges: Mapping[str, tuple[float, float]] | None = None,
     bootstrap: Bootstrap | None = None,
     on_progress: _Tell | None = None,
-    engine: Engine | str | None = None,
+    engine: Executor | str | None = None,
 ) -> Evaluation:
     """Run so many episodes of each task, and write down what came of them.
 
@@ -242,7 +244,7 @@ def _folders(plan: EvaluationPlan) -> dict[str, str]:
 
 
 def _run(
-    engine: Engine,
+    engine: Executor,
     plan: EvaluationPlan,
     sent: SentPolicy,
     directory: Path,
@@ -285,17 +287,21 @@ def _run(
         environ=_environ_of_workers(plan, draws=draws),
         shared_directory=directory.absolute(),
     )
-    with engine.begin(work) as run:
+    is_here = isinstance(engine, LocalEngine)
+    # What is quick is done here: nothing has to wait in a cluster's queue.
+    with Run(engine if is_here else LocalEngine(1), work) as home:
         left = [task for task in plan.tasks if _is_left(plan, done[task.name])]
-        checked = check_tasks(run, plan, left)
+        checked = check_tasks(home, plan, left)
         if not is_begun:
             _make(directory)
             stack.enter_context(_held(directory))
         write_plan(directory, plan)
+        run = home if is_here else stack.enter_context(Run(engine, work))
         # Once more: workers of a driver that was killed have gone on until now.
         done = _done(plan, directory, is_begun=is_begun)
         return run_tasks(
             run,
+            home,
             plan,
             directory,
             done=done,

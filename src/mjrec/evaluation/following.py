@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ..child_python import unpacked
-from ..engines.work import Job, JobOutcome, Run
+from ..engines.jobs import Job, JobOutcome, Run, results_of
 from ..errors import EnvironmentNotMade, PicturesDiffer
 from ..formats.monitor_directory import Infix
 from ..rendering.engine_jobs import result_of
@@ -36,6 +36,9 @@ logger = logging.getLogger(__name__)
 
 # How often somebody who waits is told how far it is.
 _PATIENCE_S = 0.25
+
+# Of an engine that does not say how many it has.
+_USUAL_WORKERS = 8
 
 _Tell = Callable[[EvaluationProgress], object]
 _Done = Mapping[str, Mapping[tuple[int, int], EpisodeResult]]
@@ -132,6 +135,7 @@ def check_tasks(
 
 def run_tasks(
     run: Run,
+    home: Run,
     plan: EvaluationPlan,
     directory: Path,
     *,
@@ -144,7 +148,8 @@ def run_tasks(
     """Run all that is not done, and return what came of each task.
 
     Args:
-        run: whose workers are those of `evaluation.worker`.
+        run: runs the episodes and draws.
+        home: does on this machine what is quick; may be the same.
         plan: what is evaluated.
         directory: of the evaluation.
         done: the results of what was done before, by task.
@@ -158,7 +163,7 @@ def run_tasks(
         Error: workers cannot be started, or a ledger is damaged.
     """
     runner = _Runner(
-        run, plan, directory, draws=draws, on_results=on_results, tell=tell
+        run, home, plan, directory, draws=draws, on_results=on_results, tell=tell
     )
     return runner.run(done, checked)
 
@@ -185,6 +190,7 @@ class _Runner:
 
     Args:
         run: see `run_tasks`; so with all of these.
+        home: likewise.
         plan: likewise.
         directory: likewise.
         draws: likewise.
@@ -195,6 +201,7 @@ class _Runner:
     def __init__(
         self,
         run: Run,
+        home: Run,
         plan: EvaluationPlan,
         directory: Path,
         *,
@@ -203,6 +210,7 @@ class _Runner:
         tell: _Tell,
     ) -> None:
         self._run = run
+        self._home = home
         self._plan = plan
         self._directory = directory
         self._draws = draws
@@ -219,7 +227,7 @@ class _Runner:
         batches = batches_of(
             self._plan,
             done,
-            workers=self._run.workers,
+            workers=self._run.workers or _USUAL_WORKERS,
             alone={name for name, of in checked.items() if of.is_drawn_live},
         )
         # What takes long comes first, so that all workers end at about the same time.
@@ -228,7 +236,7 @@ class _Runner:
         for of in self._tasks.values():
             if not of.unfinished:
                 self._complete(of)
-        for outcome in self._run.results(patience_s=_PATIENCE_S):
+        for outcome in results_of(self._run, self._home, patience_s=_PATIENCE_S):
             if outcome is not None:
                 self._take(outcome)
             self._tell(self._progress())
@@ -242,7 +250,8 @@ class _Runner:
 
     def _submit(self, key: str, arguments: Mapping[str, Any]) -> None:
         kind = key.partition("/")[0]
-        self._run.submit(Job(key=key, arguments={"kind": kind, **arguments}))
+        run = self._run if kind in ("run", "draw") else self._home
+        run.submit(Job(key=key, arguments={"kind": kind, **arguments}))
 
     def _take(self, outcome: JobOutcome) -> None:
         kind, folder, *_ = outcome.key.split("/")

@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..child_python import carried
-from ..engines.work import AGAIN
+from ..engines.worker import AGAIN
 from ..errors import Error, GLError
 from ..gl import use_gl
 from ..recorder.options import DEFERRED
@@ -53,7 +53,7 @@ _GL = "MUJOCO_GL"
 
 
 class EvaluationWorker:
-    """Does the jobs of an evaluation; an `engines.work.Handler`.
+    """Does the jobs of an evaluation; a handler of `engines.jobs`.
 
     Args:
         settings: see the module.

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..engines.choice import engine_from
-from ..engines.work import Engine, Job, JobOutcome, Work
-from ..errors import InvalidArgument
+from ..engines.jobs import Job, JobOutcome, Run, Work
 from ..simulation.model_trust import TRUST_VARIABLE, note_models, stored_models
 from .finish import Finisher, note_failure
 from .jobs import Progress, RenderedVideos, VideoJob
@@ -27,38 +26,8 @@ _WORKER = "mjrec.rendering.engine_jobs:VideoWorker"
 _RASTERISER_THREADS = "LP_NUM_THREADS"
 
 
-def given_engine(engine: Engine | str | None, workers: int | None) -> Engine | None:
-    """Return the engine that a caller names or gives; None where there is none.
-
-    Args:
-        engine: an engine, or the name of one.
-        workers: how many it is to have, where it is a name.
-
-    Raises:
-        UnknownName: there is no engine of that name.
-        InvalidArgument: `engine` is none, or `workers` is no number of workers, or
-            contradicts an engine, which has its own.
-        MissingDependency: what the engine needs is not installed.
-    """
-    if engine is None:
-        return None
-    if isinstance(engine, str):
-        return engine_from(engine, workers=workers)
-    if not callable(getattr(engine, "begin", None)):
-        raise InvalidArgument(
-            "engine is an engine, such as mjrec.LocalEngine(), or the name of one, got "
-            f"{engine!r}."
-        )
-    if workers is not None:
-        raise InvalidArgument(
-            f"workers={workers} and engine={engine!r} were given, and an engine has "
-            "workers of its own: say there how many."
-        )
-    return engine
-
-
 def do_on_engine(
-    engine: Engine,
+    engine: Executor,
     jobs: Iterable[VideoJob],
     *,
     on_progress: Callable[[Progress], object] = lambda _: None,
@@ -92,7 +61,7 @@ def do_on_engine(
         environ=environ_for_drawing(),
         shared_directory=directories[0].absolute(),
     )
-    with engine.begin(work) as run:
+    with Run(engine, work) as run:
         for name, job in by_name.items():
             run.submit(Job(key=name, arguments=job.as_json()))
         for done in run.results():
@@ -143,7 +112,7 @@ def environ_for_drawing() -> dict[str, str]:
 
 
 class VideoWorker:
-    """Does one job after the other; an `engines.work.Handler`.
+    """Does one job after the other; a handler of `engines.jobs`.
 
     A process of its own draws, which stays from job to job.
 

@@ -8,19 +8,20 @@ import itertools
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Executor
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 from ..annotation import check_annotation
-from ..engines.work import Engine
+from ..engines.choice import given_engine
 from ..errors import InvalidArgument
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
 from ..formats.spans import is_in_flight
 from ..formats.video_names import camera_part, name_part
 from ..machine import usable_cpus
 from ..simulation.model_trust import trusting_models
-from .engine_jobs import do_on_engine, given_engine
+from .engine_jobs import do_on_engine
 from .finish import bring_up_to_date, do_jobs
 from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
 from .pool import check_workers
@@ -48,7 +49,7 @@ def render_videos(
     workers: int | None = None,
     strict: bool = False,
     trust_models: bool = False,
-    engine: Engine | str | None = None,
+    engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> RenderedVideos:
     """Render the pending videos of a directory, or recorded episodes again.
@@ -132,7 +133,7 @@ def iter_rendered_videos(
     workers: int | None = None,
     strict: bool = False,
     trust_models: bool = False,
-    engine: Engine | str | None = None,
+    engine: Executor | str | None = None,
     on_progress: _OnProgress | None = None,
 ) -> Iterator[RenderedVideos]:
     """Do what `render_videos` does, and yield what became of each as it is over.

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that does jobs: `python -m mjrec.engines.local_worker SOCKET WORK`.
+"""A process that does jobs: `python -m mjrec.engines.child SOCKET`.
 
-Both are file descriptors. WORK is a file: a line of JSON with `entry` and `settings` of
-the `Work`, the size of its `payload`, or null, and `gpu`: null, or, where workers are
-given GPUs, `{"required": false}`; then that payload. On the socket both sides say one
-JSON object a line. It is told one job after the other::
+On the socket, a file descriptor, both sides say one JSON object a line. The first line
+says what the work is: `entry`, `settings`, `place`, `require_gpu`, `path`; see
+`jobs.Run`. Then comes one job after the other::
 
     {"key": "a", "arguments": {...}}
 
-and says::
+and this process says::
 
     {"ready": true}                       there is a handler; before anything else
     {"error": {...}}                      instead of it: none could be made
@@ -16,9 +15,9 @@ and says::
     {"key": "b", "failure": "..."}        or failed, with what the handler raised
     {"log": ["mjrec.x", 30, "..."]}       for the parent's log
 
-Whatever it prints is passed on by the parent. On SIGTERM the handler is closed and the
-process ends; so it does when the socket ends because the parent has died, in mid-job
-too.
+On SIGTERM the handler is closed and the process ends; so it does when the socket ends
+because the parent has died, in mid-job too, and when the run's folder says that all is
+over.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ import importlib
 import io
 import json
 import logging
-import mmap
 import operator
 import os
 import queue
@@ -37,19 +35,18 @@ import socket
 import sys
 import threading
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, cast
 
 from ..child_python import carried, say_stacks_when_asked
 from ..gl.devices import render_on_given_gpu
 from ..signals import Terminated, exiting_on_signals, received
-from .work import Handler
+from .worker import PAYLOAD, SECONDS_TO_CLOSE, STOP
 
 # Not `__name__`, which is `__main__`.
-logger = logging.getLogger("mjrec.engines.local_worker")
+logger = logging.getLogger("mjrec.engines.child")
 
-# A monitor is closed in well under a second, on a slow network disk in a few; Slurm
-# kills 30 seconds after its SIGTERM, Kubernetes too, docker after 10.
-SECONDS_TO_CLOSE = 10.0
+_SECONDS_BETWEEN_LOOKS = 1.0
 
 
 def main() -> None:
@@ -57,15 +54,18 @@ def main() -> None:
     say_stacks_when_asked()
     # As in a terminal: what is printed is there when the process dies.
     cast("io.TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
-    _hear_sigterm()
+    # The parent may have done something to its own.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
     parent = _Parent(socket.socket(fileno=int(sys.argv[1])))
     logging.getLogger().addHandler(_ToParent(parent))
     with exiting_on_signals():
-        handler = _handler(int(sys.argv[2]), parent)
+        work = parent.take()
+        handler = _handler(work, parent)
         try:
             parent.say(ready=True)
-            while True:
-                _do(handler, parent.next_job(), parent)
+            while (job := parent.next_job(Path(work["place"]))) is not None:
+                _do(handler, job, parent)
         finally:
             _close(handler)
 
@@ -76,16 +76,29 @@ class _Parent:
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
         self._one_at_a_time = threading.Lock()
-        self._jobs: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._said: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         # The connection ends with this process, whatever a policy has started.
         connection.set_inheritable(False)
         # Detached, because the file that is read from would keep it open.
         os.register_at_fork(after_in_child=lambda: os.close(connection.detach()))
         threading.Thread(target=self._read, name="mjrec-jobs", daemon=True).start()
 
-    def next_job(self) -> dict[str, Any]:
-        """Return the next job, waiting for it."""
-        return self._jobs.get()
+    def take(self, *, seconds: float | None = None) -> dict[str, Any]:
+        """Return the next thing that it says, waiting for it.
+
+        Raises:
+            queue.Empty: it has said nothing for so long.
+        """
+        return self._said.get(timeout=seconds)
+
+    def next_job(self, place: Path) -> dict[str, Any] | None:
+        """Return the next job, waiting for it; None where the run is over."""
+        while True:
+            try:
+                return self.take(seconds=_SECONDS_BETWEEN_LOOKS)
+            except queue.Empty:
+                if (place / STOP).exists() or not place.exists():
+                    return None
 
     def say(self, **said: Any) -> None:
         """Say something, from any thread."""
@@ -104,7 +117,7 @@ class _Parent:
         try:
             with self._connection.makefile("rb") as lines:
                 for line in lines:
-                    self._jobs.put(json.loads(line))
+                    self._said.put(json.loads(line))
         except OSError:
             # Reset, because it died before it had read everything.
             pass
@@ -126,12 +139,6 @@ class _ToParent(logging.Handler):
             self.handleError(record)
 
 
-def _hear_sigterm() -> None:
-    """Undo what the parent may have done to its own signals."""
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
-
-
 def _end_without_parent() -> None:
     """Do what SIGTERM does, and make sure that it is the end."""
     # Nobody reads what is printed from now on; that must not disturb the closing.
@@ -147,35 +154,34 @@ def _end_without_parent() -> None:
         signal.pthread_kill(main_thread, signal.SIGTERM)
 
 
-def _handler(work: int, parent: _Parent) -> Handler:
+def _handler(work: Mapping[str, Any], parent: _Parent) -> Any:
     """Make the handler; tell the parent why there is none."""
     try:
-        facts, payload = _read_work(work)
-        if facts["gpu"] is not None:
+        known = {*sys.path}
+        # What this machine has of its own comes first.
+        sys.path += [
+            entry
+            for entry in work["path"]
+            if entry not in known and Path(entry).exists()
+        ]
+        if work["require_gpu"] is not None:
             # Before the handler's module, which may import mujoco.
-            render_on_given_gpu(required=facts["gpu"]["required"])
-        module, _, name = facts["entry"].partition(":")
+            render_on_given_gpu(required=work["require_gpu"])
+        payload = Path(work["place"], PAYLOAD)
+        module, _, name = work["entry"].partition(":")
         make = operator.attrgetter(name)(importlib.import_module(module))
-        handler: Handler = make(facts["settings"], payload)
+        return make(
+            work["settings"], payload.read_bytes() if payload.exists() else None
+        )
     except Exception as error:
         # Python 3.11 turns what is raised inside a class's body into a RuntimeError.
         if terminated := received():
             raise terminated from error
         parent.say(error=carried(error))
         raise SystemExit(1) from error
-    return handler
 
 
-def _read_work(descriptor: int) -> tuple[dict[str, Any], bytes | None]:
-    # Mapped, because all workers share the descriptor's position.
-    with mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ) as work:
-        facts = json.loads(work.readline())
-        payload = None if facts["payload"] is None else work.read(facts["payload"])
-    os.close(descriptor)
-    return facts, payload
-
-
-def _do(handler: Handler, job: Mapping[str, Any], parent: _Parent) -> None:
+def _do(handler: Any, job: Mapping[str, Any], parent: _Parent) -> None:
     try:
         value = dict(handler(job["arguments"]))
         done = json.dumps({"key": job["key"], "value": value})
@@ -194,7 +200,7 @@ def _in_one_line(error: BaseException) -> str:
     return f"{kind}: {text}" if text else kind
 
 
-def _close(handler: Handler) -> None:
+def _close(handler: Any) -> None:
     # What has begun to close is not interrupted once more; SIGKILL is still there.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What holds of jobs on every engine: ours, and any executor of one's own.
+
+`docs/clusters.md` has the table of these guarantees.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from engine_runs import (
+    lines,
+    odd_work,
+    outcomes,
+    submit,
+    values,
+    wait_for,
+    wait_for_end,
+)
+from parts import parametrize
+
+import mjrec
+from mjrec.engines.jobs import Job, JobOutcome, Run, Work
+from mjrec.engines.local import LocalEngine
+from mjrec.engines.ray import RayEngine
+from mjrec.engines.slurm import SlurmEngine
+from mjrec.errors import ClosedError, Error, InvalidArgument
+
+Begin = Callable[..., Run]
+
+pytestmark = [
+    # Ray's own connections and pipes, of which it says so when they are collected.
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+]
+# Real Ray, and Slurm jobs through submitit, take seconds each.
+on_each = parametrize("engine", ["local", "own", "slurm", "ray"], default=2)
+
+
+@pytest.fixture(scope="module")
+def ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A Ray that this process has started, with room for two workers."""
+    from ray_clusters import home_for_ray, own_ray
+
+    with home_for_ray(tmp_path_factory.mktemp("home")), own_ray(cpus=2):
+        yield
+
+
+@pytest.fixture
+def begin(
+    engine: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> Iterator[Begin]:
+    """Return what begins a run of `odd_jobs` on an engine."""
+    made: list[Executor] = []
+
+    def begun(workers: int = 1, make: str = "make", **settings: Any) -> Run:
+        executor: Executor
+        if engine == "local":
+            executor = LocalEngine(workers)
+        elif engine == "own":
+            executor = ThreadPoolExecutor(workers)
+        elif engine == "slurm":
+            pytest.importorskip("submitit")
+            executor = SlurmEngine(workers, cluster="local")
+        else:
+            request.getfixturevalue("ray")
+            executor = RayEngine(workers)
+        made.append(executor)
+        return Run(executor, odd_work(make, shared=tmp_path / "shared", **settings))
+
+    yield begun
+    for executor in made:
+        executor.shutdown()
+    assert not (tmp_path / "shared").exists()
+
+
+@on_each
+def test_jobs_get_settings_and_arguments(begin: Begin) -> None:
+    """Also those that are submitted while results come, and after."""
+    with begin(2, seeds=[1, 2]) as run:
+        submit(run, "0", do="echo", text="ß\n")
+        seen = []
+        for outcome in run.results():
+            assert outcome is not None
+            seen.append(outcome.key)
+            if len(seen) < 4:
+                submit(run, str(len(seen)), do="echo")
+        submit(run, "later", do="echo", text="ß\n")
+        assert run.unfinished == 1
+        [value] = values(run)
+        assert run.unfinished == 0
+    assert seen == ["0", "1", "2", "3"]
+    arguments = {"do": "echo", "text": "ß\n"}
+    assert value == {"arguments": arguments, "settings": {"seeds": [1, 2]}}
+
+
+@on_each
+def test_jobs_run_beside_each_other(begin: Begin, tmp_path: Path) -> None:
+    """Two that wait for each other both come to their end."""
+    os.mkfifo(tmp_path / "pipe")
+    with begin(2) as run:
+        submit(run, "a", do="meet", pipe=str(tmp_path / "pipe"), mode="rb")
+        submit(run, "b", do="meet", pipe=str(tmp_path / "pipe"), mode="wb")
+        assert len({value["pid"] for value in values(run)}) == 2
+
+
+@on_each
+def test_who_waits_may_look_at_the_clock(begin: Begin) -> None:
+    """None is no outcome."""
+    with begin() as run:
+        submit(run, "a", do="echo")
+        assert next(run.results(patience_s=1e-6)) is None
+        assert run.unfinished == 1
+        assert [o.key for o in run.results(patience_s=0.1) if o is not None] == ["a"]
+
+
+@on_each
+def test_children_are_where_the_driver_is(
+    begin: Begin, engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Out of Ctrl-C's reach; each stays for later jobs, in Slurm of the same array."""
+    monkeypatch.chdir(tmp_path)
+    with begin() as run:
+        submit(run, "a", do="where")
+        submit(run, "b", do="where")
+        first, second = values(run)
+    assert first == second or engine == "slurm"
+    assert first["directory"] == str(tmp_path)
+    assert first["session"] == first["pid"]
+
+
+@on_each
+def test_children_get_the_payload(begin: Begin, tmp_path: Path) -> None:
+    """As a policy travels; a run without one has None."""
+    payload = os.urandom(1 << 20)
+    with begin() as run:
+        submit(run, "none", do="payload")
+        assert values(run) == [{"payload": None}]
+        shared = tmp_path / "shared"
+        work = Work(entry="odd_jobs:make", payload=payload, shared_directory=shared)
+        with Run(run.engine, work) as with_payload:
+            submit(with_payload, *"abc", do="payload")
+            found = values(with_payload)
+    digest = hashlib.sha256(payload).hexdigest()
+    assert [value["sha256"] for value in found] == [digest] * 3
+
+
+@on_each
+def test_what_a_handler_raises_is_the_outcome(
+    begin: Begin, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In one line; the child goes on, and the log has the traceback."""
+    with begin() as run:
+        submit(run, "bad", do="fail")
+        submit(run, "exit", do="leave")
+        submit(run, "path", do="no_json")
+        submit(run, "after", do="echo")
+        found = outcomes(run)
+    assert found["bad"] == JobOutcome(
+        key="bad", value=None, failure="ValueError: not today", tries=1
+    )
+    assert found["exit"].failure == "SystemExit: enough"
+    assert (found["path"].failure or "").startswith("TypeError: Object of type")
+    assert found["after"].value is not None
+    assert 'raise ValueError("not\\n  today")' in caplog.text
+
+
+@on_each
+def test_a_job_whose_child_dies_is_done_again(
+    begin: Begin, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Three times in all; no other job fails."""
+    with begin(2) as run:
+        once = str(tmp_path / "once")
+        submit(run, "once", do="die", how="SIGSEGV", once=once)
+        submit(run, "poison", do="die", how="SIGKILL")
+        submit(run, *"abcdef", do="echo")
+        found = outcomes(run)
+    assert found["once"] == JobOutcome(key="once", value={"alive": True}, tries=2)
+    assert found["poison"] == JobOutcome(
+        key="poison",
+        value=None,
+        failure=(
+            "Its worker died, which was try 3 of 3: it was killed by SIGKILL. "
+            "The end of what it said: SIGKILL is near"
+        ),
+        tries=3,
+    )
+    assert [found[key].failure for key in "abcdef"] == [None] * 6
+    assert "job once, which is begun again. It was killed by SIGSEGV" in caplog.text
+
+
+@on_each
+def test_a_handler_that_cannot_be_made(begin: Begin) -> None:
+    """An error of ours keeps its class and its facts; of others it is told."""
+    with begin(make="make_no_name") as run:
+        submit(run, *"abc", do="echo")
+        with pytest.raises(mjrec.UnknownName, match="no camera 'egocentric'") as raised:
+            outcomes(run)
+    assert raised.value.available == ["back", "side"]
+    with begin(make="make_nothing") as run:
+        submit(run, "a", do="echo")
+        with pytest.raises(Error, match="ValueError: there is no handler"):
+            outcomes(run)
+
+
+@on_each
+def test_children_that_die_as_they_begin(begin: Begin, tmp_path: Path) -> None:
+    """The run ends, and says of what."""
+    with begin(make="make_and_die", begun=str(tmp_path / "begun")) as run:
+        submit(run, "a", do="echo")
+        with pytest.raises(
+            Error,
+            match=r"No worker can begin. The last one ended with status 3. "
+            r"The end of what it said: a library is missing",
+        ):
+            outcomes(run)
+
+
+@on_each
+def test_warnings_come_home(begin: Begin, caplog: pytest.LogCaptureFixture) -> None:
+    """Under their own name, each once; nothing that a job prints is an answer."""
+    with begin() as run:
+        submit(run, *"ab", do="talk")
+        assert values(run) == [{"read": ""}] * 2
+    told = [record.getMessage() for record in caplog.records if record.name == "odd"]
+    assert told == ["a warning of 7"]
+
+
+@on_each
+def test_cancelling_lets_a_job_close_its_files(begin: Begin, tmp_path: Path) -> None:
+    """No child goes on; a second time is no more than once."""
+    run = begin(closed=str(tmp_path / "closed"))
+    submit(run, "a", "b", do="hold", begun=str(tmp_path / "begun"))
+    pid = wait_for(tmp_path / "begun", run)
+    run.cancel()
+    run.cancel()
+    wait_for_end(pid)
+    assert lines(tmp_path / "closed") == [str(pid)]
+    with pytest.raises(ClosedError, match="cancelled"):
+        run.results()
+    with pytest.raises(ClosedError, match="cancelled"):
+        submit(run, "c", do="echo")
+
+
+@on_each
+def test_forgotten_runs_end(begin: Begin, tmp_path: Path) -> None:
+    """In mid-job too."""
+    run = begin()
+    submit(run, "a", do="hold", begun=str(tmp_path / "begun"))
+    pid = wait_for(tmp_path / "begun", run)
+    del run
+    gc.collect()
+    wait_for_end(pid)
+
+
+@on_each
+def test_what_cannot_be_handed_out(begin: Begin) -> None:
+    """Errors name the job."""
+    with pytest.raises(InvalidArgument, match="settings of the work cannot be written"):
+        begin(path=Path())
+    with begin() as run:
+        submit(run, "a", do="echo")
+        with pytest.raises(InvalidArgument, match="a job 'a' in this run already"):
+            submit(run, "a", do="echo")
+        with pytest.raises(InvalidArgument, match="arguments of the job 'b' cannot be"):
+            run.submit(Job(key="b", arguments={"path": Path()}))
+        with pytest.raises(InvalidArgument, match="patience_s must be"):
+            run.results(patience_s=0)
+
+
+@parametrize("engine", ["own", "slurm", "ray"], default=1)
+def test_a_shared_directory_is_needed_elsewhere(begin: Begin) -> None:
+    """And what others keep in it stays; two runs there do not know of each other."""
+    with begin() as run:
+        shared = Path(run._work["place"]).parent.parent
+        (shared / "results.csv").touch()
+        with pytest.raises(InvalidArgument, match="that all workers see"):
+            Run(run.engine, odd_work())
+        with Run(run.engine, odd_work(shared=shared)) as other:
+            submit(other, "a", do="echo")
+            submit(run, "a", do="echo")
+            assert [*outcomes(other)] == [*outcomes(run)] == ["a"]
+    assert [path.name for path in shared.iterdir()] == ["results.csv"]
+    (shared / "results.csv").unlink()
+    shared.rmdir()
