@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import math
 import sys
 from pathlib import Path
@@ -71,9 +72,12 @@ def close(monitor: Any, interrupting: Interrupting) -> None:
             monitor.close()
     finally:
         sys.setprofile(None)
+        gc.collect()
 
 
-# Takes more than five seconds: a run, its recovery and its videos for each moment.
+# Takes more than five seconds: a run, its recovery and its videos for each moment. A
+# file that was opened in just that moment is closed by the garbage collection.
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
 @parametrize(
     ("render", "moment"),
     [(render, k) for render in ("deferred", "live") for k in range(MOMENTS)],
