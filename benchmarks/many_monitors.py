@@ -27,7 +27,13 @@ from mjrec.evaluation.results_files import write_results
 from mjrec.evaluation.summaries import Bootstrap
 from mjrec.evaluation.summarizing import summarize_results
 from mjrec.formats.journal import JournalEntry, JournalWriter
-from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
+from mjrec.formats.manifest import (
+    Manifest,
+    StatsFile,
+    read_manifest,
+    write_manifest,
+    write_stats_file,
+)
 from mjrec.formats.monitor_directory import (
     Infix,
     journal_name,
@@ -35,7 +41,6 @@ from mjrec.formats.monitor_directory import (
     stats_prefix,
     trajectory_prefix,
 )
-from mjrec.formats.stats_file import StatsFile, write_stats_file
 
 TASK = "InvertedPendulum-v5"
 

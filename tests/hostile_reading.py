@@ -119,7 +119,7 @@ def _manifest(path: Path) -> None:
 
 
 def _stats(path: Path) -> None:
-    from mjrec.formats.stats_file import read_stats_file
+    from mjrec.formats.manifest import read_stats_file
 
     read_stats_file(path)
 

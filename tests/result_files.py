@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mjrec.formats.journal import JournalEntry, JournalWriter
-from mjrec.formats.manifest import Manifest, write_manifest
-from mjrec.formats.stats_file import StatsFile, write_stats_file
+from mjrec.formats.manifest import Manifest, StatsFile, write_manifest, write_stats_file
 
 ENV_INFO = {"gym_version": "mjrec-1", "env_id": "(unknown:Corridor)"}
 

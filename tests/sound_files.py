@@ -14,11 +14,10 @@ import numpy as np
 from trajectories_by_hand import INFIX, add_row, write_log
 
 from mjrec.formats.journal import JournalEntry, JournalWriter
-from mjrec.formats.manifest import Manifest, write_manifest
+from mjrec.formats.manifest import Manifest, StatsFile, write_manifest, write_stats_file
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.spans import list_paths
-from mjrec.formats.stats_file import StatsFile, write_stats_file
 from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
 from mjrec.simulation.model_sources import authored_from_file

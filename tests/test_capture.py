@@ -246,16 +246,6 @@ def test_a_recompiled_model_is_another_one(simulation: Simulation) -> None:
     assert simulation.begin().model == first.model
 
 
-def test_other_data_of_the_same_model_is_followed(simulation: Simulation) -> None:
-    """Captures are of the data that the environment has at that moment."""
-    simulation.begin()
-    simulation.data = mujoco.MjData(simulation.model)
-    simulation.data.qpos[0] = 0.75
-    mujoco.mj_forward(simulation.model, simulation.data)
-    assert simulation.capture() is None
-    assert np.array_equal(simulation.captured("geom_xpos"), simulation.data.geom_xpos)
-
-
 @pytest.mark.parametrize(
     "flag", ["CONTACTPOINT", "CONTACTFORCE", "CONTACTSPLIT", "ISLAND"]
 )

@@ -29,10 +29,14 @@ from trajectory_contents import content_of
 
 from mjrec import UnreadableFile
 from mjrec.formats.journal import JournalWriter, read_journal
-from mjrec.formats.manifest import read_manifest, write_manifest
+from mjrec.formats.manifest import (
+    read_manifest,
+    read_stats_file,
+    write_manifest,
+    write_stats_file,
+)
 from mjrec.formats.monitor_directory import states_name, trajectory_prefix
 from mjrec.formats.row_log import TAIL_HEAD
-from mjrec.formats.stats_file import read_stats_file, write_stats_file
 from mjrec.formats.trajectory import ModelChange
 from mjrec.formats.trajectory_file import finish_trajectory, open_trajectory
 from mjrec.formats.trajectory_log import pack_change

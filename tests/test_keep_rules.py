@@ -112,7 +112,7 @@ def test_failures_are_what_the_environment_calls_so(
     # At the end of each, so that after the last nothing is recorded any more.
     selection = told(f"failures:{most}", episodes)
     assert selection.chosen == failed[:most]
-    assert selection.is_full == (len(failed) >= most)
+    assert selection(99) == (len(failed) < most)
 
 
 def test_a_function_gets_the_finished_episodes() -> None:

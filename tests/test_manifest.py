@@ -11,8 +11,14 @@ from pathlib import Path
 import pytest
 
 from mjrec.errors import UnreadableFile
-from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
-from mjrec.formats.stats_file import StatsFile, read_stats_file, write_stats_file
+from mjrec.formats.manifest import (
+    Manifest,
+    StatsFile,
+    read_manifest,
+    read_stats_file,
+    write_manifest,
+    write_stats_file,
+)
 
 MANIFEST = Manifest(
     stats="s.stats.json",

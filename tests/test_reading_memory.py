@@ -11,9 +11,14 @@ from typing import Any
 from parts import parametrize
 
 import mjrec
-from mjrec.formats.manifest import Manifest, read_manifest, write_manifest
+from mjrec.formats.manifest import (
+    Manifest,
+    StatsFile,
+    read_manifest,
+    write_manifest,
+    write_stats_file,
+)
 from mjrec.formats.monitor_directory import Infix, manifest_name, stats_prefix
-from mjrec.formats.stats_file import StatsFile, write_stats_file
 from mjrec.reporting.gathering import gather
 
 MONITORS = 40

@@ -15,7 +15,7 @@ from result_files import ENV_INFO, write_journal, write_saved
 import mjrec
 from mjrec.errors import DirectoryInUse, UnreadableFile
 from mjrec.formats.locks import Lock
-from mjrec.formats.stats_file import StatsFile
+from mjrec.formats.manifest import StatsFile
 
 MONITOR_FILES = [
     "openaigym.episode_batch.0.1.stats.json",

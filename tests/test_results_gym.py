@@ -20,7 +20,7 @@ import pytest
 from result_files import write_saved
 
 import mjrec
-from mjrec.formats.stats_file import StatsFile
+from mjrec.formats.manifest import StatsFile
 
 TESTS = Path(__file__).parent
 DATA = TESTS / "data" / "gym"

@@ -17,7 +17,7 @@ from mjrec import (
     ResetNotAllowed,
     StatsRecorder,
 )
-from mjrec.formats.stats_file import read_stats_file
+from mjrec.formats.manifest import read_stats_file
 
 
 @pytest.fixture

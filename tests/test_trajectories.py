@@ -242,18 +242,6 @@ def test_a_directory_is_answered_with_what_is_in_it(tmp_path: Path) -> None:
         mjrec.load_trajectory(tmp_path)
 
 
-@pytest.mark.parametrize("content", [None, b"", b"something else"])
-def test_what_is_no_trajectory_is_one_clear_error(
-    tmp_path: Path, content: bytes | None
-) -> None:
-    """It names the file."""
-    path = tmp_path / "openaigym.trajectory.0.7.episode000000.h5"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(UnreadableFile, match=path.name):
-        mjrec.load_trajectory(path)
-
-
 def test_reading_needs_no_simulator(tmp_path: Path) -> None:
     """Arrays are read on a machine without mujoco; a model is not."""
     path = finished(Recording(tmp_path, model_of("heap")))

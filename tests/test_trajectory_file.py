@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import random
 import re
 import shutil
 import signal
@@ -33,12 +32,11 @@ from trajectories_by_hand import new_logs
 from trajectory_contents import TrajectoryContent, content_of
 
 import mjrec.formats.trajectory_file as trajectory_file
-from mjrec.errors import ClosedError, FileNotWritten, UnreadableFile
+from mjrec.errors import FileNotWritten, UnreadableFile
 from mjrec.formats import trajectory_hdf5
 from mjrec.formats.spans import list_paths
 from mjrec.formats.trajectory import ModelChange, added_up, packed, row_dtype
 from mjrec.formats.trajectory_file import (
-    find_trajectory,
     finish_trajectory,
     open_trajectory,
 )
@@ -294,37 +292,6 @@ def test_a_killed_finish_is_done_again(path: Path, where: str) -> None:
     assert list(list_paths(path.parent)) == []
 
 
-def test_the_file_of_an_episode_is_found(path: Path, tmp_path: Path) -> None:
-    """Whether it is in flight still or finished; else nothing. A name may be any."""
-    assert find_trajectory(tmp_path, INFIX, 27) is None
-    record(path)
-    assert find_trajectory(tmp_path, INFIX, 27) == path
-    finish_trajectory(path)
-    assert find_trajectory(tmp_path, "0.1", 27) == path
-    assert find_trajectory(tmp_path, INFIX, 28) is None
-    assert find_trajectory(tmp_path, "nonsense", 27) is None
-    check(read(Path(shutil.copy(path, tmp_path / "renamed"))), 40)
-
-
-@pytest.mark.parametrize("is_finished", [True, False])
-def test_a_closed_file_says_so(path: Path, is_finished: bool) -> None:
-    """Closing is idempotent; what is in memory stays."""
-    record(path)
-    if is_finished:
-        finish_trajectory(path)
-    reader = open_trajectory(path)
-    reader.close()
-    reader.close()
-    assert reader.step_count == 40
-    for use in (
-        lambda: reader.states(0, 1),
-        lambda: reader.snapshots(0, 1),
-        lambda: reader.model_changes,
-    ):
-        with pytest.raises(ClosedError, match="is closed"):
-            use()
-
-
 def attribute(name: str, value: Any) -> Callable[[h5py.File], None]:
     return lambda file: file.attrs.__setitem__(name, value)
 
@@ -388,28 +355,6 @@ def test_a_file_of_another_making_is_refused(
     with pytest.raises(UnreadableFile, match=reason) as error:
         read(path)
     assert error.value.path == path
-
-
-def test_damage_is_noticed(path: Path) -> None:
-    """So is a missing end; or it is a byte that nothing depends on."""
-    record(path)
-    finish_trajectory(path)
-    data = path.read_bytes()
-    for size in [*range(0, 200, 20), len(data) // 2, len(data) - 1]:
-        path.write_bytes(data[:size])
-        with pytest.raises(UnreadableFile, match=path.name):
-            read(path)
-    chance = random.Random(1)
-    for _ in range(60):
-        damaged = bytearray(data)
-        damaged[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
-        path.write_bytes(damaged)
-        try:
-            again = read(path)
-        except UnreadableFile:
-            continue
-        check(again, 40)
-        assert again.facts == {**FACTS, "complete": True, "length": 40}
 
 
 def test_rewards_are_added_up_one_after_the_other() -> None:

@@ -57,9 +57,10 @@ class Lock:
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
         self._take(path, os.open(path, flags, mode))
         try:
-            if not self._lock(fcntl.LOCK_EX, content):
+            if not self._lock(fcntl.LOCK_EX):
                 # Before it was locked it looked like a dead monitor's.
                 raise FileExistsError(f"{path} was removed while it was being locked")
+            self._write(content)
         except BaseException:
             self.release()
             raise
@@ -69,16 +70,14 @@ class Lock:
         self._descriptor: int | None = descriptor
         _held.add(self)
 
-    def _lock(self, operation: int, content: str) -> bool:
+    def _lock(self, operation: int) -> bool:
         """Lock the file; False where another one is in its place by now."""
         fcntl.flock(self.fileno(), operation)
-        if not _is_at(self.fileno(), self._path):
-            return False
-        # A full disk takes no content; what counts is who holds the file.
-        with contextlib.suppress(OSError):
-            os.ftruncate(self.fileno(), 0)
-            os.write(self.fileno(), content.encode())
-        return True
+        return _is_at(self.fileno(), self._path)
+
+    def _write(self, content: str) -> None:
+        os.ftruncate(self.fileno(), 0)
+        os.write(self.fileno(), content.encode())
 
     def fileno(self) -> int:
         """Return the descriptor. A process that inherits it holds the lock too."""
@@ -142,7 +141,10 @@ def _taken(path: Path, content: str, operation: int) -> Lock:
         try:
             # Its holder may have removed it after it was opened, and somebody else
             # have made another: then this one guards nothing.
-            if lock._lock(operation, content):
+            if lock._lock(operation):
+                # A full disk takes no content; what counts is who holds the file.
+                with contextlib.suppress(OSError):
+                    lock._write(content)
                 return lock
         except BaseException:
             lock.let_go()

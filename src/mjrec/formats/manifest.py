@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manifest: which files belong to one monitor.
+"""Gym's two files of a monitor: the manifest and the statistics.
 
-`openaigym.manifest.<infix>.manifest.json` is written last, so that whatever it lists
-is there and whole. Names in it are base names: the directory can be moved, and a
-manifest from elsewhere cannot point outside its own directory.
+The manifest, `openaigym.manifest.<infix>.manifest.json`, says which files belong to one
+monitor. It is written last, so that whatever it lists is there and whole. Names in it
+are base names: the directory can be moved, and a manifest from elsewhere cannot point
+outside its own directory.
+
+The statistics, `openaigym.episode_batch.<infix>.stats.json`, have the keys of
+`StatsFile`, in its order. The lists have one item for each completed episode. Gym
+itself wrote one type for each *reset*, so that its `episode_types` can be longer than
+the other lists; they are read as they stand.
 """
 
 from __future__ import annotations
@@ -21,8 +27,10 @@ from .json_fields import (
     integer,
     list_of,
     mapping,
+    number,
     optional,
     read_object,
+    text,
     unreadable,
 )
 
@@ -92,3 +100,66 @@ def _details(value: Any) -> Mapping[str, Any]:
     field(details, "pending", optional(list_of(mapping)), default=None)
     field(details, "broken", optional(list_of(base_name)), default=None)
     return details
+
+
+@dataclass(frozen=True)
+class StatsFile:
+    """What one monitor counted.
+
+    Attributes:
+        initial_reset_timestamp: when the first reset began; None before it.
+        timestamps: when each episode ended.
+        episode_lengths: steps of each episode.
+        episode_rewards: sum of the rewards of each episode.
+        episode_types: `"t"` for training, `"e"` for evaluation; None in files of
+            before there were types.
+    """
+
+    initial_reset_timestamp: float | None
+    timestamps: tuple[float, ...]
+    episode_lengths: tuple[int, ...]
+    episode_rewards: tuple[float, ...]
+    episode_types: tuple[str, ...] | None
+
+
+def read_stats_file(path: Path) -> StatsFile:
+    """Return what the file holds; `null` among the rewards is NaN.
+
+    Raises:
+        UnreadableFile: it is missing or damaged, or its lists differ in length.
+    """
+    with unreadable(path):
+        values = read_object(path)
+        stats = StatsFile(
+            # Absent in the first of all gyms.
+            initial_reset_timestamp=field(
+                values, "initial_reset_timestamp", optional(number), default=None
+            ),
+            timestamps=field(values, "timestamps", list_of(number)),
+            episode_lengths=field(values, "episode_lengths", list_of(integer)),
+            episode_rewards=field(values, "episode_rewards", list_of(number)),
+            episode_types=field(
+                values, "episode_types", optional(list_of(text)), default=None
+            ),
+        )
+        _check_lengths(stats)
+    return stats
+
+
+def write_stats_file(path: Path, stats: StatsFile) -> None:
+    """Write the file, whole or not at all."""
+    values = vars(stats)
+    if stats.episode_types is None:
+        values = {k: v for k, v in values.items() if k != "episode_types"}
+    write_text(path, dumps(values))
+
+
+def _check_lengths(stats: StatsFile) -> None:
+    names = ("timestamps", "episode_lengths", "episode_rewards")
+    counts = {name: len(vars(stats)[name]) for name in names}
+    if len(set(counts.values())) > 1:
+        each = ", ".join(f"{count} {name}" for name, count in counts.items())
+        raise ValueError(f"its lists belong together but differ in length: {each}")
+    types, count = stats.episode_types, counts["timestamps"]
+    if types is not None and len(types) < count:
+        raise ValueError(f"it has {len(types)} episode_types for {count} episodes")

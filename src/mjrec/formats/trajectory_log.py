@@ -70,9 +70,7 @@ def open_recording(path: Path) -> TrajectoryReader:
         if recording.stop is not None:
             # All of its rows were counted when that was said.
             count = rows.count
-        reader = _reader_of(recording, count, rows, path, opened)
-        reader.release = opened.pop_all().close
-        return reader
+        return _reader_of(recording, count, rows, path, opened)
 
 
 def _reader_of(
@@ -123,7 +121,7 @@ def _reader_of(
         dropped=max(0, promised - first) - len(heads),
         read=read,
         read_change=read_change,
-        release=rows.close,
+        release=opened.pop_all().close,
     )
 
 

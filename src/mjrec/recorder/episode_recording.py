@@ -220,11 +220,10 @@ class EpisodeRecording:
 
     def expect(self) -> None:
         """Let others tell of the videos, once they are there."""
-        if self._live is not None:
+        if self.mode is not None and self._run.trackers:
             self._run.trackers.expect(Path(str(self.video.path)))
+        if self._live is not None:
             self._live.name_again()
-        elif isinstance(self.video, DeferredVideo):
-            self._run.trackers.expect(Path(self.video.path))
 
     def choose(self, selection: Mapping[str, Any]) -> None:
         """Keep the video of an episode that has ended before it was chosen.

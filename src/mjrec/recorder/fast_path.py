@@ -11,14 +11,14 @@ that name is to be called.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.row_log import TAIL_HEAD
 from ..formats.span_writer import ROW_HEAD, SpanWriter
-from ..formats.trajectory import FRAME, STEP
+from ..formats.trajectory import FRAME, STEP, TERMINATED, TRUNCATED
 from ..simulation.raw_memory import WORDS
 from .stats_recorder import StatsRecorder
 
@@ -28,16 +28,25 @@ _sum = float.__add__
 _LARGEST = 1 << 53
 
 
+class Step(Protocol):
+    """Records a step by its reward, and counts it."""
+
+    def __call__(
+        self, reward: Any, *, terminated: bool = ..., truncated: bool = ...
+    ) -> bool:
+        """Return False where it is not usual, and nothing was recorded."""
+
+
 class FastPath(NamedTuple):
     """What usual steps are recorded with.
 
     Attributes:
         before_step: notes the action, and tells whether a step may be taken.
-        step: records a step that did not end the episode, by its reward.
+        step: records a step. That the episode is over by it is the recorder's to say.
     """
 
     before_step: Callable[[Any], bool]
-    step: Callable[[Any], bool]
+    step: Step
 
 
 def counting(stats: StatsRecorder) -> FastPath:
@@ -47,7 +56,7 @@ def counting(stats: StatsRecorder) -> FastPath:
         # Others may have ended the episode, or its recording.
         return stats.done is False and not stats.closed
 
-    def step(reward: Any) -> bool:
+    def step(reward: Any, *, terminated: bool = False, truncated: bool = False) -> bool:
         if not isinstance(reward, float):
             return False
         total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
@@ -88,7 +97,7 @@ def gathering(
     def before_step(action: Any) -> bool:
         return stats.done is False and not stats.closed and set_action(action)
 
-    def step(reward: Any) -> bool:
+    def step(reward: Any, *, terminated: bool = False, truncated: bool = False) -> bool:
         row = log.count
         if row >= log.limit or not is_current():
             return False
@@ -99,8 +108,11 @@ def gathering(
         slot = row % capacity
         take(words, None, bodies[slot], "clip")
         number = span.steps + 1
-        is_frame = number % stride == 0
+        is_last = terminated or truncated
+        is_frame = is_last or number % stride == 0
         flags = both if is_frame else STEP
+        if is_last:
+            flags |= TERMINATED * terminated | TRUNCATED * truncated
         pack_into(memory, TAIL_HEAD + slot * size, row, number, reward, flags)
         total = _sum(reward, stats.rewards)  # type: ignore[arg-type]
         # No call from here on, behind which a signal's handler could raise: what is

@@ -11,7 +11,6 @@ import enum
 import math
 import operator
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
@@ -52,13 +51,17 @@ class Standing(enum.Enum):
     DROPPED = "dropped"
 
 
-class Selection(ABC):
+class Selection:
     """Chooses among the finished episodes of one run.
 
     It is a schedule too: of every episode that may be chosen when it has ended.
 
-    Attributes:
+    Args:
         name: of the rule, as the manifest has it.
+
+    Attributes:
+        name: as given.
+        finished: how many episodes it was told of.
         holds_all: every episode is a candidate until `close`.
         is_left_open: every episode stays a candidate, of whatever end: somebody else
             decides, when the monitor is gone.
@@ -71,58 +74,47 @@ class Selection(ABC):
         self.name = name
         # Under which a schedule is written into the manifest.
         self.__qualname__ = f"keep:{name}"
-        # The number of the last one, and how many there were.
-        self._counted = (-1, 0)
+        self.finished = 0
+        self._last_id = -1
+        self._candidates: dict[int, FinishedEpisode] = {}
+        self._chosen: set[int] = set()
 
     def facts(self) -> dict[str, Any]:
         """Return what a run says of it."""
         left_open = {"left_open": True} if self.is_left_open else {}
         return {"rule": self.name, **left_open}
 
-    @property
-    def finished(self) -> int:
-        """How many episodes it was told of."""
-        return self._counted[1]
-
     def __call__(self, episode_id: int) -> bool:
         """Tell whether an episode is to be recorded, as if it got a video."""
-        return not self.is_full
-
-    @property
-    def is_full(self) -> bool:
-        """Whether no later episode can be chosen any more."""
-        return False
+        return True
 
     def add(self, episode: FinishedEpisode) -> None:
-        """Take note of an episode; their numbers rise.
+        """Take note of an episode; their numbers rise. Of the same one it counts once.
 
-        May be interrupted (Ctrl-C), and called again with the same one.
+        A candidate that has fallen out never comes back.
         """
-        self._take(episode)
-        last_id, count = self._counted
-        if episode.episode_id > last_id:
-            # One assignment: no interruption counts an episode twice.
-            self._counted = (episode.episode_id, count + 1)
+        if episode.episode_id > self._last_id:
+            self._take(episode)
+            self.finished += 1
+            self._last_id = episode.episode_id
 
-    @abstractmethod
-    def _take(self, episode: FinishedEpisode) -> None:
-        """Take note of an episode; of the last one any number of times."""
-
-    @abstractmethod
     def standing(self, episode_id: int) -> Standing:
         """Return how an episode stands that it was told of."""
+        if episode_id in self._chosen:
+            return Standing.CHOSEN
+        is_candidate = episode_id in self._candidates
+        return Standing.CANDIDATE if is_candidate else Standing.DROPPED
 
     @property
-    @abstractmethod
     def undecided(self) -> int:
         """How many episodes are candidates."""
+        return len(self._candidates)
 
     @property
-    @abstractmethod
     def chosen(self) -> list[int]:
         """The numbers of those that are chosen, rising."""
+        return sorted(self._chosen)
 
-    @abstractmethod
     def close(self) -> None:
         """Decide about all candidates: there are no more episodes. Idempotent.
 
@@ -130,6 +122,11 @@ class Selection(ABC):
             InvalidArgument: the user's function raised, or did not return numbers of
                 finished episodes. Nothing is decided then.
         """
+        self._chosen.update(self._candidates)
+        self._candidates.clear()
+
+    def _take(self, episode: FinishedEpisode) -> None:
+        self._candidates[episode.episode_id] = episode
 
 
 def selection_from(keep: object) -> Selection:
@@ -200,29 +197,11 @@ class _Extremes(Selection):
         super().__init__(name)
         self._count = count
         self._order = order
-        self._first: dict[int, _Key] = {}
-        self._closed = False
 
     def _take(self, episode: FinishedEpisode) -> None:
-        known = {**self._first, episode.episode_id: self._order(episode)}
-        first = sorted(known, key=lambda number: known[number])[: self._count]
-        self._first = {number: known[number] for number in first}
-
-    def standing(self, episode_id: int) -> Standing:
-        if episode_id not in self._first:
-            return Standing.DROPPED
-        return Standing.CHOSEN if self._closed else Standing.CANDIDATE
-
-    @property
-    def undecided(self) -> int:
-        return 0 if self._closed else len(self._first)
-
-    @property
-    def chosen(self) -> list[int]:
-        return sorted(self._first) if self._closed else []
-
-    def close(self) -> None:
-        self._closed = True
+        super()._take(episode)
+        if len(self._candidates) > self._count:
+            del self._candidates[max(map(self._order, self._candidates.values()))[-1]]
 
 
 class _Failures(Selection):
@@ -231,29 +210,13 @@ class _Failures(Selection):
     def __init__(self, name: str, most: int | None) -> None:
         super().__init__(name)
         self._most = most
-        # A dictionary for its order.
-        self._failed: dict[int, None] = {}
 
-    @property
-    def is_full(self) -> bool:
-        return self._most is not None and len(self._failed) >= self._most
+    def __call__(self, episode_id: int) -> bool:
+        return self._most is None or len(self._chosen) < self._most
 
     def _take(self, episode: FinishedEpisode) -> None:
-        if _has_failed(episode) and not self.is_full:
-            self._failed[episode.episode_id] = None
-
-    def standing(self, episode_id: int) -> Standing:
-        return Standing.CHOSEN if episode_id in self._failed else Standing.DROPPED
-
-    @property
-    def undecided(self) -> int:
-        return 0
-
-    @property
-    def chosen(self) -> list[int]:
-        return list(self._failed)
-
-    def close(self) -> None: ...
+        if _has_failed(episode) and self(episode.episode_id):
+            self._chosen.add(episode.episode_id)
 
 
 def _has_failed(episode: FinishedEpisode) -> bool:
@@ -270,18 +233,8 @@ class _LeftOpen(Selection):
     holds_all = True
     is_left_open = True
 
-    def _take(self, episode: FinishedEpisode) -> None: ...
-
     def standing(self, episode_id: int) -> Standing:
         return Standing.CANDIDATE
-
-    @property
-    def undecided(self) -> int:
-        return self.finished
-
-    @property
-    def chosen(self) -> list[int]:
-        return []
 
     def close(self) -> None: ...
 
@@ -298,44 +251,29 @@ class _ByFunction(Selection):
     ) -> None:
         super().__init__(name)
         self._function = function
-        self._episodes: dict[int, FinishedEpisode] = {}
-        self._chosen: frozenset[int] | None = None
-
-    def _take(self, episode: FinishedEpisode) -> None:
-        self._episodes[episode.episode_id] = episode
-
-    def standing(self, episode_id: int) -> Standing:
-        if self._chosen is None:
-            return Standing.CANDIDATE
-        return Standing.CHOSEN if episode_id in self._chosen else Standing.DROPPED
-
-    @property
-    def undecided(self) -> int:
-        return len(self._episodes) if self._chosen is None else 0
-
-    @property
-    def chosen(self) -> list[int]:
-        return sorted(self._chosen or ())
+        self._is_decided = False
 
     def close(self) -> None:
-        if self._chosen is None:
-            self._chosen = self._ask()
+        if not self._is_decided:
+            self._chosen.update(self._ask())
+            self._is_decided = True
+            self._candidates.clear()
 
     def _ask(self) -> frozenset[int]:
         try:
-            answer = self._function(tuple(self._episodes.values()))
+            answer = self._function(tuple(self._candidates.values()))
             numbers = frozenset(map(_number, answer))
         except Exception as error:
             raise InvalidArgument(
-                f"keep={self.name} could not choose among {len(self._episodes)} "
+                f"keep={self.name} could not choose among {len(self._candidates)} "
                 f"finished episodes: {type(error).__name__}: {error}. It must return "
                 "the numbers (episode_id) of those to keep."
             ) from error
-        unknown = sorted(numbers - self._episodes.keys())
+        unknown = sorted(numbers - self._candidates.keys())
         if unknown:
             raise InvalidArgument(
                 f"keep={self.name} returned {_listed(unknown)}, and no finished "
-                f"episode has that number: there are {_listed([*self._episodes])}."
+                f"episode has that number: there are {_listed([*self._candidates])}."
             )
         return numbers
 

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..annotation import Caption
 from ..formats.monitor_directory import Infix
 from ..formats.span_writer import SpanLogs
@@ -23,6 +26,7 @@ from .opening import OpenDirectory
 from .options import LIVE, RecorderOptions
 from .run_journal import RunJournal, What
 from .stats_recorder import StatsRecorder
+from .step_arrays import StepArray
 from .subject import EpisodePictures, Subject, check_refusal
 from .tracking import Trackers
 from .video_recorder import VideoRecorder
@@ -77,6 +81,7 @@ class MonitoredRun:
         infix: what its files have in the middle.
         logs: of the episodes' rows.
         clip_logs: of the clips'.
+        action, row_words: what the next recording may use again of the last one.
     """
 
     def __init__(
@@ -110,6 +115,11 @@ class MonitoredRun:
             )
             for _ in range(2)
         )
+        # Of the last recording, which the next one's are usually like: the memory of
+        # actions, and the words of a row with those of the state before them.
+        self.action: StepArray | None = None
+        self.row_words: tuple[object, object, NDArray[np.intp]] | None = None
+        self._no_video = VideoRecorder(subject.pictures, enabled=False)
         self._episode: BegunEpisode | None = None
         # Why videos are drawn live, as far as it was said.
         self._said: set[str] = set()
@@ -274,7 +284,7 @@ class MonitoredRun:
 
     def no_video(self) -> VideoRecorder:
         """Return what stands for the video of an episode that gets none."""
-        return VideoRecorder(self.subject.pictures, enabled=False)
+        return self._no_video
 
     def _live_recorder(
         self, base_path: Path, pictures: EpisodePictures

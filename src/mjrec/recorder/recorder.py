@@ -358,40 +358,48 @@ class Recorder:
         reward = reward_to_float(reward)
         flags = {"terminated": bool(terminated), "truncated": bool(truncated)}
         done = any(flags.values())
-        self.fast = self._ending = None
+        fast, self.fast = self.fast if done else None, None
+        self._ending = None
         recording, clips = self._recording, self._clips
-        failures: list[Exception] = []
-        if recording is not None:
-            try:
-                # First of all: what is counted has a row, if it can have one.
-                with _raising_later(failures, Error):
-                    recording.step(
-                        reward, **flags, observation=observation, has_picture=picture
-                    )
-            except BaseException as error:
-                # A signal's handler has raised: this step is not recorded.
-                self.note_error(error)
-                raise
+        failures = _Failures()
+        is_counted = False
+        try:
+            # First of all: what is counted has a row, if it can have one.
+            if fast is not None and picture:
+                is_counted = fast.step(reward, **flags)
+            if recording is not None and not is_counted:
+                recording.step(
+                    reward, **flags, observation=observation, has_picture=picture
+                )
+        except Error as error:
+            failures.note(error)
+        except BaseException as error:
+            # A signal's handler has raised: this step is not recorded.
+            self.note_error(error)
+            raise
         self._flags, self._success = flags, success
-        self.stats_recorder.count(reward, done)
+        if is_counted:
+            self.stats_recorder.done = True
+            self.stats_recorder.save_complete()
+        else:
+            self.stats_recorder.count(reward, done)
         if done:
             # Before all that is drawn, so that no failing video can lose the episode.
-            with _raising_later(failures):
+            with failures:
                 self._journal_end(CLOSE)
         if recording is not None:
-            with _raising_later(failures):
+            with failures:
                 recording.take_pictures(is_last=done, is_there=picture)
         if clips is not None:
-            with _raising_later(failures):
+            with failures:
                 clips.step(reward, **flags, has_picture=picture)
         if done:
-            with _raising_later(failures):
+            with failures:
                 self._end_episode()
             self._tell_of_episode()
         elif clips is None and recording is not None:
             self.fast = recording.fast_path()
-        if failures:
-            raise failures[0]
+        failures.raise_first()
 
     def finish(self, on_progress: Callable[[Any], None] = lambda _: None) -> None:
         """End the running episode, and wait until all videos are rendered.
@@ -430,10 +438,10 @@ class Recorder:
         """
         if self.closed:
             return
-        failures: list[Exception] = []
+        failures = _Failures()
         with self._leaving_if_interrupted():
             self._finisher.stop()
-            with _raising_later(failures):
+            with failures:
                 self._end_recordings()
             self._trackers.end()
             pending = self._write_last_results()
@@ -446,8 +454,7 @@ class Recorder:
                 "video" if pending == 1 else "videos",
                 self.directory,
             )
-        if failures:
-            raise failures[0]
+        failures.raise_first()
         logger.info("Finished writing results. They are in %s.", self.directory)
 
     def failures(self) -> Mapping[str, str]:
@@ -500,20 +507,19 @@ class Recorder:
         if recording is None or recording.is_over:
             return
         end = self._decided_end(otherwise)
-        failures: list[Exception] = []
-        with _raising_later(failures):
+        failures = _Failures()
+        with failures:
             self._journal_end(otherwise)
-        with _raising_later(failures):
+        with failures:
             chosen = {} if kept is None else kept.chosen_facts()
             recording.end(end.facts, end.standing, chosen)
             if kept is not None and end.standing is Standing.CANDIDATE:
                 kept.hold(recording)
             else:
                 recording.hand_on()
-        with _raising_later(failures):
+        with failures:
             self._settle(None if kept is None else kept.settle)
-        if failures:
-            raise failures[0]
+        failures.raise_first()
 
     def _decided_end(self, otherwise: str) -> _End:
         """Return how the running episode has ended, which is decided once."""
@@ -555,8 +561,8 @@ class Recorder:
         is_chosen = self._choice.is_scheduled and end.standing is Standing.CHOSEN
         is_out = end.standing is Standing.DROPPED
         choice = {"chosen": is_chosen, "recording": None if is_out else recording.mode}
-        failures: list[Exception] = []
-        with _raising_later(failures):
+        failures = _Failures()
+        with failures:
             if end.episode is not None:
                 facts = {**vars(end.episode), **choice}
                 del facts["total_steps"]
@@ -566,8 +572,7 @@ class Recorder:
                 number = {"episode_id": recording.episode_id}
                 self._journal.note("cut", {**number, **reason, **choice})
         end.is_journaled = True
-        if failures:
-            raise failures[0]
+        failures.raise_first()
 
     def _tell_of_episode(self) -> None:
         end, video = self._end, self.video_recorder
@@ -579,26 +584,25 @@ class Recorder:
     def _end_recordings(self) -> None:
         """End whatever runs; what fails stops nothing else. Idempotent."""
         self.fast = None
-        failures: list[Exception] = []
-        with _raising_later(failures):
+        failures = _Failures()
+        with failures:
             if self._clips is not None:
                 self._clips.close(self._ending or {"reason": CLOSE})
-        with _raising_later(failures):
+        with failures:
             self._take_last_frame()
-        with _raising_later(failures):
+        with failures:
             self._end_episode()
-        with _raising_later(failures):
+        with failures:
             self._settle(None if self._kept is None else self._kept.decide)
         for states in self._states:
             # A trajectory without its model is worth nothing, and what stores it may
             # end with the process.
-            with _raising_later(failures):
+            with failures:
                 self._finish_models(states)
         for logs in (self.run.logs, self.run.clip_logs):
-            with _raising_later(failures):
+            with failures:
                 self._settle(logs.close)
-        if failures:
-            raise failures[0]
+        failures.raise_first()
 
     def _finish_models(self, states: Capture) -> None:
         try:
@@ -679,15 +683,26 @@ class Recorder:
         return len(listing.pending)
 
 
-@contextlib.contextmanager
-def _raising_later(
-    failures: list[Exception], kind: type[Exception] = Exception
-) -> Iterator[None]:
-    """Go on after an error: whoever has the list raises the first at the end."""
-    try:
-        yield
-    except kind as error:
-        failures.append(error)
+class _Failures:
+    """Inside it an error stops nothing else; the first is raised when all is done."""
+
+    def __init__(self) -> None:
+        self._first: Exception | None = None
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, _: object) -> bool:
+        if isinstance(error, Exception):
+            self.note(error)
+            return True
+        return False
+
+    def note(self, error: Exception) -> None:
+        self._first = self._first or error
+
+    def raise_first(self) -> None:
+        if self._first is not None:
+            raise self._first
 
 
 # Asking the system for the process's number at every step takes as long as counting it.

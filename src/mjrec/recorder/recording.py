@@ -135,8 +135,12 @@ class Recording:
         """Note the action of the coming step, which the environment may overwrite."""
         if self.is_stopped:
             return
-        if self._span is None:
-            self._action = action_array(action)
+        if self._span is None and action is not None:
+            usual = self._run.action
+            if usual is None or not usual.set(action):
+                usual = action_array(action)
+                self._run.action = usual or self._run.action
+            self._action = usual
         if self._action is not None and not self._action.set(action):
             self._note_irregular("actions")
 
@@ -275,10 +279,14 @@ class Recording:
         # Of another size the last word would have what stands behind it in memory.
         if start is None or start.words is None or action is None or action.size % 8:
             return None
+        known = self._run.row_words
+        if known is None or known[0] is not start.words or known[1] is not action:
+            words = np.concatenate([start.words, words_of([action.values])])
+            self._run.row_words = known = start.words, action, words
         return gathering(
             self._run.stats,
             span,
-            np.concatenate([start.words, words_of([action.values])]),
+            known[2],
             set_action=action.set,
             is_current=start.is_current,
             stride=self._stride,
@@ -286,7 +294,7 @@ class Recording:
 
     def _begin(self) -> SpanWriter:
         action, observation = self._action, self._observation
-        dtype = row_dtype(
+        dtype = _row_dtype(
             state=self._state,
             snapshot=self._snapshot,
             action=None if action is None else action.kind,
@@ -376,23 +384,36 @@ class Recording:
                 what,
             )
 
-    def _measured_pace(self) -> dict[str, Any]:
+    def _measured_pace(self) -> Mapping[str, Any]:
         """Measure the time of a step over the first one, and choose the stride."""
         began, now = self._first_time, self._run.subject.clock()
-        elapsed = None if began is None or now is None else now - began
-        is_known = elapsed is not None and elapsed > 0
-        rate = _rate_of(elapsed) if is_known else self._run.subject.declared()
-        self._stride = _stride_for(rate, self._max_fps)
-        return {
-            "rate": str(rate),
-            "timestep": str(1 / rate) if is_known else None,
-            "stride": self._stride,
-        }
+        if began is None or now is None or now <= began:
+            facts = _pace(self._run.subject.declared(), None, self._max_fps)
+        else:
+            facts = _measured(now - began, self._max_fps)
+        self._stride = facts["stride"]
+        return facts
+
+
+def _pace(
+    rate: Fraction, timestep: Fraction | None, max_fps: float | Fraction | None
+) -> Mapping[str, Any]:
+    return {
+        "rate": str(rate),
+        "timestep": None if timestep is None else str(timestep),
+        "stride": stride_for(rate, max_fps),
+    }
+
+
+# Mostly of one kind in all episodes; that two dtypes are one is told at once then.
+_row_dtype = functools.lru_cache(maxsize=8)(row_dtype)
 
 
 # Of the same few steps in each episode; fractions take Python long.
-_rate_of = functools.lru_cache(maxsize=64)(rate_from_timestep)
-_stride_for = functools.lru_cache(maxsize=64)(stride_for)
+@functools.lru_cache(maxsize=64)
+def _measured(seconds: float, max_fps: float | Fraction | None) -> Mapping[str, Any]:
+    rate = rate_from_timestep(seconds)
+    return _pace(rate, 1 / rate, max_fps)
 
 
 def _words(kind: np.dtype[Any] | None) -> int:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ClosedError, InvalidArgument, ResetNeeded, ResetNotAllowed
-from ..formats.stats_file import StatsFile, write_stats_file
+from ..formats.manifest import StatsFile, write_stats_file
 
 _TYPES = ("t", "e")
 

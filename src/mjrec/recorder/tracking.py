@@ -154,6 +154,10 @@ class Trackers:
         self._episodes: dict[int, FinishedEpisode] = {}
         self._tell(None, "begin")
 
+    def __bool__(self) -> bool:
+        """Whether anybody listens."""
+        return bool(self._trackers)
+
     def expect(self, video: Path) -> None:
         """Watch for the first video of an episode or a clip, whoever makes it."""
         if self._trackers:

@@ -7,13 +7,13 @@ gym from 0.7.4 to 0.22 wrote.
 
 from __future__ import annotations
 
-from .detection import (
+from .episodes import Episode, iter_episodes
+from .merging import load_results, merge_stats_files
+from .monitor_files import (
     clear_monitor_files,
     detect_monitor_files,
     detect_training_manifests,
 )
-from .episodes import Episode, iter_episodes
-from .merging import load_results, merge_stats_files
 
 __all__ = [
     "Episode",

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry, read_journal
-from ..formats.stats_file import StatsFile
+from ..formats.manifest import StatsFile
 from .journal_or_stats import MonitorResults
 from .monitor_files import MonitorFiles, monitors_of
 

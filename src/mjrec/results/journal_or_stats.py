@@ -15,14 +15,14 @@ import logging
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry, read_journal
 from ..formats.json_fields import json_object
-from ..formats.manifest import Manifest, read_manifest
-from ..formats.stats_file import StatsFile, read_stats_file
+from ..formats.manifest import Manifest, StatsFile, read_manifest, read_stats_file
 from .monitor_files import MonitorFiles
 from .run import Run
 
@@ -86,20 +86,24 @@ class MonitorResults:
 
     @functools.cached_property
     def run(self) -> Run:
-        """What the journal says; where there is none, a run without a fact.
+        """What the journal says, or where its beginning is gone, the manifest.
 
         Raises:
             UnreadableFile: it cannot be read, and there are no statistics either.
         """
-        if self.files.journal is None:
-            return Run()
+        run = Run()
         try:
-            return Run.read(self.files.journal)
+            if self.files.journal is not None:
+                run = Run.read(self.files.journal)
         except UnreadableFile as error:
             if self.saved is None:
                 raise
             self._say(error, "statistics file")
-            return Run()
+        if run.facts or self.manifest is None:
+            return run
+        of_manifest = Run.of_manifest(self.manifest)
+        last = max(run.last_episode_id, of_manifest.last_episode_id)
+        return replace(of_manifest, count=run.count, last_episode_id=last)
 
     @functools.cached_property
     def promised(self) -> set[int]:
@@ -108,9 +112,7 @@ class MonitorResults:
         Raises:
             UnreadableFile: as `run`.
         """
-        if self.run.facts or self.manifest is None:
-            return self.run.promised
-        return Run.of_manifest(self.manifest).promised
+        return self.run.promised
 
     @property
     def details(self) -> Mapping[str, Any]:

@@ -17,7 +17,14 @@ from typing import Any
 from .. import json_text
 from ..errors import DirectoryNotWritable, UnreadableFile
 from ..formats.locks import is_locked, wait_for_lock
-from ..formats.manifest import GYM_VERSION, Manifest, read_manifest, write_manifest
+from ..formats.manifest import (
+    GYM_VERSION,
+    Manifest,
+    StatsFile,
+    read_manifest,
+    write_manifest,
+    write_stats_file,
+)
 from ..formats.monitor_directory import (
     ClipPart,
     Infix,
@@ -35,7 +42,6 @@ from ..formats.monitor_directory import (
 )
 from ..formats.render_failures import forget_failure, reason_of
 from ..formats.spans import FINISHED, is_in_flight
-from ..formats.stats_file import StatsFile, write_stats_file
 from ..formats.video_metadata import (
     finished_videos,
     is_broken,
@@ -147,11 +153,7 @@ def write_manifest_and_stats(
                 is_new_stats = stats != results.saved
                 if is_new_stats:
                     write_stats_file(directory / name, stats)
-        if run is None:
-            run = results.run
-            if not run.facts and old is not None:
-                run = Run.of_manifest(old)
-        manifest = _manifest(directory, infix, run, stats_name=name)
+        manifest = _manifest(directory, infix, run or results.run, stats_name=name)
         is_new_manifest = old is None or _as_read(manifest) != old
         if is_new_manifest:
             write_manifest(directory / manifest_name(infix), manifest)

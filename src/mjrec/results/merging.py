@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..formats.manifest import GYM_VERSION
-from ..formats.stats_file import StatsFile, read_stats_file
+from ..formats.manifest import GYM_VERSION, StatsFile, read_stats_file
 from ..formats.video_metadata import is_broken
 from .journal_or_stats import MonitorResults
 from .monitor_files import monitors_of

@@ -24,7 +24,7 @@ from .fields import (
     empty_model,
     holder_of,
     member_names,
-    read_member,
+    read_fields,
     struct_names,
 )
 from .raw_memory import address_of, raw_memory
@@ -102,7 +102,8 @@ class Looks:
         What is there now counts as seen.
         """
         pieces = [*self._light, *self._heavy]
-        return self._read(name for piece in pieces for name in piece.look_from_stored())
+        names = (name for piece in pieces for name in piece.look_from_stored())
+        return read_fields(self._model, names)
 
     def changed(self, *, anything: bool = False) -> dict[str, NDArray[Any]] | None:
         """Return the watched fields that are other than when last looked at.
@@ -116,16 +117,8 @@ class Looks:
         if not anything and self.seen == self.present:
             return None
         pieces = [*self._light, *self._view, *(self._heavy if anything else ())]
-        return self._read(name for piece in pieces for name in piece.look()) or None
-
-    def _read(self, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-        values = {}
-        for name in names:
-            struct, _, member = name.partition(".")
-            is_of_view = struct in self._structs
-            holder = self._structs[struct] if is_of_view else self._model
-            values[name] = read_member(holder, member if is_of_view else name)
-        return values
+        names = (name for piece in pieces for name in piece.look())
+        return read_fields(self._model, names, **self._structs) or None
 
 
 class _Piece:

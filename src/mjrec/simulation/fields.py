@@ -80,9 +80,22 @@ def read_member(struct: object, name: str) -> NDArray[Any]:
     return np.array(getattr(*holder_of(struct, name)))
 
 
-def read_fields(model: mujoco.MjModel, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Return copies of fields of a model; single numbers as arrays of no dimension."""
-    return {name: read_member(model, name) for name in names}
+def read_fields(
+    model: mujoco.MjModel, names: Iterable[str], **view: Any
+) -> dict[str, NDArray[Any]]:
+    """Return copies of fields; single numbers as arrays of no dimension.
+
+    Args:
+        model: the model.
+        names: of its fields, or those that begin with `camera.` and `option.`.
+        view: the `camera` and the `option`.
+    """
+    values = {}
+    for name in names:
+        struct, _, member = name.partition(".")
+        holder, own = (view[struct], member) if struct in view else (model, name)
+        values[name] = read_member(holder, own)
+    return values
 
 
 def apply_fields(

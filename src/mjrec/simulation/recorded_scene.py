@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import FileNotWritten, InvalidArgument, UnreadableFile
 from ..formats.trajectory import ModelChange, TrajectoryReader
 from .cameras import check_camera, raw_model
-from .fields import apply_fields, read_member
+from .fields import apply_fields, read_fields
 from .model_sources import with_embedded_files
 from .model_store import load_model
 from .renderer import is_kept_by_context
@@ -100,20 +100,13 @@ class RecordedScene:
         while self._next is not None and self._next.step <= step:
             fields.update(self._next.fields)
             self._next = next(self._changes, None)
+        view = {"camera": self.view.camera, "option": self.view.option}
         for name in fields.keys() - self._originals.keys():
             # One that there is not is an error of `apply_fields`.
             with contextlib.suppress(AttributeError):
-                self._originals[name] = self._read(name)
-        apply_fields(
-            self.model, fields, camera=self.view.camera, option=self.view.option
-        )
+                self._originals |= read_fields(self.model, [name], **view)
+        apply_fields(self.model, fields, **view)
         return fields
-
-    def _read(self, name: str) -> NDArray[Any]:
-        struct, _, member = name.partition(".")
-        if struct in ("camera", "option"):
-            return read_member(getattr(self.view, struct), member)
-        return read_member(self.model, name)
 
     def _row(self, index: int) -> Any:
         """Return a snapshot; they are read in blocks."""

@@ -12,9 +12,8 @@ from typing import Any
 from ...errors import UnreadableFile
 from ...formats.journal import JournalEntry, JournalReader
 from ...formats.json_fields import read_object
-from ...formats.manifest import Manifest, read_manifest
+from ...formats.manifest import Manifest, StatsFile, read_manifest, read_stats_file
 from ...formats.monitor_directory import episode_of
-from ...formats.stats_file import StatsFile, read_stats_file
 from ...formats.video_metadata import metadata_path
 from ...formats.video_names import view_of
 from ...results.monitor_files import MonitorFiles, monitors_of
