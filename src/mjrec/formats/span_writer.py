@@ -29,6 +29,7 @@ from .spans import (
     LOG,
     LOOKS,
     append_line,
+    create_list,
     remove_if_done,
     remove_list,
 )
@@ -158,12 +159,13 @@ class OpenLog:
         self._looks: int | None = None
         line = {"format": FORMAT, "version": FORMAT_VERSION, "rows": dtype.descr}
         # First of all, so that whatever a killed process leaves is found.
-        append_line(path, {**line, "facts": dict(facts)}, is_first=True)
+        self._list: int | None = create_list(path, {**line, "facts": dict(facts)})
         try:
             self.rows = RowLog(
                 path.with_suffix(LOG), dtype.itemsize // 8, tail_bytes=tail_bytes
             )
         except BaseException:
+            os.close(self._list)
             remove_list(path)
             raise
         slots = self.rows.slots
@@ -179,6 +181,14 @@ class OpenLog:
         is_short = self.rows.size + self.look_size < _LONG
         is_free = self.rows.is_open and not self.is_alone
         return is_short and is_free and self._dtype == dtype
+
+    def say(self, values: Mapping[str, Any]) -> None:
+        """Add a line to the list.
+
+        Raises:
+            FileNotWritten: the disk is full, or the list was removed.
+        """
+        append_line(self.path, values, descriptor=self._list)
 
     def add_change(self, change: ModelChange) -> None:
         """Add a change of the model that holds from the next row on.
@@ -207,7 +217,7 @@ class OpenLog:
         """
         try:
             self.rows.write()
-            append_line(self.path, {"closed": True})
+            self.say({"closed": True})
         except FileNotWritten:
             if not self.path.exists():
                 # The directory was removed; there is nothing to try again.
@@ -222,9 +232,11 @@ class OpenLog:
     def release(self) -> None:
         """Let go of the files as they are. Idempotent."""
         self.rows.release()
-        if self._looks is not None:
-            os.close(self._looks)
-            self._looks = None
+        for descriptor in (self._list, self._looks):
+            if descriptor is not None:
+                os.close(descriptor)
+        # Whatever is said of a recording after this goes by the path.
+        self._list = self._looks = None
 
 
 class SpanWriter:
@@ -260,7 +272,7 @@ class SpanWriter:
         without = [key for key in log.facts if key not in facts]
         line = {"begin": name, "row": self._first_row, "look": log.look_size}
         line |= {"facts": own, **({"without": without} if without else {})}
-        append_line(log.path, line)
+        log.say(line)
 
     @property
     def size(self) -> int:
@@ -321,7 +333,7 @@ class SpanWriter:
         """Add to the facts; on a full disk they wait for the next note or the end."""
         self._unsaid.update(facts)
         with contextlib.suppress(FileNotWritten):
-            append_line(self.log.path, {"note": self._name, "facts": self._unsaid})
+            self.log.say({"note": self._name, "facts": self._unsaid})
             self._unsaid = {}
 
     def end(self, facts: Mapping[str, Any]) -> None:
@@ -335,7 +347,7 @@ class SpanWriter:
             ending = {"end": self._name, "row": self.log.rows.count}
             self._ending = {**ending, "facts": {**self._unsaid, **facts}}
         if not self._has_ended:
-            append_line(self.log.path, self._ending)
+            self.log.say(self._ending)
             self._has_ended = True
 
     def drop(self) -> None:
@@ -345,5 +357,5 @@ class SpanWriter:
             FileNotWritten: the disk is full.
         """
         if not self._is_dropped:
-            append_line(self.log.path, {"drop": self._name})
+            self.log.say({"drop": self._name})
             self._is_dropped = True

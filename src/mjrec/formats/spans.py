@@ -55,6 +55,7 @@ FORMAT = "mjrec spans"
 SPANS, LOG, LOOKS, FINISHED = ".spans", ".log", ".looks", ".h5"
 
 _LONGEST_LINE = 1 << 26
+_APPENDING = os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW
 
 
 @dataclass
@@ -186,38 +187,68 @@ class SpanList:
             self.recordings[values["note"]].facts.update(mapping(values["facts"]))
 
 
+def create_list(path: Path, first_line: Mapping[str, Any]) -> int:
+    """Make a list, and return a descriptor for `append_line`.
+
+    Raises:
+        FileNotWritten: the disk is full, or the directory is gone; nothing is left.
+    """
+    try:
+        descriptor = os.open(path, _APPENDING | os.O_CREAT | os.O_EXCL, 0o666)
+    except OSError as error:
+        raise FileNotWritten(path, error.strerror or error) from error
+    try:
+        append_line(path, first_line, descriptor=descriptor)
+    except BaseException:
+        os.close(descriptor)
+        with contextlib.suppress(OSError):
+            path.unlink()
+        raise
+    return descriptor
+
+
 def append_line(
-    path: Path, values: Mapping[str, Any], *, is_first: bool = False
+    path: Path, values: Mapping[str, Any], *, descriptor: int | None = None
 ) -> None:
     """Add a line to a list, whole or not at all.
 
+    Args:
+        path: of the list.
+        values: of the line.
+        descriptor: of the list, where it is open.
+
     Raises:
-        FileNotWritten: the disk is full, and the list says what it said before; or
-            the line is longer than any that is read.
+        FileNotWritten: the disk is full, and the list says what it said before; the
+            list was removed; or the line is longer than any that is read.
     """
-    flags = os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW
-    flags |= os.O_CREAT | os.O_EXCL if is_first else 0
+    line = dumps(values).encode() + b"\n"
     try:
-        descriptor = os.open(path, flags, 0o666)
+        if len(line) > _LONGEST_LINE:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+        if descriptor is not None:
+            _append(descriptor, line)
+            return
+        descriptor = os.open(path, _APPENDING)
         try:
-            size = os.fstat(descriptor).st_size
-            line = dumps(dict(values)).encode() + b"\n"
-            if size and os.pread(descriptor, 1, size - 1) != b"\n":
-                # The torn end says nothing, also where nothing but its end is missing.
-                line = b"?\n" + line
-            if len(line) > _LONGEST_LINE:
-                raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
-            written = os.write(descriptor, line)
-            if written != len(line):
-                _take_back(descriptor, written)
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            _append(descriptor, line)
         finally:
             os.close(descriptor)
     except OSError as error:
-        if is_first and not isinstance(error, FileExistsError):
-            with contextlib.suppress(OSError):
-                path.unlink()
         raise FileNotWritten(path, error.strerror or error) from error
+
+
+def _append(descriptor: int, line: bytes) -> None:
+    status = os.fstat(descriptor)
+    if status.st_nlink == 0:
+        # What is written there is nowhere.
+        raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
+    if status.st_size and os.pread(descriptor, 1, status.st_size - 1) != b"\n":
+        # The torn end says nothing, also where nothing but its end is missing.
+        line = b"?\n" + line
+    written = os.write(descriptor, line)
+    if written != len(line):
+        _take_back(descriptor, written)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _take_back(descriptor: int, written: int) -> None:
