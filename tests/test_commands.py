@@ -421,6 +421,7 @@ def test_list_says_which_videos_are_pending(mjrec: Any, tmp_path: Path) -> None:
                 options=None,
                 terminated=True,
                 truncated=False,
+                recording="deferred" if number else None,
             )
         )
     journal.close()

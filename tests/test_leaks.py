@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium
 from parts import parametrize
 from processes import children
+from waiting import wait_until
 
 from mjrec import Monitor, load_results
 
@@ -87,6 +88,8 @@ def test_recorded_episodes_leave_nothing(workers: int, tmp_path: Path) -> None:
         workers=workers,
     )
     run(monitor, WARM_UP)
+    # What looks for the run's provenance has ended then; what renders stays.
+    wait_until(lambda: len(children()) <= workers)
     warm = held()
     run(monitor, EPISODES - WARM_UP)
     late = held()

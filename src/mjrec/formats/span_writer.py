@@ -232,6 +232,7 @@ class OpenLog:
     def release(self) -> None:
         """Let go of the files as they are. Idempotent."""
         self.rows.release()
+        self.bodies, self.columns = [], {}
         for descriptor in (self._list, self._looks):
             if descriptor is not None:
                 os.close(descriptor)

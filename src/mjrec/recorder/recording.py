@@ -241,6 +241,8 @@ class Recording:
             FileNotWritten: the disk is full, and that is not tolerated; the next call
                 tries again.
         """
+        # It holds the log's memory.
+        self._fast = None
         try:
             (self._span or self._begin()).end(facts)
             if self._is_alone:
