@@ -158,8 +158,7 @@ def _step_limit(environment: Any) -> int:
 def _dm_control_view(environment: Any, options: EnvironmentOptions) -> dict[str, Any]:
     if not options.pictures:
         return {}
-    from ..simulation.cameras import resolve_camera
-    from .default_camera import default_camera
+    from ..simulation.cameras import default_camera, resolve_camera
 
     model = environment.physics.model
     if options.camera is None:

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument, NoPictures
 from ..frames import Frame, check_size
-from ..simulation.cameras import camera_label, resolve_camera
+from ..simulation.cameras import camera_label, default_camera, resolve_camera
 from ..simulation.mjcf import MjcfSimulation, load_mjcf
 from ..simulation.renderer import SceneRenderer
-from .default_camera import default_camera
 from .options import EnvironmentOptions
 
 _SIDE = 480

@@ -26,6 +26,7 @@ TIMEOUT = 60.0
 # How long after its own end of patience the child is killed.
 _GRACE = 5.0
 _END_OF_OUTPUT = 4000
+_SAID = ("renders", "gl_renderer", "gl_vendor", "gl_version", "frames_per_second")
 _SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|SwiftShader|software", re.IGNORECASE)
 
 
@@ -134,25 +135,17 @@ def probe_environment(
     """
     backend = environ["MUJOCO_GL"]
     facts, output = _ask_child(environ, measure=measure, timeout=timeout)
+    known = {name: facts[name] for name in _SAID if name in facts}
     devices = tuple(EglDevice(**device) for device in facts.get("devices", ()))
-    if facts.get("renders"):
-        return Probe(
-            backend=backend,
-            renders=True,
-            gl_renderer=facts.get("gl_renderer", ""),
-            gl_vendor=facts.get("gl_vendor", ""),
-            gl_version=facts.get("gl_version", ""),
-            frames_per_second=facts.get("frames_per_second"),
-            devices=devices,
-        )
+    if known.get("renders"):
+        return Probe(backend=backend, devices=devices, **known)
     # The words of a failure that nobody has explained yet are its cause.
     words = "\n".join(list(filter(str.strip, output.splitlines()))[-3:])
     found = diagnose(output, backend=backend, environ=environ) or Diagnosis(
         words or "The child process said nothing.", ""
     )
     return Probe(
-        backend,
-        False,
+        *(backend, False),
         devices=devices,
         cause=found.cause,
         fix=found.fix,

@@ -157,6 +157,46 @@ def tracking_camera(model: Any) -> str | int | None:
     return model.camera(candidates[0]).name or candidates[0]
 
 
+def default_camera(model: Any) -> str | int:
+    """Return the camera that follows the robot, else the first, else the free one.
+
+    Robots leave the frame of a camera that does not follow them. Where none follows,
+    the author's first camera knows more of the scene than MuJoCo's free one.
+
+    Returns:
+        A name, or a number for a camera that has no name; -1 is the free camera.
+    """
+    tracking = tracking_camera(model)
+    if tracking is not None:
+        return tracking
+    model = raw_model(model)
+    return (model.camera(0).name or 0) if model.ncam else FREE_CAMERA
+
+
+def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, Any]:
+    """Return a camera as metadata says it: a name, a number, or a free camera's pose.
+
+    Args:
+        model: has the camera.
+        camera: a name, a number (-1 is the free camera) or an `mujoco.MjvCamera`.
+    """
+    if isinstance(camera, str):
+        return camera
+    if isinstance(camera, mujoco.MjvCamera):
+        if int(camera.type) != int(mujoco.mjtCamera.mjCAMERA_FIXED):
+            return {
+                "type": mujoco.mjtCamera(camera.type).name,
+                "trackbodyid": int(camera.trackbodyid),
+                "lookat": camera.lookat.tolist(),
+                "distance": float(camera.distance),
+                "azimuth": float(camera.azimuth),
+                "elevation": float(camera.elevation),
+            }
+        camera = camera.fixedcamid
+    number = int(camera)
+    return number if number < 0 else model.camera(number).name or number
+
+
 def _travels(model: mujoco.MjModel, body: int) -> bool:
     root = model.body_rootid[body]
     joints = model.jnt_type[model.jnt_bodyid == root]
@@ -175,7 +215,13 @@ def _unwrapped(holder: object, kind: type) -> Any:
 
 def _camera_index(model: mujoco.MjModel, camera: object) -> int:
     if isinstance(camera, str):
-        return _index_of_name(model, camera)
+        kind = int(mujoco.mjtObj.mjOBJ_CAMERA)
+        # An empty name would find the first nameless camera.
+        index = mujoco.mj_name2id(model, kind, camera) if camera else -1
+        if index < 0:
+            hint = "Or give -1, the free camera."
+            raise UnknownName("camera", camera, camera_names(model), hint=hint)
+        return int(index)
     if isinstance(camera, bool) or not isinstance(camera, int | np.integer):
         raise InvalidArgument(
             "A camera is a name, a number or a mujoco.MjvCamera, got "
@@ -187,44 +233,3 @@ def _camera_index(model: mujoco.MjModel, camera: object) -> int:
             f"Give a number from -1 (the free camera) to {model.ncam - 1}."
         )
     return int(camera)
-
-
-def _index_of_name(model: mujoco.MjModel, name: str) -> int:
-    # An empty name would find the first nameless camera.
-    index = (
-        mujoco.mj_name2id(model, int(mujoco.mjtObj.mjOBJ_CAMERA), name) if name else -1
-    )
-    if index < 0:
-        raise UnknownName(
-            "camera", name, camera_names(model), hint="Or give -1, the free camera."
-        )
-    return int(index)
-
-
-def camera_label(model: mujoco.MjModel, camera: Any) -> str | int | dict[str, Any]:
-    """Return a camera as metadata says it: a name, a number, or a free camera's pose.
-
-    Args:
-        model: has the camera.
-        camera: a name, a number (-1 is the free camera) or an `mujoco.MjvCamera`.
-    """
-    if isinstance(camera, str):
-        return camera
-    if not isinstance(camera, mujoco.MjvCamera):
-        return _name_or_number(model, int(camera))
-    if int(camera.type) == int(mujoco.mjtCamera.mjCAMERA_FIXED):
-        return _name_or_number(model, camera.fixedcamid)
-    return {
-        "type": mujoco.mjtCamera(camera.type).name,
-        "trackbodyid": int(camera.trackbodyid),
-        "lookat": camera.lookat.tolist(),
-        "distance": float(camera.distance),
-        "azimuth": float(camera.azimuth),
-        "elevation": float(camera.elevation),
-    }
-
-
-def _name_or_number(model: mujoco.MjModel, number: int) -> str | int:
-    # Unnamed cameras have an empty name.
-    name = model.cam(number).name if number >= 0 else ""
-    return name if name in camera_names(model) and name else number

@@ -125,8 +125,8 @@ def draw_test_scene(
     return lambda: renderer.render(data), renderer.gl_facts
 
 
-def main() -> int:
-    """Try the backend that `MUJOCO_GL` names and return the exit status."""
+def main() -> None:
+    """Try the backend that `MUJOCO_GL` names."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--measure", action="store_true", help="measure the speed too")
     parser.add_argument(
@@ -138,13 +138,22 @@ def main() -> int:
     faulthandler.dump_traceback_later(arguments.seconds, exit=True)
     say = _reporter()
     backend = os.environ.get("MUJOCO_GL", "")
+    facts: dict[str, Any] = {}
     try:
-        _draw_and_report(say, backend, measure=arguments.measure)
+        draw, facts = draw_test_scene(_SIZE)
+        say(renders=True, **facts)
+        if arguments.measure:
+            say(frames_per_second=_frames_per_second(draw))
     except Exception as error:  # Whatever it is, it is the answer.
         say(notes=list(_notes(backend)), error=_text_of(error))
-        _report_devices(say, backend)
-        return 1
-    return 0
+    # Last, because asking for CUDA's numbers begins CUDA, which may fail or hang.
+    if backend == "egl":
+        used = facts.get("gl_device", {}).get("index")
+        devices = [
+            {**dataclasses.asdict(device), "in_use": device.index == used}
+            for device in egl_devices()
+        ]
+        say(devices=devices)
 
 
 def _reporter() -> Callable[..., None]:
@@ -157,27 +166,6 @@ def _reporter() -> Callable[..., None]:
         ours.flush()
 
     return say
-
-
-def _draw_and_report(say: Callable[..., None], backend: str, *, measure: bool) -> None:
-    draw, facts = draw_test_scene(_SIZE)
-    say(renders=True, **facts)
-    if measure:
-        say(frames_per_second=_frames_per_second(draw))
-    _report_devices(say, backend, facts.get("gl_device", {}).get("index"))
-
-
-def _report_devices(
-    say: Callable[..., None], backend: str, used: int | None = None
-) -> None:
-    # Last, because asking for CUDA's numbers begins CUDA, which may fail or hang.
-    if backend == "egl":
-        say(
-            devices=[
-                {**dataclasses.asdict(device), "in_use": device.index == used}
-                for device in egl_devices()
-            ]
-        )
 
 
 def _frames_per_second(draw: Callable[[], np.ndarray]) -> float:
@@ -268,6 +256,6 @@ def _text_of(error: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    status = main()
+    main()
     # Some versions of mujoco print tracebacks while contexts end at exit.
-    os._exit(status)
+    os._exit(0)

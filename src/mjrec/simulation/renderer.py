@@ -6,7 +6,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import weakref
-from types import TracebackType
 from typing import Any
 
 import mujoco
@@ -132,7 +131,10 @@ class Canvas:
             # Its own hook may come after EGL was shut down; the context has another.
             weakref.finalize(self, self._context.free).atexit = False
         with self._context.current():
-            limit = _largest_frame()
+            # The longest side that the driver can draw.
+            limits = np.zeros(1, np.int32)
+            raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limits)
+            limit = int(limits[0])
             if max(height, width) > limit:
                 raise InvalidArgument(
                     f"A frame of {width}x{height} pixels is larger than this OpenGL "
@@ -296,12 +298,7 @@ class SceneRenderer:
     def __enter__(self) -> SceneRenderer:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc_value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -333,10 +330,3 @@ def _with_settings(
         settings.offsamples = 0
         settings.shadowsize = min(settings.shadowsize, _DRAFT_SHADOW_MAP)
     return changed
-
-
-def _largest_frame() -> int:
-    """Return the longest side that the driver of the current context can draw."""
-    limit = np.zeros(1, np.int32)
-    raw_opengl().glGetIntegerv(_MAX_RENDERBUFFER_SIZE, limit)
-    return int(limit[0])
