@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import functools
 import hashlib
 import logging
@@ -227,8 +228,9 @@ def _append(directory: Path, digests: Iterable[str]) -> None:
         raise PermissionError(f"{base} is not root's")
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     with _opened(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND) as descriptor:
-        # In one piece, so that processes do not mix their lines; the first end of a
-        # line is for one that a full disk has cut off.
+        # Network file systems do not append in one piece.
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        # The first end of a line is for one that a full disk has cut off.
         text = "".join(f"\n{digest}" for digest in digests).encode() + b"\n"
         if os.write(descriptor, text) < len(text):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
