@@ -43,7 +43,7 @@ from mjrec.formats.trajectory_log import pack_change
 from mjrec.formats.video_metadata import is_broken
 from mjrec.json_text import dumps, loads
 from mjrec.rendering.recorded_facts import open_for_rendering
-from mjrec.results.manifest_and_stats import update_manifests
+from mjrec.results.manifest_writing import update_manifests
 
 FEW = settings(
     derandomize=True,

@@ -39,7 +39,7 @@ from mjrec.formats.manifest import read_manifest
 from mjrec.formats.monitor_directory import Infix, episode_of, infix_of
 from mjrec.formats.trajectory import ModelChange, row_dtype
 from mjrec.formats.trajectory_file import finish_trajectory
-from mjrec.results.manifest_and_stats import update_manifests
+from mjrec.results.manifest_writing import update_manifests
 from mjrec.simulation.model_sources import compile_sources
 from mjrec.simulation.model_trust import note_models
 

@@ -40,7 +40,7 @@ from mjrec.rendering.recordings import (
     look_at,
     may_be_left,
 )
-from mjrec.results.manifest_and_stats import write_manifest_and_stats
+from mjrec.results.manifest_writing import write_manifest_and_stats
 
 pytestmark = pytest.mark.usefixtures("painter")
 

@@ -41,7 +41,7 @@ from ..formats.video_metadata import is_done
 from ..rendering.jobs import RecordingKey
 from ..rendering.recorded_facts import open_for_rendering
 from ..rendering.recordings import claim, recorded_episodes
-from ..results.manifest_and_stats import manifest_lock, write_manifest_and_stats
+from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.run import Run
 
 # Under `scope`, in a manifest: the choice was made over all monitors of one.

@@ -26,7 +26,7 @@ from ..formats.monitor_directory import (
 from ..formats.render_failures import note_failure, reason_of
 from ..formats.spans import FINISHED
 from ..provenance import versions
-from ..results.manifest_and_stats import write_manifest_and_stats
+from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
 from .ending_reasons import CLOSE, RESET, ending
 from .episode_choice import EpisodeChoice

@@ -24,7 +24,7 @@ from ..formats import render_failures
 from ..formats.second_names import give_all_second_names
 from ..formats.spans import drop_recording, list_paths, remove_if_done
 from ..formats.trajectory_file import finish_trajectory
-from ..results.manifest_and_stats import update_manifests
+from ..results.manifest_writing import update_manifests
 from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
 from .pool import SharedPool
 from .recorded_facts import further_video_paths, video_facts

@@ -114,7 +114,7 @@ def recover(
         return Recovery(path, open_monitors=open_monitors)
     # Not at the top: it loads HDF5, which a simulation that goes on where a closed
     # monitor left off has no use for.
-    from .dead_monitors import Report, put_in_order
+    from .cut_episodes import Report, put_in_order
 
     report = Report(deadline=deadline)
     try:

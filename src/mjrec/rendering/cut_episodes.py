@@ -41,7 +41,7 @@ from ..formats.trajectory_file import (
 )
 from ..formats.video_metadata import is_done
 from ..results.journal_or_stats import MonitorResults, locked_run
-from ..results.manifest_and_stats import (
+from ..results.manifest_writing import (
     Written,
     manifest_lock,
     write_manifest_and_stats,

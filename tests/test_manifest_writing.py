@@ -14,7 +14,7 @@ from recordings import events_of, manifest_of, stats_of
 
 import mjrec
 from mjrec.formats.monitor_directory import Infix
-from mjrec.results.manifest_and_stats import write_manifest_and_stats
+from mjrec.results.manifest_writing import write_manifest_and_stats
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "deferred": {"video_callable": lambda episode: episode % 2 == 0},
