@@ -108,7 +108,8 @@ def record(
                 each_step(step)
                 outcome = monitor.step(_action(env, random))
                 frames.append(picture())
-                if isinstance(outcome, tuple) and True in outcome[2:4]:
+                # A dm_env's discount is 1 while the episode goes on.
+                if hasattr(env, "action_space") and any(outcome[2:4]):
                     break
             live.append(frames)
         monitor.close(wait=False)
