@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from full_disk import file_size_limit
 from result_files import ENV_INFO, entry, write_journal, write_saved
 from trajectories_by_hand import write_log
 
@@ -186,3 +187,10 @@ def test_joining_leaves_dead_monitors_as_they_are(
     assert not any(path.exists() for path in left)
     assert dead.exists()
     assert "Not recovered" not in caplog.text
+
+
+def test_failed_opening_removes_what_it_made(tmp_path: Path) -> None:
+    """On a full disk; directories made on the way go again."""
+    with file_size_limit(0), pytest.raises(DirectoryNotWritable):
+        monitor(tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()
