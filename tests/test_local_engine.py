@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,9 @@ from engine_runs import (
 )
 from interruption import ctrl_c_soon
 from processes import children
+from waiting import wait_until
 
-from mjrec.engines import worker
+from mjrec.engines import local, worker
 from mjrec.engines.jobs import Run, Work
 from mjrec.engines.local import LocalEngine
 from mjrec.errors import ClosedError, Error, GLError, InvalidArgument
@@ -307,6 +309,7 @@ if __name__ == "__main__":
 
 LEAVING = """
 import sys
+import threading
 from mjrec.engines.jobs import Job, Run, Work
 from mjrec.engines.local import LocalEngine
 run = Run(LocalEngine(1), Work(entry="odd_jobs:make"))
@@ -387,3 +390,13 @@ def test_import_is_inert() -> None:
         f"print(json.dumps([m for m in {heavy} if m in sys.modules]))"
     )
     assert json.loads(run_python("-c", script)) == []
+
+
+def test_threads_that_have_nothing_to_do_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An engine that was used and forgotten leaves none; one that is used has new."""
+    monkeypatch.setattr(local, "_SECONDS_IDLE", 0.05)
+    engine = LocalEngine(3)
+    for _ in range(2):
+        calls = [engine.submit(time.sleep, 0.01) for _ in range(6)]
+        assert [call.result() for call in calls] == [None] * 6
+        wait_until(lambda: "mjrec-worker" not in str(threading.enumerate()))

@@ -15,6 +15,8 @@ from ..machine import usable_cpus
 from . import worker
 from .gpu_shares import GpuShare, check_worker_count
 
+_SECONDS_IDLE = 5.0
+
 
 class LocalEngine(Executor):
     """Runs jobs in processes of this machine: threads, each with a child at work.
@@ -42,8 +44,10 @@ class LocalEngine(Executor):
         self.share = GpuShare(each=gpus, required=require_gpu)
         self.require_gpu = self.share.required if self.share.asked_for else None
         self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()
-        self._threads = 0
-        self._idle = threading.Semaphore(0)
+        # The numbers of the threads, and how many of them wait for a call.
+        self._seats: set[int] = set()
+        self._idle = 0
+        self._one_at_a_time = threading.Lock()
         self._is_shut_down = False
 
     def __repr__(self) -> str:
@@ -61,34 +65,50 @@ class LocalEngine(Executor):
         if self._is_shut_down:
             raise ClosedError("The engine was shut down.")
         call = _Call(fn, args, kwargs)
-        self._calls.put(call)
-        if not self._idle.acquire(blocking=False) and self._threads < self.workers:
-            # Daemons: a run that is forgotten must not hold up the interpreter's end.
-            threading.Thread(
-                target=self._work,
-                args=[self._threads],
-                name=f"mjrec-worker-{self._threads}",
-                daemon=True,
-            ).start()
-            self._threads += 1
+        with self._one_at_a_time:
+            self._calls.put(call)
+            if self._idle:
+                self._idle -= 1
+            elif len(self._seats) < self.workers:
+                seat = min({*range(self.workers)} - self._seats)
+                self._seats.add(seat)
+                # Daemons: a forgotten run must not hold up the interpreter's end.
+                threading.Thread(
+                    target=self._work,
+                    args=[seat],
+                    name=f"mjrec-worker-{seat}",
+                    daemon=True,
+                ).start()
         return call.future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Take no more calls, and let the threads end. Idempotent."""
         del wait, cancel_futures
-        if not self._is_shut_down:
-            self._is_shut_down = True
-            for _ in range(self._threads):
-                self._calls.put(None)
+        self._is_shut_down = True
+        for _ in range(self.workers):
+            self._calls.put(None)
 
-    def _work(self, number: int) -> None:
+    def _work(self, seat: int) -> None:
         if self.share.asked_for:
-            worker.seat.gpus = self.share.of(number, visible_gpus())
-        while (call := self._calls.get()) is not None:
+            worker.seat.gpus = self.share.of(seat, visible_gpus())
+        while True:
+            try:
+                call = self._calls.get(timeout=_SECONDS_IDLE)
+            except queue.Empty:
+                with self._one_at_a_time:
+                    if self._idle and self._calls.empty():
+                        # So that an engine is not kept by threads that wait for it.
+                        self._idle -= 1
+                        self._seats.remove(seat)
+                        return
+                continue
+            if call is None:
+                return
             call.do()
             # So that nothing of it lives on until the next one.
             del call
-            self._idle.release()
+            with self._one_at_a_time:
+                self._idle += 1
 
 
 class _Call:
