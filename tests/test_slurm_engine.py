@@ -40,7 +40,8 @@ def mark(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     mark = secrets.token_hex(8)
     monkeypatch.setenv(MARK, mark)
     yield mark
-    wait_until(lambda: not marked(mark))
+    # submitit waits for a minute for what it is to run, also where that is removed.
+    wait_until(lambda: not marked(mark), seconds=90, told=lambda: marked(mark))
 
 
 def engine(workers: int = 1, **options: Any) -> SlurmEngine:
