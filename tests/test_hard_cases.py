@@ -22,6 +22,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from compiled_tasks import growing
 from robots import robots_that_reset
 
 import mjrec
@@ -79,33 +80,6 @@ def play_task(env: Any, episodes: int) -> None:
         while not timestep.last():
             number += 1
             timestep = env.step(np.full(env.action_spec().shape, 0.1 * (number % 3)))
-
-
-def growing() -> Any:
-    """Return a composer task that compiles another model at each reset."""
-    from dm_control import composer
-
-    class Growing(composer.Task):  # type: ignore[misc]  # no stubs
-        root_entity = None
-
-        def __init__(self) -> None:
-            self.root_entity = composer.Arena()
-            world = self.root_entity.mjcf_model.worldbody
-            world.add("light", pos=(0, 0, 3))
-            world.add("camera", pos=(0, -3, 0.5), xyaxes=(1, 0, 0, 0, 0, 1))
-            self.set_timesteps(control_timestep=0.02, physics_timestep=0.002)
-            pole = world.add("body", pos=(0, 0, 0.5))
-            hinge = pole.add("joint", type="hinge", axis=(0, 1, 0))
-            self.box = pole.add("geom", type="box", size=(0.1, 0.1, 0.3))
-            self.root_entity.mjcf_model.actuator.add("motor", joint=hinge)
-
-        def initialize_episode_mjcf(self, random_state: Any) -> None:
-            self.box.size = random_state.uniform(0.1, 0.5, 3)
-
-        def get_reward(self, physics: Any) -> float:
-            return 1.0
-
-    return composer.Environment(Growing(), time_limit=0.08, random_state=3)
 
 
 def hashes(directory: Path) -> list[str]:

@@ -288,3 +288,9 @@ def test_an_evaluation_in_slurm_jobs_is_that_of_this_machine(tmp_path: Path) -> 
     assert recorded_in(there) == recorded_in(here)
     assert len(recorded_in(there)) == 4 + 1
     assert not (tmp_path / "there" / WORK_FOLDER).exists()
+
+
+def test_it_does_jobs_only() -> None:
+    """Their outcomes are files, which other functions would not write."""
+    with pytest.raises(InvalidArgument, match="executor of submitit's"):
+        engine().submit(len, "abc")

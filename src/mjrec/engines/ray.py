@@ -214,7 +214,7 @@ def _connect(ray: Any, address: str | None, cpus: int | None) -> bool:
 
 
 def _check_reachable(address: str) -> None:
-    """Raise OSError where nobody listens; Ray would try it for minutes."""
+    """Raise OSError where no cluster listens; Ray would try for minutes."""
     if address == "auto":
         # What Ray has noted of a cluster that need not run any more; a private name.
         with contextlib.suppress(ImportError, AttributeError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs on a Slurm cluster: arrays of Slurm jobs, each of which does some of ours.
+"""Jobs on a Slurm cluster: arrays of Slurm jobs, and each does some of ours.
 
 The outcomes of a run are files in its folder, which all machines see, so that nothing
 depends on one Slurm job's life: a job that Slurm begins again does what it has not
@@ -188,12 +188,16 @@ class SlurmEngine(Executor):
 
         Raises:
             ClosedError: it was shut down.
+            InvalidArgument: it is another function.
         """
         if self._is_shut_down:
             raise ClosedError("The engine was shut down.")
+        if fn is not do_job or len(args) != 1 or kwargs:
+            raise InvalidArgument(
+                "SlurmEngine does only jobs of mjrec, whose outcomes are files. For "
+                "other functions use an executor of submitit's."
+            )
         [message] = args
-        assert fn is do_job
-        assert not kwargs
         place = message["work"]["place"]
         if place not in self._runs:
             self._runs[place] = ArrayRun(

@@ -122,7 +122,7 @@ class ArrayRun:
         self._cluster.end([job for job, numbers in self._elements.items() if numbers])
         deadline = time.monotonic() + _SECONDS_TO_END
         while self._elements and time.monotonic() < deadline:
-            # A question that is not answered ends nobody's patience.
+            # Where Slurm does not answer, the deadline ends this.
             states = self._cluster.states(self._elements)
             for job in [job for job, state in states.items() if state.is_over]:
                 del self._elements[job]

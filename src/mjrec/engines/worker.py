@@ -210,7 +210,7 @@ class _Child:
         while True:
             ready, _, _ = select.select(self._sources, [], [], _SECONDS_BETWEEN_LOOKS)
             if self._output in ready and not self._pass_on_output():
-                # A reader that is told of the end again and again would not sleep.
+                # Else `select` returns at once for ever.
                 self._sources.remove(self._output)
             if self._socket in ready:
                 try:
@@ -299,7 +299,7 @@ def _end(
     if os.getpid() != owner:
         return
     process.kill()
-    # One whose driver does not return cannot die; nobody waits for that.
+    # A process inside a driver call that never returns cannot be killed.
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(_SECONDS_TO_DIE)
     for file in files:
