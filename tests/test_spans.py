@@ -359,6 +359,8 @@ def test_a_full_disk_costs_no_step_that_was_recorded(
             logs.close()
     write(logs, recorded + 8, first=recorded + 1, span=span)
     logs.close()
+    _, _, tail, _ = files_of(path.parent)
+    assert not tail.exists()
     check(read(path), recorded + 8)
 
 
