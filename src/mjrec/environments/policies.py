@@ -33,7 +33,6 @@ from typing import Any, Final
 import numpy as np
 
 from ..errors import Error, InvalidArgument, PolicyError, UnknownName
-from .actions import action_space, checked, zero
 from .episode_seeds import EpisodeSeeds
 from .policy_files import file_of_policy, policy_in_file
 from .working_directory import working_directory_importable
@@ -55,8 +54,12 @@ class Policy:
     """
 
     def __init__(self, environment: Any, name: str) -> None:
-        self._space = action_space(environment)
-        self._zero = zero(self._space) if name == "zero" else None
+        # Not at the top: it loads Gymnasium.
+        from . import actions
+
+        self._space = actions.action_space(environment)
+        self._zero = actions.zero(self._space) if name == "zero" else None
+        self._checked = actions.checked
 
     def reset(self, seeds: EpisodeSeeds) -> None:
         """Prepare for an episode that has these seeds; before its first action."""
@@ -102,7 +105,7 @@ class _ForeignPolicy(Policy):
     def __call__(self, observation: Any) -> Any:
         with _failures_named("The policy ", self._name):
             action = self._choose(observation)
-        return checked(self._space, action)
+        return self._checked(self._space, action)
 
 
 class _Predictor:

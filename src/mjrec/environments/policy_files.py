@@ -24,11 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..errors import MissingDependency, PolicyError, UnknownName
-from .actions import action_space
 
 
 def file_of_policy(text: str) -> Path | None:
@@ -78,7 +76,7 @@ class _Model:
         """Return the action, and the state that comes next."""
         space = self._policy.observation_space
         given: Any
-        if isinstance(space, spaces.Dict):
+        if hasattr(space, "spaces"):
             parts = space.spaces.items()
             given = {n: np.asarray(observation[n], part.dtype) for n, part in parts}
         elif isinstance(observation, Mapping):
@@ -147,13 +145,15 @@ def _network(
     outputs: Callable[[NDArray[np.float32]], Any], environment: Any
 ) -> Callable[[Any], Any]:
     """Return what acts as a network says whose outputs have a row for each input."""
-    space = action_space(environment)
+    # Not at the top: it loads Gymnasium.
+    from .actions import action_space
+
+    space: Any = action_space(environment)
 
     def choose(observation: Any) -> Any:
         action = outputs(_row(observation)[np.newaxis])[0]
-        if isinstance(space, spaces.Box) and action.shape == space.shape:
-            return np.clip(action, space.low, space.high)
-        return action
+        is_box = hasattr(space, "low") and action.shape == space.shape
+        return np.clip(action, space.low, space.high) if is_box else action
 
     return choose
 
