@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mjrec.evaluation.summaries import AcrossTasks, Bootstrap
-from mjrec.evaluation.summarizing import summarize_across, summarize_task
+from mjrec.evaluation.statistics import Bootstrap
+from mjrec.evaluation.summaries import AcrossTasks, summarize_across, summarize_task
 from mjrec.reporting.contents import (
     EPISODE,
     ReportContents,

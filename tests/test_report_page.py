@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from report_contents import HOSTILE, contents, hostile_report, task, video
 
-from mjrec.evaluation.summaries import AcrossTasks, Interval, Profile, TaskSummary
+from mjrec.evaluation.statistics import Interval
+from mjrec.evaluation.summaries import AcrossTasks, Profile, TaskSummary
 from mjrec.reporting.contents import ReportContents
 from mjrec.reporting.curves import evaluation_curve, learning_curve, profile_curve
 from mjrec.reporting.page import page_of

@@ -14,7 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.summaries import AcrossTasks, Bootstrap, TaskSummary
+from ..evaluation.statistics import Bootstrap
+from ..evaluation.summaries import AcrossTasks, TaskSummary
 
 # One episode: a million of them fit into little memory. `run` is the seed of an
 # evaluation, else the monitor, as an index into `ReportTask.runs`; `total_reward` and

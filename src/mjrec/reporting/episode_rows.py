@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.result_columns import ResultColumns
-from ..evaluation.summaries import Bootstrap, TaskSummary
-from ..evaluation.summarizing import default_score_range, summarize_task
+from ..evaluation.statistics import Bootstrap
+from ..evaluation.summaries import TaskSummary, default_score_range, summarize_task
 from ..results.episodes import Episode
 from .contents import EPISODE, FAILED, TERMINATED, TRUNCATED
 

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingDependency
-from ..evaluation.intervals import PERCENTILE_BOOTSTRAP
-from ..evaluation.summaries import Interval, TaskSummary
+from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Interval
+from ..evaluation.summaries import TaskSummary
 from .contents import FAILED, ReportContents, ReportTask, ReportVideo
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
 from .page_text import (
@@ -240,7 +240,7 @@ def _method_in_words(method: str | None, contents: ReportContents) -> str | None
         return method
     how = contents.bootstrap
     resamples = counted(how.resamples, "resample")
-    return f"{how.method}, {resamples}, seed {how.seed}"
+    return f"{method} over episodes, {resamples}, seed {how.seed}"
 
 
 def _notes(

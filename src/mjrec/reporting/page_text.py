@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from typing import Any, Final
 from urllib.parse import quote
 
-from ..evaluation.summaries import Interval
+from ..evaluation.statistics import Interval
 
 # What stands where there is no number.
 NOTHING: Final = "\N{EN DASH}"
