@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -111,3 +114,18 @@ def test_record_says_which_videos_are_pending(
     assert main([*command, str(tmp_path / "b"), "--json"]) == 0
     [episode] = json.loads(capsys.readouterr().out)["episodes"]
     assert episode["pending"] is True
+
+
+@pytest.mark.thorough
+def test_record_without_any_gl(tmp_path: Path) -> None:
+    """On a machine, or in a process, that has none."""
+    command = [*RECORD, "--seed", "0", "--workers", "0"]
+    run = subprocess.run(
+        [sys.executable, "-m", "mjrec", *command, "--out", str(tmp_path)],
+        env={**os.environ, "MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "pending: mjrec render" in run.stdout
