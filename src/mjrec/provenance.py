@@ -204,17 +204,23 @@ def installed_packages() -> dict[str, Any]:
 def _packages_in(places: Sequence[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for distribution in importlib.metadata.distributions(path=list(places)):
-        # Parsing all of it takes as long as the rest.
-        text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")
-        said = dict(_NAME_OR_VERSION.findall((text or "").partition("\n\n")[0]))
-        name = said.get("Name")
+        name, version = _name_and_version(distribution)
         # The first on the path is the one that is imported.
         if name and name not in found:
             found[name] = {
-                "version": said.get("Version"),
+                "version": version,
                 "record_sha256": _record_sha256(distribution),
             }
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
+
+
+def _name_and_version(
+    distribution: importlib.metadata.Distribution,
+) -> tuple[str | None, str | None]:
+    """Return what a package says first: parsing all that it says takes milliseconds."""
+    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")
+    said = dict(_NAME_OR_VERSION.findall((text or "").partition("\n\n")[0]))
+    return said.get("Name"), said.get("Version")
 
 
 def _record_sha256(distribution: importlib.metadata.Distribution) -> str | None:
@@ -261,7 +267,8 @@ def versions() -> Mapping[str, str]:
     found = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
-            found[package] = importlib.metadata.version(package)
+            distribution = importlib.metadata.distribution(package)
+            found[package] = str(_name_and_version(distribution)[1])
         except importlib.metadata.PackageNotFoundError:
             continue
     return MappingProxyType(found)

@@ -10,14 +10,13 @@ machine with two CPUs so have two workers at work, not sixteen.
 from __future__ import annotations
 
 import collections
-import functools
 import itertools
 import logging
 import os
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -47,9 +46,6 @@ from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
 from .views import PlainCamera, View, plain_camera
 
 logger = logging.getLogger(__name__)
-
-# The argument of a worker that is to look first at a frame of its own.
-TRY = "--try"
 
 _MODULE = "mjrec.rendering.worker"
 _MOST_BUFFERED = 2
@@ -251,34 +247,32 @@ class WorkerPool:
             return
         if "MUJOCO_GL" not in self._environ:
             self._environ = environment_for(BACKENDS[0], self._environ)
-        # One that tries it is enough: the first frame of all is the first worker's.
-        tries = worker is self._workers[0] and not self._is_tried
         try:
-            worker.child = self._forked(tries) or Child(
-                # No directory of others is kept from being removed or unmounted.
-                *(_MODULE, *[TRY] * tries),
-                environ=self._environ,
-                cwd="/",
+            # No directory of others is kept from being removed or unmounted.
+            worker.child = Child(
+                _MODULE, environ=self._environ, cwd="/", fork=self._main_of_fork()
             )
         except OSError as error:
             raise Error(
                 f"No process that draws could be started: {sys.executable!r}: {error}."
             ) from error
+        # One that tries it is enough: the first frame of all is the first worker's.
+        if worker is self._workers[0] and not self._is_tried:
+            worker.child.send(tries=True)
 
-    def _forked(self, tries: bool) -> Child | None:
+    def _main_of_fork(self) -> Callable[[], object] | None:
         if not self._forks or threading.active_count() > 1:
             return None
         # Read when mujoco is imported.
         os.environ.update(self._environ)
         try:
             # Not at the top: other processes that have a pool draw nothing.
-            from .worker import draw_for_parent
+            from .worker import main
         except Exception:
             # A process of its own says why; or another backend works.
             self._forks = False
             return None
-        run = functools.partial(draw_for_parent, tries=tries)
-        return Child(_MODULE, environ=self._environ, cwd="/", fork=run)
+        return main
 
     def _try_backends(self) -> None:
         """Let all workers begin anew with the first backend that works.

@@ -3,6 +3,7 @@
 
 Its parent sends::
 
+    {"tries": true}                         it looks first at a frame of its own
     {"drawing": {...}, "indices": [1, 3, 5]}
 
 `drawing` is what `open_drawing` takes; `indices` are the frames. It sends the bytes of
@@ -11,8 +12,8 @@ frames, `(height, width, 3) uint8`, and::
     {"size": [48, 64], "gl": {...}}         before the frames of a job
     {"error": {...}}                        instead of a frame and all that would follow
     {"log": ["mjrec.x", 30, "..."]}         for the parent's log
-    {"untried": "..."}                      with `--try`, where a frame of its own is
-                                            not what it should be: then it ends
+    {"untried": "..."}                      its own frame is not what it should be:
+                                            then it ends
 
 It ends with its parent, in mid-drawing too.
 """
@@ -21,7 +22,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,6 @@ from ..simulation.gl_probe import draw_test_scene
 from ..simulation.recorded_scene import GivenStates, RecordedScene
 from ..simulation.renderer import Canvas, SceneRenderer
 from ..simulation.warnings import log_mujoco_warnings
-from .pool import TRY
 from .recorded_facts import check_has_frames, open_for_rendering
 from .views import PlainCamera, View
 
@@ -267,30 +266,22 @@ def _camera(model: Any, camera: Any) -> Camera:
 
 
 def main() -> None:
-    """Draw for the parent, until that ends."""
-    draw_for_parent(tries=TRY in sys.argv[1:])
-
-
-def draw_for_parent(*, tries: bool) -> None:
-    """Draw what the parent wants, until it ends.
-
-    Args:
-        tries: whether to look first at a frame of its own.
-    """
+    """Draw what the parent wants, until it ends."""
     parent = Parent()
     parent.send_warnings()
     parent.listen()
     os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
-    if tries:
-        try:
-            draw_test_scene()
-        except Exception as error:
-            parent.send(untried=str(error))
-            # Not `sys.exit`, which would wait for the driver.
-            os._exit(1)
     canvas = Canvas()
     while True:
         order = parent.receive()
+        if "tries" in order:
+            try:
+                draw_test_scene()
+            except Exception as error:
+                parent.send(untried=str(error))
+                # Not `sys.exit`, which would wait for the driver.
+                os._exit(1)
+            continue
         try:
             _draw(order, canvas, parent)
         except Exception as error:
