@@ -14,7 +14,7 @@ import rich.progress
 import tyro
 
 from .. import json_text
-from ..reporting.media_files import OnProgress, ReportProgress
+from ..reporting.media import OnProgress, ReportProgress
 from ..reporting.report_folder import write_report
 from .help_text import flowing_help
 
