@@ -440,11 +440,10 @@ def test_a_list_that_an_open_monitor_writes_is_not_removed(
     real = spans._is_open
 
     def record_late(name: Path) -> bool:
-        was_open = real(name)
         write(logs, 5, episode=28).end({"complete": True})
         logs.release()
         lock.release()
-        return was_open
+        return real(name)
 
     monkeypatch.setattr(spans, "_is_open", record_late)
     remove_if_done(found)

@@ -220,7 +220,7 @@ def examine_ffmpeg() -> Ffmpeg:
         path = ffmpeg_executable()
         version = ffmpeg_version()
         settings = encoder_settings(codec=None, crf=None, muxer=MUXERS[".mp4"])
-        try_encoding(path, settings, _TRIAL_FPS)
+        try_encoding(settings, _TRIAL_FPS)
     except Error as error:
         said = error.stderr.split("\n") if isinstance(error, EncoderError) else []
         cause = next(filter(None, map(str.strip, reversed(said))), str(error))
