@@ -327,7 +327,9 @@ def test_a_tail_of_something_else_is_passed_over(
     words = struct.pack(f"={len(HEADS[head])}Q", *HEADS[head])
     size = len(words) if head == "short" else TAIL_HEAD + CAPACITY * ROW
     tail.write_bytes(words.ljust(size, b"\0"))
-    check(read(path), 4)
+    content = read(path)
+    check(content, 4)
+    assert content.dropped == 0
 
 
 def kill_in_line(number: int, part: Callable[[bytes], bytes]) -> None:
