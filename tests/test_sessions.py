@@ -16,7 +16,7 @@ from recordings import manifest_of, videos_in
 
 from mjrec import sessions
 from mjrec.commands import main
-from mjrec.environments.options import EnvironmentOptions
+from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.errors import GLError
 from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session

@@ -15,13 +15,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from .environments.episode_seeds import episode_seeds
-from .environments.from_name import NamedEnvironment, environment_from_name
-from .environments.global_generators import seed_global_generators
-from .environments.names import parse_environment_name
-from .environments.options import EnvironmentOptions
+from .environments.episode_seeds import episode_seeds, seed_global_generators
+from .environments.from_name import environment_from_name
+from .environments.named_environment import EnvironmentOptions, NamedEnvironment
+from .environments.names import parse_environment_name, working_directory_importable
 from .environments.policies import load_policy, policy_file
-from .environments.working_directory import working_directory_importable
 from .errors import GLError, InvalidArgument
 from .formats.manifest import read_manifest
 from .formats.monitor_directory import Infix, infix_of, manifest_name
@@ -144,7 +142,8 @@ def record_session(
                 observation = named.begin_episode(monitor, seeds)
                 done = False
                 while not done:
-                    observation, done = named.step(monitor, policy(observation))
+                    observation, _, *ends = named.step(monitor, policy(observation))
+                    done = any(ends)
                     on_step()
             stats, video = monitor.stats_recorder, monitor.video_recorder
             has_video = video is not None and video.functional and not video.empty

@@ -9,6 +9,7 @@ imported, and what only wants to know names shall not choose for its process.
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import json
 import os
 import re
@@ -23,8 +24,7 @@ from ..child_python import (
     said_in,
     take_standard_output,
 )
-from ..errors import EnvironmentNotMade
-from .dm_control_failures import dm_control_failure
+from ..errors import EnvironmentNotMade, Error, MissingDependency
 
 _SUITE = "dm_control"
 _GYMNASIUM = "gymnasium"
@@ -76,6 +76,30 @@ def mujoco_ids() -> tuple[str, ...]:
         name, _, version = env_id.rpartition("-v")
         newest[name] = max(int(version), newest.get(name, 0))
     return tuple(f"{name}-v{version}" for name, version in newest.items())
+
+
+def dm_control_failure(name: str, error: Exception) -> Error:
+    """Return the error for what importing dm_control, or loading a task, raised.
+
+    Args:
+        name: of the environment.
+        error: what was raised.
+    """
+    missing = error.name if isinstance(error, ModuleNotFoundError) else None
+    if missing in ("dm_control", "dm_env"):
+        return MissingDependency(
+            "dm_control", purpose=name, install='pip install "mjrec[dm-control]"'
+        )
+    # dm_control 1.0.50 reads fields of MuJoCo's structures that mujoco 4 lacks.
+    if re.search(r"Mj(Model|Data)\b.* has no attribute", str(error)):
+        dm_control, mujoco = map(importlib.metadata.version, ("dm-control", "mujoco"))
+        return MissingDependency(
+            "a mujoco that it knows (below version 4)",
+            purpose=f"{name}: dm_control {dm_control} does not work with mujoco "
+            f"{mujoco} ({error}) and",
+            install='pip install "mujoco<4"',
+        )
+    return EnvironmentNotMade(name, f"{type(error).__name__}: {error}")
 
 
 def _names_of(part: str) -> tuple[str, ...]:
