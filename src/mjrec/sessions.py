@@ -9,6 +9,7 @@ can be recorded again without those before it.
 from __future__ import annotations
 
 import contextlib
+import logging
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,12 +26,14 @@ from .formats.manifest import read_manifest
 from .formats.monitor_directory import Infix, infix_of, manifest_name
 from .gl import use_gl
 from .monitors.monitor import monitored
-from .recorder.options import LIVE, OFF, RecorderOptions
+from .recorder.options import DEFERRED, LIVE, OFF, RecorderOptions
 from .schedules import disable_videos, schedule_from_text
 
 if TYPE_CHECKING:
     from .monitors.dm_env_monitor import DmEnvMonitor
     from .monitors.gymnasium_monitor import GymnasiumMonitor
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +92,9 @@ def record_session(
 ) -> Generator[SessionEpisode, None, None]:
     """Record a session, and yield each episode as it ends.
 
+    Of an environment that cannot be drawn here there are statistics and no videos,
+    unless `render` asks for them; the log says why.
+
     The recordings are closed when the iterator ends, is closed, or raises; so close
     it, best with `contextlib.closing`. Only when it ends by itself are the videos
     waited for that are still to be rendered; else they are left pending.
@@ -111,6 +117,11 @@ def record_session(
         named = _environment(session, pictures=drawn)
         closing = stack.enter_context(contextlib.ExitStack())
         closing.callback(named.environment.close)
+        if named.no_pictures is not None:
+            if options.render in (LIVE, DEFERRED):
+                raise named.no_pictures
+            logger.warning("No videos, only statistics. %s", named.no_pictures)
+            schedule, options = disable_videos, replace(options, keep=None)
         policy = load_policy(session.policy, named.environment, session.policy_kwargs)
         view = dict(named.view)
         if session.further_cameras:

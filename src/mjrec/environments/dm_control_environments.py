@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import dm_env
+import numpy as np
 from dm_control import suite
 
 from ..errors import UnknownName
@@ -103,6 +104,14 @@ class DmControlEnvironment(NamedEnvironment):
             view=view,
         )
         self._contexts = ContextsOnDemand(environment)
+        self._made_with = getattr(environment.task, MADE_WITH)["task_kwargs"]["random"]
+        self._draws_when_made = not _is_fresh(self._generator(), self._made_with)
+        self._was_reset = False
+
+    @property
+    def draws_when_made(self) -> bool:
+        """Whether its model depends on the seed that it was made with."""
+        return self._draws_when_made
 
     def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
         """Reset to an episode's seeds.
@@ -112,7 +121,7 @@ class DmControlEnvironment(NamedEnvironment):
         must see the same. A monitor is told the seed, for its metadata.
         """
         self._generator().seed(seeds.environment)
-        return _reset(around, seeds.environment)
+        return self._reset(around, seeds.environment)
 
     def begin_stream(self, around: Any, seed: int, seeds: EpisodeSeeds) -> Any:
         """Reset, seeded for all episodes that follow.
@@ -121,14 +130,13 @@ class DmControlEnvironment(NamedEnvironment):
         it is as `suite.load(..., task_kwargs={"random": seed})` made it, and what it
         drew while it was made stays drawn. Any other begins the seed's sequence anew.
         """
-        made = getattr(self.environment.task, MADE_WITH)
-        if made["task_kwargs"]["random"] != seed:
+        if self._was_reset or self._made_with != seed:
             self._generator().seed(seed)
-        return _reset(around, None)
+        return self._reset(around, None)
 
     def next_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
         """Reset without seeding; a monitor says that the episode had no seed."""
-        return _reset(around, None)
+        return self._reset(around, None)
 
     def step(self, around: Any, action: Any) -> Step:
         """Step, and return what that gave."""
@@ -158,11 +166,17 @@ class DmControlEnvironment(NamedEnvironment):
     def _generator(self) -> Any:
         return generator_of(self.environment)
 
+    def _reset(self, around: Any, seed: int | None) -> Any:
+        self._was_reset = True
+        if not callable(getattr(around, "seed", print)):
+            around.seed = seed
+        return around.reset().observation
 
-def _reset(around: Any, seed: int | None) -> Any:
-    if not callable(getattr(around, "seed", print)):
-        around.seed = seed
-    return around.reset().observation
+
+def _is_fresh(generator: Any, seed: Any) -> bool:
+    """Tell whether a generator, made with a seed, has drawn nothing."""
+    states = (each.get_state() for each in (generator, np.random.RandomState(seed)))
+    return all(map(np.array_equal, *states))
 
 
 def _arguments(kwargs: Mapping[str, Any]) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from ..errors import (
 from ..simulation.find_simulation import simulation_in
 from .episode_seeds import EpisodeSeeds
 from .gymnasium_scenes import drawn_part, gymnasium_scenes
+from .known_names import newest_versions
 from .named_environment import EnvironmentOptions, NamedEnvironment, Step
 from .names import working_directory_importable
 from .scenes import Scenes, set_generator_state
@@ -157,7 +158,8 @@ def _spec(env_id: str) -> registration.EnvSpec:
     module, colon, name = env_id.rpartition(":")
     if colon:
         _import_registering_module(module, env_id)
-    spec = registration.registry.get(name) or _latest_version(name)
+    newest = newest_versions(registration.registry)
+    spec = registration.registry.get(newest.get(name, name))
     if spec is None:
         raise UnknownName(
             "Gymnasium environment",
@@ -179,17 +181,6 @@ def _import_registering_module(module: str, env_id: str) -> None:
             f"importing the module {module!r} gave {_what_was_raised(error)}",
             hint="It must be installed, or lie in the working directory.",
         ) from error
-
-
-def _latest_version(name: str) -> registration.EnvSpec | None:
-    try:
-        namespace, base, version = registration.parse_env_id(name)
-    except gymnasium.error.Error:
-        return None
-    if version is not None:
-        return None
-    latest = registration.find_highest_version(namespace, base)
-    return registration.registry.get(registration.get_env_id(namespace, base, latest))
 
 
 def _make(
@@ -230,49 +221,30 @@ def _what_was_raised(error: Exception) -> str:
 
 def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
     with _failures_of(spec.id):
-        creator = _creator(spec)
-    modes = _render_modes(creator)
-    mode = _chosen_mode(spec.id, modes, kwargs)
-    _check_pygame(spec.id, creator, mode, modes)
-    return mode
-
-
-def _creator(spec: registration.EnvSpec) -> Any:
-    if isinstance(spec.entry_point, str):
-        return registration.load_env_creator(spec.entry_point)
-    if spec.entry_point is None:
-        raise EnvironmentNotMade(spec.id, "only its vectorised form is registered")
-    return spec.entry_point
-
-
-def _render_modes(creator: Any) -> list[str] | None:
-    """Return the modes that a creator declares; None for one that says nothing."""
-    metadata = getattr(creator, "metadata", None)
+        creator: Any = spec.entry_point
+        if creator is None:
+            raise EnvironmentNotMade(spec.id, "only its vectorised form is registered")
+        if isinstance(creator, str):
+            creator = registration.load_env_creator(creator)
     # A function has none, and on a wrapper's class it is a property.
-    if not isinstance(metadata, dict):
-        return None
-    return list(metadata.get("render_modes") or [])
-
-
-def _chosen_mode(
-    env_id: str, modes: list[str] | None, kwargs: Mapping[str, Any]
-) -> str:
+    metadata = getattr(creator, "metadata", None)
+    modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
     if "render_mode" in kwargs:
-        return _checked_mode(env_id, modes, kwargs["render_mode"])
-    if modes is None:
-        return _PREFERRED_MODES[0]
-    for mode in _PREFERRED_MODES:
-        if mode in modes:
-            return mode
-    raise _no_pictures(env_id, f"its render modes are {modes}")
-
-
-def _checked_mode(env_id: str, modes: list[str] | None, mode: Any) -> str:
-    if mode in (None, "human"):
-        raise _no_pictures(env_id, f"render_mode={mode!r} was asked for")
-    # Gymnasium itself collects the pictures of `rgb_array` into `rgb_array_list`.
-    if modes is not None and str(mode).removesuffix("_list") not in modes:
-        raise UnknownName(f"render mode of {env_id}", mode, modes)
+        mode = kwargs["render_mode"]
+        if mode in (None, "human"):
+            raise _no_pictures(spec.id, f"render_mode={mode!r} was asked for")
+        # Gymnasium itself collects the pictures of `rgb_array` into `rgb_array_list`.
+        if modes is not None and str(mode).removesuffix("_list") not in modes:
+            raise UnknownName(f"render mode of {spec.id}", mode, modes)
+    else:
+        # What says nothing is asked for pictures.
+        there = _PREFERRED_MODES if modes is None else modes
+        mode = next((each for each in _PREFERRED_MODES if each in there), None)
+        if mode is None:
+            raise _no_pictures(spec.id, f"its render modes are {modes}")
+    family = str(getattr(creator, "__module__", "")).rpartition(".")[0]
+    if family in _PYGAME_EXTRAS and str(mode).startswith("rgb_array"):
+        _check_pygame(spec.id, _PYGAME_EXTRAS[family], has_text="ansi" in (modes or ()))
     return str(mode)
 
 
@@ -284,25 +256,15 @@ def _no_pictures(env_id: str, why: str) -> NoPictures:
     )
 
 
-def _check_pygame(
-    env_id: str, creator: Any, mode: str, modes: list[str] | None
-) -> None:
+def _check_pygame(env_id: str, extra: str, *, has_text: bool) -> None:
     """Say before the first episode what would fail at its first picture."""
-    family = str(getattr(creator, "__module__", "")).rpartition(".")[0]
-    extra = _PYGAME_EXTRAS.get(family)
-    drawn = mode.startswith("rgb_array")
-    if extra is None or not drawn or importlib.util.find_spec("pygame") is not None:
-        return
-    text_instead = (
-        ' (or record its text: --env-kwargs \'{"render_mode": "ansi"}\')'
-        if "ansi" in (modes or [])
-        else ""
-    )
-    raise MissingDependency(
-        "pygame",
-        purpose=f"Drawing {env_id}",
-        install=f'pip install "gymnasium[{extra}]"{text_instead}',
-    )
+    if importlib.util.find_spec("pygame") is None:
+        text_instead = ' (or record its text: --env-kwargs \'{"render_mode": "ansi"}\')'
+        raise MissingDependency(
+            "pygame",
+            purpose=f"Drawing {env_id}",
+            install=f'pip install "gymnasium[{extra}]"{text_instead * has_text}',
+        )
 
 
 def _make_drawn(

@@ -15,7 +15,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from ..child_python import (
@@ -26,6 +26,7 @@ from ..child_python import (
 )
 from ..errors import EnvironmentNotMade, Error, MissingDependency
 
+_VERSION = re.compile(r"-v([0-9]+)$", re.ASCII)
 _SUITE = "dm_control"
 _GYMNASIUM = "gymnasium"
 
@@ -54,7 +55,7 @@ def gymnasium_ids(module: str | None = None) -> tuple[str, ...]:
     """Return the ids in Gymnasium's registry.
 
     Args:
-        module: imported first, because it registers environments.
+        module: that registers environments when it is imported; then only its ids.
 
     Raises:
         EnvironmentNotMade: the module cannot be imported.
@@ -71,11 +72,24 @@ def gymnasium_ids(module: str | None = None) -> tuple[str, ...]:
 
 def mujoco_ids() -> tuple[str, ...]:
     """Return the ids of Gymnasium's own MuJoCo environments, the newest of each."""
-    newest: dict[str, int] = {}
-    for env_id in _names_of("mujoco"):
-        name, _, version = env_id.rpartition("-v")
-        newest[name] = max(int(version), newest.get(name, 0))
-    return tuple(f"{name}-v{version}" for name, version in newest.items())
+    return tuple(newest_versions(gymnasium_ids("gymnasium.envs.mujoco")).values())
+
+
+def newest_versions(env_ids: Iterable[str]) -> dict[str, str]:
+    """Return the newest of the ids that differ in their version, by what is before it.
+
+    One without a version is its own newest.
+    """
+    newest: dict[str, str] = {}
+    for env_id in sorted(env_ids, key=version_of):
+        newest[_VERSION.sub("", env_id)] = env_id
+    return newest
+
+
+def version_of(env_id: str) -> int:
+    """Return the version at the end of an id; -1 for one without."""
+    match = _VERSION.search(env_id)
+    return int(match[1]) if match else -1
 
 
 def dm_control_failure(name: str, error: Exception) -> Error:
@@ -100,12 +114,6 @@ def dm_control_failure(name: str, error: Exception) -> Error:
             install='pip install "mujoco<4"',
         )
     return EnvironmentNotMade(name, f"{type(error).__name__}: {error}")
-
-
-def _names_of(part: str) -> tuple[str, ...]:
-    said = _ask(_GYMNASIUM, "", part)
-    names: list[str] = said.get("names", [])
-    return tuple(names)
 
 
 def _ask(*arguments: str) -> dict[str, Any]:
@@ -147,18 +155,24 @@ def _main(arguments: Sequence[str]) -> None:
         json.dump(said, output)
 
 
-def _names(framework: str, what: str, part: str = "") -> list[str]:
+def _names(framework: str, what: str) -> list[str]:
     if framework == _SUITE:
         return _suite_names(what)
-    from gymnasium.envs import registration
+    from gymnasium.envs.registration import registry
 
-    if what:
-        # The working directory may hold it, as it may hold a policy.
-        sys.path.append(os.getcwd())  # noqa: PTH109  sys.path holds texts
-        importlib.import_module(what)
-    known = registration.registry.values()
-    inside = re.compile(rf"gymnasium\.envs\.{part}\." if part else "")
-    return [spec.id for spec in known if inside.match(str(spec.entry_point))]
+    if not what:
+        return list(registry)
+    before = dict(registry)
+    # The working directory may hold it, as it may hold a policy.
+    sys.path.append(os.getcwd())  # noqa: PTH109  sys.path holds texts
+    importlib.import_module(what)
+    return [
+        env_id
+        for env_id, spec in registry.items()
+        # Gymnasium itself may have loaded it before.
+        if before.get(env_id) is not spec
+        or f"{spec.entry_point}".startswith((f"{what}.", f"{what}:"))
+    ]
 
 
 def _suite_names(tag: str) -> list[str]:

@@ -117,6 +117,11 @@ class NamedEnvironment(abc.ABC):
         self.no_pictures = no_pictures
         self.is_random = is_random
 
+    @property
+    def draws_when_made(self) -> bool:
+        """Whether its model depends on the seed that it was made with."""
+        return False
+
     @abc.abstractmethod
     def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
         """Reset to an episode's seeds, and return the first observation."""
