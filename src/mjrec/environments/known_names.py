@@ -10,20 +10,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import json
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ..child_python import (
-    environment_of_child,
-    python_command,
-    said_in,
-    take_standard_output,
-)
+from ..child_python import Child, Parent
 from ..errors import EnvironmentNotMade, Error, MissingDependency
 
 _VERSION = re.compile(r"-v([0-9]+)$", re.ASCII)
@@ -118,19 +111,13 @@ def dm_control_failure(name: str, error: Exception) -> Error:
 
 def _ask(*arguments: str) -> dict[str, Any]:
     """Return what a process says of itself: `names`, or the error's `kind`, `text`."""
-    finished = subprocess.run(
-        [*python_command(__name__), *arguments],
-        # Names need no OpenGL; without a display, GLFW would complain.
-        env=environment_of_child({**os.environ, "MUJOCO_GL": "disabled"}),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        timeout=_TIMEOUT_S,
-        check=False,
-    )
-    if finished.returncode == 0:
-        return said_in(finished.stdout)
-    last = finished.stderr.decode(errors="replace").strip().splitlines()[-1:]
-    return {"kind": f"exit status {finished.returncode}", "text": " ".join(last)}
+    # Names need no OpenGL; without a display, GLFW would complain.
+    environ = {**os.environ, "MUJOCO_GL": "disabled"}
+    with Child(__name__, *arguments, environ=environ) as child:
+        for said in child.messages(_TIMEOUT_S):
+            if said is not None:
+                return said
+        return {"kind": "its process", "text": child.last_words()}
 
 
 def _as_raised(said: dict[str, Any]) -> Exception:
@@ -142,17 +129,12 @@ def _as_raised(said: dict[str, Any]) -> Exception:
 
 
 def _main(arguments: Sequence[str]) -> None:
-    descriptor = take_standard_output()
+    parent = Parent()
     try:
-        said: dict[str, Any] = {"names": _names(*arguments)}
+        parent.send(names=_names(*arguments))
     except Exception as error:
-        said = {
-            "kind": type(error).__name__,
-            "text": str(error),
-            "name": getattr(error, "name", None),
-        }
-    with os.fdopen(descriptor, "w") as output:
-        json.dump(said, output)
+        kind, name = type(error).__name__, getattr(error, "name", None)
+        parent.send(kind=kind, text=str(error), name=name)
 
 
 def _names(framework: str, what: str) -> list[str]:
