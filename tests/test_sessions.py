@@ -6,6 +6,9 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -135,3 +138,18 @@ def test_what_cannot_be_drawn_is_recorded_without_videos(
     live = replace(asked, monitor=RecorderOptions(render="live", force=True))
     with pytest.raises(mjrec.MissingDependency, match="pygame"):
         list(record_session(live))
+
+
+@pytest.mark.thorough
+def test_record_without_any_gl(tmp_path: Path) -> None:
+    """On a machine, or in a process, that has none."""
+    command = [*RECORD, "--seed", "0", "--workers", "0"]
+    run = subprocess.run(
+        [sys.executable, "-m", "mjrec", *command, "--out", str(tmp_path)],
+        env={**os.environ, "MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "pending: mjrec render" in run.stdout
