@@ -20,7 +20,7 @@ from trajectories_by_hand import write_log
 
 from mjrec import Monitor, load_results
 from mjrec.commands import COMMANDS, main
-from mjrec.formats.journal import JournalEntry, JournalWriter
+from report_recordings import entry, write_evaluation, write_journal
 
 PENDULUM = """
 <mujoco>
@@ -408,24 +408,8 @@ def test_list_json_is_a_line_for_each_episode(mjrec: Any, tmp_path: Path) -> Non
 
 def test_list_says_which_videos_are_pending(mjrec: Any, tmp_path: Path) -> None:
     """In place of the name that there is not yet."""
-    journal = JournalWriter(tmp_path / "openaigym.episodes.0.7.jsonl")
-    for number in range(2):
-        journal.append(
-            JournalEntry(
-                episode_id=number,
-                length=5,
-                reward=0.5,
-                type="e",
-                start_time=1.0,
-                end_time=2.0,
-                seed=None,
-                options=None,
-                terminated=True,
-                truncated=False,
-                recording="deferred" if number else None,
-            )
-        )
-    journal.close()
+    entries = [entry(0), entry(1, recording="deferred")]
+    write_journal(tmp_path, "0.7", "X-v0", entries)
     trajectory = write_log(tmp_path, 1, steps=2)
     _, out, _ = mjrec("list", tmp_path)
     assert out.count("pending") == 1
@@ -452,6 +436,26 @@ def test_list_shows_the_directories_in_one(mjrec: Any, tmp_path: Path) -> None:
     _, out, _ = mjrec("list", tmp_path, "--json")
     lines = [json.loads(line) for line in out.splitlines()]
     assert [line["directory"] for line in lines] == ["a", "a", "b"]
+
+
+def test_list_shows_an_evaluation_as_one(mjrec: Any, tmp_path: Path) -> None:
+    """Task, seed, return and video of each episode; what failed says so."""
+    name = "openaigym.video.0.batch.video000000.mp4"
+    write_evaluation(tmp_path, ["a/x", "b/y"], videos={"a/x": name, "b/y": name})
+    (tmp_path / "a-x" / name).touch()
+    status, out, _ = mjrec("list", tmp_path)
+    assert status == 0
+    rows = [line.split() for line in out.splitlines() if "/" in line]
+    assert rows[:3] == [
+        ["a/x", "0", "0", "10", "3", "truncated", name],
+        ["a/x", "0", "1", "10", "1", "truncated"],
+        ["a/x", "7", "0", "10", "failed"],
+    ]
+    assert [rows[4][-1], len(rows)] == ["pending", 8]
+    _, out, _ = mjrec("list", tmp_path, "--json")
+    first, *_ = (json.loads(line) for line in out.splitlines())
+    assert (first["task"], first["seed"], first["reward"]) == ("a/x", 0, 3.0)
+    assert (first["video"], first["pending"]) == (str(tmp_path / "a-x" / name), False)
 
 
 def test_list_says_that_there_is_nothing(mjrec: Any, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import rich.console
 import tyro
 
 from .. import json_text
-from ..environments.options import EnvironmentOptions
+from ..environments.named_environment import EnvironmentOptions
 from ..formats.video_metadata import finished_videos
 from ..monitors.progress import progress_bar
 from ..recorder.options import RecorderOptions

@@ -35,8 +35,8 @@ import numpy as np
 
 from ..errors import Error, InvalidArgument, PolicyError, UnknownName
 from .episode_seeds import EpisodeSeeds
+from .names import working_directory_importable
 from .policy_files import file_of_policy, policy_in_file
-from .working_directory import working_directory_importable
 
 logger = logging.getLogger(__name__)
 
