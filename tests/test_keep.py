@@ -27,6 +27,7 @@ from recordings import (
 
 import mjrec
 from conftest import Corridor
+from mjrec.formats import spans
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.keep_rules import UNDECIDED
 from mjrec.recorder.tracking import FinishedVideo, Tracker
@@ -472,6 +473,22 @@ def test_impossible_options_are_refused_before_anything_is_made(
     with pytest.raises(mjrec.NoPictures):
         mjrec.Monitor(Corridor(render_mode=None), tmp_path / "run", keep="worst:1")
     assert not (tmp_path / "run").exists()
+
+
+def test_deciding_costs_each_candidate_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No list is looked for among those of all the others."""
+    read: list[Path] = []
+    original = spans.read_list
+    monkeypatch.setattr(spans, "read_list", lambda p: read.append(p) or original(p))
+    monitor = mjrec.Monitor(
+        pendulum([1] * 20), tmp_path, keep="median", env_id="Pole-v0", workers=0
+    )
+    run(monitor, 20)
+    read.clear()
+    monitor.close(wait=False)
+    assert 0 < len(read) <= 3 * 20
 
 
 def test_nothing_was_finished(tmp_path: Path) -> None:

@@ -337,6 +337,24 @@ class SpanWriter:
             self.log.say({"note": self._name, "facts": self._unsaid})
             self._unsaid = {}
 
+    def add(self, facts: Mapping[str, Any]) -> None:
+        """Add to the facts, also after the end; of a key, the newest counts.
+
+        Raises:
+            FileNotWritten: the disk is full; nothing was added.
+        """
+        self.log.say({"note": self._name, "facts": dict(facts)})
+
+    def remove(self) -> None:
+        """Give up its rows after its end; its log goes where nothing else is in it.
+
+        Raises:
+            FileNotWritten: the disk is full.
+            DirectoryNotWritable: files cannot be removed.
+        """
+        self.drop()
+        remove_if_done(self.log.path)
+
     def end(self, facts: Mapping[str, Any]) -> None:
         """Say how it ended. Idempotent; what the first call says counts.
 
