@@ -40,6 +40,7 @@ IMPOSSIBLE: dict[str, list[tuple[dict[str, Any], str, str]]] = {
         ({"video_callable": True}, "InvalidArgument", "video_callable"),
         ({"mode": "testing"}, "InvalidArgument", "training"),
         ({"fps": True}, "InvalidArgument", "fps"),
+        ({"trajectory_callable": 5}, "InvalidArgument", "trajectory_callable"),
         ({"uid": "a/b"}, "InvalidArgument", "uid"),
         ({"resume": "yes"}, "InvalidArgument", "resume"),
         ({"camera": "side"}, "InvalidArgument", "camera"),
