@@ -135,6 +135,13 @@ class ResultColumns:
         """The infixes of the monitors that recorded them."""
         return [infix for _, infix in self.places]
 
+    def video_path(self, index: int) -> str | None:
+        """Return the path of an episode's video in the evaluation's directory."""
+        if index not in self.videos:
+            return None
+        folder, _ = list(self.places)[self.monitor[index]]
+        return f"{folder}/{self.videos[index]}"
+
     def __iter__(self) -> Iterator[EpisodeResult]:
         """Yield each episode as a result; its warnings are not in the columns."""
         monitors = self.monitors
