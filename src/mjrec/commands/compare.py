@@ -1,192 +1,210 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`mjrec compare`: how much better the second of two evaluations is."""
+"""`mjrec compare`: how much better the second of two evaluations is, or of two sets."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Literal
 
 import rich.box
-import rich.console
 import rich.markup
 import rich.table
 import tyro
 
 from .. import json_text
-from ..evaluation.comparing import Comparison, TaskComparison
+from ..errors import InvalidArgument
+from ..evaluation.comparing import TASK_FIGURES, Comparison
 from ..evaluation.comparing import compare as compare_evaluations
-from ..evaluation.summaries import Bootstrap, Interval
+from ..evaluation.requirements import parse_requirement
+from ..evaluation.statistics import Estimate
+from .counted import counted
 from .help_text import flowing_help
 from .terminal import printable, result_console
 
-_USUAL = Bootstrap()
+_UNMET = 1
 
 
 @flowing_help
 def compare(
-    a: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="A")],
-    b: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="B")],
+    a: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="DIRECTORY...")
+    ],
     /,
     *,
-    resamples: int = _USUAL.resamples,
-    seed: int = _USUAL.seed,
-    confidence: float = _USUAL.confidence,
+    against: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIRECTORY...")] = (),
+    require: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    no_worse_than: Literal["A", "B"] | None = None,
+    margin: float | None = None,
+    confidence: float = 0.95,
+    resamples: int = 10_000,
+    seed: int = 0,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Compare two evaluations: every figure is of B against A.
+    """Compare evaluations: every figure is of B against A.
 
-    For each task that both have: the means, their difference B - A, the probability
-    that an episode of B has a higher return than one of A, and the p-value of the
-    Mann-Whitney test, adjusted (Holm) for the number of tasks. Over all of them: that
-    probability on average, and the difference of the interquartile means of scores.
+    A and B are two directories: mjrec compare A B. Or they are several each, one for
+    each training: mjrec compare A... --against B... Then the figures are of the
+    evaluations' mean returns, and say how much better the method of B is.
+
+    For each task that all have: the means, their difference B - A, the probability of
+    improvement (that B has a higher return than A), and the p-value of the Mann-Whitney
+    test, adjusted (Holm) for the number of tasks. Over all of them: that probability on
+    average, and the difference of the interquartile means of scores.
+
+    The exit status is 1 where a task cannot be compared (no episode was completed, or
+    returns are NaN). With --require or --no-worse-than also where that does not hold,
+    and where an episode of B (with --no-worse-than B: of A) failed.
 
     Args:
-        a: the directory of an evaluation.
-        b: the directory of another.
+        a: A and B; with --against, the directories of A.
+        against: the directories of B.
+        require: [TASK: ]FIGURE > NUMBER, also >=, < and <=, such as 'probability of
+            improvement > 0.75'. Figures of all tasks: probability of improvement, IQM
+            A, IQM B, IQM difference. Of the task named or, without one, of each: mean
+            A, mean B, difference, paired difference, p-value. Behind a figure, low or
+            high is that end of its interval. May be given several times.
+        no_worse_than: A requires of B that the interquartile mean of its scores is not
+            lower by --margin or more, as the interval has it; B the same of A.
+        margin: of scores, such as 0.05.
+        confidence: the share of intervals that hold the true value.
         resamples: of the bootstrap that intervals come from.
         seed: of its generator.
-        confidence: the share of intervals that hold the true value.
         as_json: print one JSON object, instead of text.
     """
-    how = dataclasses.replace(
-        _USUAL, resamples=resamples, seed=seed, confidence=confidence
+    if not against:
+        if len(a) != 2:
+            raise InvalidArgument(
+                "Two evaluations are compared (mjrec compare A B), or two sets (mjrec "
+                f"compare A... --against B...), got {len(a)} without --against."
+            )
+        a, against = a[:1], a[1:]
+    if (no_worse_than is None) != (margin is None):
+        raise InvalidArgument("--no-worse-than and --margin belong together.")
+    texts = list(require)
+    if margin is not None:
+        if margin < 0:
+            raise InvalidArgument(f"--margin is 0 or more, got {margin:g}.")
+        bound = f"low > -{margin}" if no_worse_than == "A" else f"high < {margin}"
+        texts.append(f"IQM difference {bound}")
+    required = [parse_requirement(text) for text in texts]
+    comparison = compare_evaluations(
+        a, against, confidence=confidence, resamples=resamples, seed=seed
     )
-    comparison = compare_evaluations(a, b, bootstrap=how)
+    unmet = [why for each in required for why in each.shortfalls(comparison)]
+    if required:
+        unmet += _failures(comparison, no_worse_than == "B")
     if as_json:
-        sys.stdout.write(json_text.dumps(_fields(comparison)) + "\n")
+        fields = {**dataclasses.asdict(comparison), "unmet": unmet}
+        for side in ("a", "b"):
+            fields[side] = list(map(str, fields[side]))
+        sys.stdout.write(json_text.dumps(fields) + "\n")
     else:
-        _show(comparison)
-    return 0
+        _show(comparison, unmet)
+    is_unknown = any(task.unknown for task in comparison.tasks)
+    return _UNMET if unmet or is_unknown else 0
 
 
-def _show(comparison: Comparison) -> None:
+def _failures(comparison: Comparison, of_a: bool) -> Iterator[str]:
+    for task in comparison.tasks:
+        failed = task.failed[0 if of_a else 1]
+        if failed:
+            name = "A" if of_a else "B"
+            yield f"{task.task}: {counted(failed, 'episode')} of {name} failed"
+
+
+def _show(comparison: Comparison, unmet: Sequence[str]) -> None:
     console = result_console()
-    for line in _lines_before(comparison):
-        _print(console, line)
-    console.print(_table(comparison))
-    for line in _lines_after(comparison):
-        _print(console, line)
+    lines = [*_lines_after(comparison), *(f"Not met: {why}." for why in unmet)]
+    for shown in (*_lines_before(comparison), _table(comparison), *lines):
+        if isinstance(shown, str):
+            text = printable(shown)
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
+        else:
+            console.print(shown)
 
 
-def _print(console: rich.console.Console, line: str) -> None:
-    console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
-
-
-def _lines_before(comparison: Comparison) -> list[str]:
-    return [
-        *(f"Caution: {each}." for each in comparison.cautions),
-        f"A: {comparison.a} (policy {comparison.policy_a})",
-        f"B: {comparison.b} (policy {comparison.policy_b})",
-    ]
+def _lines_before(comparison: Comparison) -> Iterator[str]:
+    for caution in comparison.cautions:
+        yield f"Caution: {caution}."
+    for name, directories, policy in zip(
+        "AB", (comparison.a, comparison.b), comparison.policies, strict=True
+    ):
+        count = f"{len(directories)} evaluations: " if len(directories) > 1 else ""
+        yield f"{name}: {count}{', '.join(map(str, directories))} (policy {policy})"
 
 
 def _table(comparison: Comparison) -> rich.table.Table:
-    has_pairs = any(each.paired for each in comparison.tasks)
     table = rich.table.Table(
         box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
+    # All but that of paired differences, which not all comparisons have.
+    names = [n for n in TASK_FIGURES if any(n in t.figures for t in comparison.tasks)]
     table.add_column("task", overflow="fold")
-    for name in (
-        *("episodes A, B", "mean A", "mean B", "B - A"),
-        *(["B - A, paired"] if has_pairs else []),
-        *("P(B > A)", "p (Holm)"),
-    ):
-        table.add_column(name, justify="right")
-    for each in comparison.tasks:
-        cells = _cells(each, has_pairs=has_pairs)
-        table.add_row(*(rich.markup.escape(printable(cell)) for cell in cells))
+    for name in ("episodes", *names):
+        table.add_column(name, justify="right", overflow="fold")
+    for task in comparison.tasks:
+        label = f"{task.task}: {task.unknown}" if task.unknown else task.task
+        table.add_row(
+            rich.markup.escape(printable(label)),
+            ", ".join(map(str, task.episodes)),
+            *(_cell(name, task.figures.get(name)) for name in names),
+        )
     return table
 
 
-def _cells(each: TaskComparison, *, has_pairs: bool) -> list[str]:
-    counts = f"{each.episodes_a}, {each.episodes_b}"
-    if each.unknown is not None:
-        return [f"{each.task}: {each.unknown}", counts]
-    paired = each.paired
-    shown = _with_interval(paired.difference, paired.interval) if paired else ""
-    return [
-        each.task,
-        counts,
-        _number(each.mean_a),
-        _number(each.mean_b),
-        _with_interval(each.difference, each.difference_interval),
-        *([shown] if has_pairs else []),
-        _share(each.probability, each.probability_interval),
-        _p_value(each.p_value_holm),
-    ]
+def _cell(name: str, estimate: Estimate | None) -> str:
+    if estimate is None:
+        return ""
+    # There is no room for the intervals of all.
+    if name.startswith("mean"):
+        return _number(estimate.value)
+    return _estimate(estimate).replace(" (", "\n(")
 
 
-def _lines_after(comparison: Comparison) -> list[str]:
+def _lines_after(comparison: Comparison) -> Iterator[str]:
     percent = f"{comparison.bootstrap.confidence * 100:g} %"
-    lines = [f"In brackets: {percent} intervals. P(B > A): equal returns count half."]
-    for name, tasks in (("A", comparison.only_in_a), ("B", comparison.only_in_b)):
+    yield (
+        f"In brackets: {percent} intervals, over {comparison.unit}. Equal returns "
+        "count half in the probability of improvement; p-values are Holm's."
+    )
+    for name, tasks in zip("AB", comparison.left_out, strict=True):
         if tasks:
-            lines.append(f"Only in {name}: {', '.join(tasks)}")
+            yield f"Only in {name}: {', '.join(tasks)}"
     if comparison.remarks:
-        lines.append(f"The two also differ in: {'; '.join(comparison.remarks)}.")
-    return [*lines, _sentence(comparison)]
+        yield f"The two also differ in: {'; '.join(comparison.remarks)}."
+    yield _sentence(comparison)
 
 
 def _sentence(comparison: Comparison) -> str:
     """Return what the figures say, in words."""
-    compared = comparison.compared
-    if not compared:
+    differences = [
+        each.figures["difference"].value for each in comparison.tasks if each.figures
+    ]
+    if not differences:
         return "No task could be compared."
-    higher = sum(_is(each, above=True) for each in compared)
-    lower = sum(_is(each, above=False) for each in compared)
-    tasks = "1 task" if len(compared) == 1 else f"{len(compared)} tasks"
+    higher = sum(difference > 0 for difference in differences)
+    same = differences.count(0)
+    tasks = counted(len(differences), "task")
     text = f"B has the higher mean return on {higher} of {tasks}"
-    if higher + lower < len(compared):
-        text += f", and the same on {len(compared) - higher - lower}"
-    chance = _share(comparison.probability, comparison.probability_interval)
-    text += f"; probability of improvement of B over A: {chance}"
-    scores = comparison.scores
-    if scores is not None:
-        text += (
-            f"; interquartile mean of scores {scores.iqm_a:.3f} in A and "
-            f"{scores.iqm_b:.3f} in B, difference "
-            f"{_share(scores.difference, scores.interval, digits=3)}"
-        )
-        count = len(scores.tasks)
-        if count < len(compared):
-            verb = "has" if count == 1 else "have"
-            text += f" ({count} of the tasks {verb} a scale)"
+    if same:
+        text += f", and the same on {same}"
+    for name, estimate in comparison.figures.items():
+        text += f"; {name} {_estimate(estimate)}"
+    if 0 < len(comparison.scored) < len(differences):
+        text += f" (scores of {counted(len(comparison.scored), 'task')})"
     return f"{text}."
 
 
-def _is(each: TaskComparison, *, above: bool) -> bool:
-    difference = each.difference or 0.0
-    return difference > 0 if above else difference < 0
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.6g}"
-
-
-def _p_value(value: float | None) -> str:
-    if value is None:
-        return ""
-    return "< 0.001" if value < 0.001 else f"{value:.3f}"
-
-
-def _with_interval(value: float | None, interval: Interval | None) -> str:
+def _estimate(estimate: Estimate) -> str:
+    interval = estimate.interval
     if interval is None:
-        return _number(value)
-    return f"{_number(value)} ({_number(interval.low)} to {_number(interval.high)})"
+        return _number(estimate.value)
+    ends = f"{_number(interval.low)} to {_number(interval.high)}"
+    return f"{_number(estimate.value)} ({ends})"
 
 
-def _share(value: float | None, interval: Interval | None, *, digits: int = 2) -> str:
-    if value is None:
-        return ""
-    text = f"{value:.{digits}f}"
-    if interval is None:
-        return text
-    return f"{text} ({interval.low:.{digits}f} to {interval.high:.{digits}f})"
-
-
-def _fields(comparison: Comparison) -> dict[str, Any]:
-    """Return what `--json` prints: the fields of `Comparison`."""
-    fields = dataclasses.asdict(comparison)
-    return {**fields, "a": str(comparison.a), "b": str(comparison.b)}
+def _number(value: float) -> str:
+    return f"{value:.4g}" if abs(value) < 1000 else f"{value:.1f}"

@@ -1,219 +1,191 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparing two evaluations: how much better the second one is.
+"""Comparing evaluations: how much better B is than A.
 
 Every figure is of B against A: differences are B - A, and the probability of
-improvement is that of an episode of B having a higher return than one of A. What it
-says is of these two policies: two trainings of the same method differ as well, and an
-evaluation of one policy knows nothing of that.
+improvement is that of B having a higher return than A. Where each side is one
+evaluation, the figures are of its episodes, and say something of these two policies
+only. Where a side is several, one for each training, the figures are of the
+evaluations' means, and say something of the two methods: see `docs/statistics.md`.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
 from ..errors import InvalidArgument, MissingDependency
-from . import intervals, statistics
-from .plan import SEEDED, EvaluationPlan
-from .result_columns import ResultColumns
+from . import statistics
+from .plan import SEEDED
+from .result_tables import ResultColumns
 from .results_files import ReadResults, read_results
-from .statistics import FloatArray
-from .summaries import Bootstrap, Interval
-from .summarizing import scaled
+from .statistics import Bootstrap, Estimate, FloatArray
+from .summaries import scaled
 
-# Of the plan: what changes returns though the policy is the same.
-_CONDITIONS: Final = ("max_steps", "env_kwargs")
-# What only chooses which episodes are seen.
-_CHOICES: Final = ("protocol", "seeds", "episodes")
+Directories: TypeAlias = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
+IMPROVEMENT: Final = "probability of improvement"
+TASK_FIGURES: Final = (
+    *("mean A", "mean B", "difference", "paired difference"),
+    *(IMPROVEMENT, "p-value"),
+)
+"""What is said of a task, in the order of tables."""
+OVERALL_FIGURES: Final = (IMPROVEMENT, "IQM A", "IQM B", "IQM difference")
+"""What is said of all tasks together, likewise."""
+
 _MOST_TOLD: Final = 10
-
-# A million of their squares can be added up.
-_LARGEST: Final = 1e150
-
-
-@dataclass(frozen=True)
-class PairedDifference:
-    """How much more B got than A, from the same initial states.
-
-    Attributes:
-        episodes: how many seeds and numbers both completed.
-        difference: the mean of B - A over them.
-        interval: of that, by resampling pairs; None of a single one.
-    """
-
-    episodes: int
-    difference: float
-    interval: Interval | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskComparison:
-    """What is said of one task. What cannot be said is None.
+    """What is said of one task; what is in pairs is of A and of B.
 
     Attributes:
         task: its name.
-        episodes_a: how many were completed; the figures are theirs.
-        episodes_b: likewise.
-        failed_a: how many were not.
-        failed_b: likewise.
-        mean_a: of the returns.
-        mean_b: likewise.
-        difference: `mean_b - mean_a`.
-        difference_interval: of that.
-        probability: that B is better: of an episode of B having a higher return than
-            one of A, where equal returns count half.
-        probability_interval: of that.
-        p_value: of the two-sided Mann-Whitney test that neither tends to be higher.
-        p_value_holm: that, adjusted (Holm) for the number of tasks.
-        paired: the same difference from episodes that began alike; None where the two
-            evaluations have none.
-        interval_method: how the intervals were made.
+        episodes: how many were completed; the figures are theirs.
+        failed: how many were not.
+        not_finite: how many of the completed ones have a return that is NaN or
+            infinite. Where any has, there are no figures.
+        figures: by name, those of `TASK_FIGURES` that can be said. The means are of the
+            returns or, of several evaluations, of their means. The paired difference is
+            that of episodes which began alike. The p-value is that of the two-sided
+            Mann-Whitney test, adjusted (Holm) for the number of tasks.
+        pairs: of how many pairs of episodes the paired difference is.
         unknown: why there are no figures; None where there are.
     """
 
     task: str
-    episodes_a: int
-    episodes_b: int
-    failed_a: int = 0
-    failed_b: int = 0
-    mean_a: float | None = None
-    mean_b: float | None = None
-    difference: float | None = None
-    difference_interval: Interval | None = None
-    probability: float | None = None
-    probability_interval: Interval | None = None
-    p_value: float | None = None
-    p_value_holm: float | None = None
-    paired: PairedDifference | None = None
-    interval_method: str | None = None
-    unknown: str | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScoreComparison:
-    """The interquartile means of the scores of all tasks with the same scale in both.
-
-    Attributes:
-        tasks: which ones.
-        iqm_a: the interquartile mean of their scores.
-        iqm_b: likewise.
-        difference: `iqm_b - iqm_a`.
-        interval: of that; None where a task has a single episode.
-    """
-
-    tasks: tuple[str, ...]
-    iqm_a: float
-    iqm_b: float
-    difference: float
-    interval: Interval | None
+    episodes: tuple[int, int]
+    failed: tuple[int, int]
+    not_finite: tuple[int, int]
+    figures: Mapping[str, Estimate]
+    pairs: int
+    unknown: str | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Evaluation B against evaluation A.
+    """B against A; what is in pairs is of A and of B.
 
     Attributes:
-        a: the directory of the one.
-        b: the directory of the other.
-        policy_a: what was evaluated in A.
-        policy_b: what was evaluated in B.
-        cautions: what must be known before the figures are believed: that the two were
-            not made under the same conditions, or that episodes failed.
+        a: the directories of the one side.
+        b: the directories of the other.
+        unit: what the figures are of, and is resampled: `"episodes"` of one evaluation
+            on each side, or `"evaluations"`.
+        policies: what was evaluated.
+        cautions: what must be known before the figures are believed: that not all was
+            made under the same conditions, or that episodes failed.
         remarks: in what else the two differ; their figures can be compared all the
             same.
-        only_in_a: tasks that are not in B.
-        only_in_b: tasks that are not in A.
-        tasks: those that are in both, in the order of A.
-        probability: that B is better, averaged over tasks; None where no task has one.
-        probability_interval: of that; None also where a task has a single episode.
-        scores: of all tasks that have the same scale in both; None where none has.
+        left_out: tasks that are not in all evaluations of the other.
+        tasks: those that are everywhere, in the order of A.
+        figures: by name, those of `OVERALL_FIGURES` that can be said: the probability
+            of improvement, averaged over tasks, and interquartile means of scores.
+        scored: the tasks whose scores these are: with the same scale everywhere.
         bootstrap: how intervals were made.
     """
 
-    a: Path
-    b: Path
-    policy_a: str
-    policy_b: str
+    a: tuple[Path, ...]
+    b: tuple[Path, ...]
+    unit: Literal["episodes", "evaluations"]
+    policies: tuple[str, str]
     cautions: tuple[str, ...]
     remarks: tuple[str, ...]
-    only_in_a: tuple[str, ...]
-    only_in_b: tuple[str, ...]
+    left_out: tuple[tuple[str, ...], tuple[str, ...]]
     tasks: tuple[TaskComparison, ...]
-    probability: float | None
-    probability_interval: Interval | None
-    scores: ScoreComparison | None
+    figures: Mapping[str, Estimate]
+    scored: tuple[str, ...]
     bootstrap: Bootstrap
-
-    @property
-    def compared(self) -> tuple[TaskComparison, ...]:
-        """The tasks that have figures."""
-        return tuple(task for task in self.tasks if task.unknown is None)
 
 
 def compare(
-    a: str | Path, b: str | Path, *, bootstrap: Bootstrap | None = None
+    a: Directories,
+    b: Directories,
+    *,
+    confidence: float = 0.95,
+    resamples: int = 10_000,
+    seed: int = 0,
 ) -> Comparison:
-    """Compare two evaluations; every figure is of B against A.
+    """Compare two evaluations, or two sets of them; every figure is of B against A.
+
+    Of one evaluation on each side, episodes are resampled: the figures are of these two
+    policies. Of several on a side (trainings of one method with different seeds), each
+    evaluation counts as its mean return, and these are resampled, for each task on its
+    own.
 
     Args:
-        a: the directory of an evaluation.
-        b: the directory of another.
-        bootstrap: how intervals are made; as `Bootstrap()` says, if None.
+        a: the directory of an evaluation, or several.
+        b: likewise.
+        confidence: the share of intervals that hold the true value.
+        resamples: of the bootstrap that intervals come from.
+        seed: of its generator.
 
     Raises:
         UnreadableFile: there is no finished evaluation in a directory, or it is
             damaged.
-        InvalidArgument: no task is in both.
+        InvalidArgument: no task is in all of them, or a directory is there twice.
         MissingDependency: scipy is not installed.
     """
-    return compare_results(
-        read_results(Path(a)), read_results(Path(b)), bootstrap or Bootstrap()
-    )
-
-
-def compare_results(a: ReadResults, b: ReadResults, bootstrap: Bootstrap) -> Comparison:
-    """Compare two evaluations that have been read; see `compare`."""
-    common = [task for task in a.columns if task in b.columns]
+    how = Bootstrap(resamples=resamples, seed=seed, confidence=confidence)
+    sides = of_a, of_b = _Side("A", a), _Side("B", b)
+    common = [task for task in of_a.tasks if task in of_b.tasks]
     if not common:
         raise InvalidArgument(
-            f"The two evaluations have no task in common: {a.directory} is of "
-            f"{', '.join(a.columns)}; {b.directory} is of {', '.join(b.columns)}."
+            "The evaluations have no task in common: "
+            + "; ".join(f"{side.told} has {', '.join(side.tasks)}" for side in sides)
         )
-    pairs = {task: _Pair(a.columns[task], b.columns[task]) for task in common}
-    known = {task: pair for task, pair in pairs.items() if pair.unknown is None}
-    returns_a = {task: pair.returns_a for task, pair in known.items()}
-    returns_b = {task: pair.returns_b for task, pair in known.items()}
-    found = intervals.improvement_intervals(returns_b, returns_a, bootstrap=bootstrap)
-    p_values = _mann_whitney(returns_a, returns_b)
-    comparison = Comparison(
-        a=a.directory,
-        b=b.directory,
-        policy_a=a.plan.policy,
-        policy_b=b.plan.policy,
-        cautions=tuple(_cautions(a, b, pairs)),
-        remarks=tuple(_remarks(a, b)),
-        only_in_a=tuple(task for task in a.columns if task not in pairs),
-        only_in_b=tuple(task for task in b.columns if task not in pairs),
-        tasks=tuple(
-            _compared_task(task, pair, found, bootstrap) for task, pair in pairs.items()
+    is_single = len(of_a.results) == len(of_b.results) == 1
+    unknown = {task: of_a.unknown(task) or of_b.unknown(task) for task in common}
+    samples = {
+        task: (of_a.sample(task, is_single), of_b.sample(task, is_single))
+        for task, why in unknown.items()
+        if why is None
+    }
+    p_values = holm_adjusted({task: _p_value(*both) for task, both in samples.items()})
+    tasks = []
+    for task in common:
+        pairs = np.empty(0)
+        figures: dict[str, Estimate] = {}
+        if task in samples:
+            if is_single:
+                pairs = _paired_differences(task, of_a.results[0], of_b.results[0])
+            figures = _task_figures(*samples[task], pairs, how)
+            figures["p-value"] = Estimate(p_values[task])
+        episodes, failed, not_finite = zip(
+            of_a.counts(task), of_b.counts(task), strict=True
+        )
+        tasks.append(
+            TaskComparison(
+                task=task,
+                episodes=episodes,
+                failed=failed,
+                not_finite=not_finite,
+                figures=figures,
+                pairs=len(pairs),
+                unknown=unknown[task],
+            )
+        )
+    scales = _scales([*of_a.results, *of_b.results])
+    scored = tuple(task for task in samples if task in scales)
+    return Comparison(
+        a=of_a.directories,
+        b=of_b.directories,
+        unit="episodes" if is_single else "evaluations",
+        policies=(_listed(of_a.policies), _listed(of_b.policies)),
+        cautions=tuple(_cautions(of_a, of_b, tasks)),
+        remarks=tuple(
+            f"{name}: {in_a} in A, {in_b} in B"
+            for name, in_a, in_b in _different(of_a, of_b, _choices)
         ),
-        probability=(
-            statistics.mean_probability_of_improvement(returns_b, returns_a)
-            if known
-            else None
-        ),
-        probability_interval=found.mean_probability,
-        scores=_compared_scores(a, b, known, bootstrap),
-        bootstrap=bootstrap,
-    )
-    comparison = _with_p_values(comparison, p_values)
-    return (
-        _with_pairs(comparison, known, bootstrap) if _begin_alike(a, b) else comparison
+        left_out=(of_a.without(common), of_b.without(common)),
+        tasks=tuple(tasks),
+        figures=_overall_figures(samples, {task: scales[task] for task in scored}, how),
+        scored=scored,
+        bootstrap=how,
     )
 
 
@@ -221,148 +193,124 @@ def holm_adjusted(p_values: Mapping[str, float]) -> dict[str, float]:
     """Return p-values that are adjusted for how many there are.
 
     The k-th smallest of m (from 0) times m - k, none smaller than one before it, at
-    most 1: S. Holm, "A Simple Sequentially Rejective Multiple Test Procedure",
-    Scandinavian Journal of Statistics 6 (1979). To call those below 0.05 different is
-    to be wrong about any of them in at most 5 of 100 comparisons.
+    most 1. To call those below 0.05 different is to be wrong about any of them in at
+    most 5 of 100 comparisons.
     """
     adjusted: dict[str, float] = {}
     largest = 0.0
     for k, name in enumerate(sorted(p_values, key=lambda name: p_values[name])):
         largest = max(largest, min(1.0, p_values[name] * (len(p_values) - k)))
         adjusted[name] = largest
-    return {name: adjusted[name] for name in p_values}
+    return adjusted
 
 
-class _Pair:
-    """The episodes of one task in both evaluations."""
+class _Side:
+    """The evaluations of one side.
 
-    def __init__(self, a: ResultColumns, b: ResultColumns) -> None:
-        self.a = a
-        self.b = b
-        self.returns_a = a.total_reward[~a.failed]
-        self.returns_b = b.total_reward[~b.failed]
+    Args:
+        name: `"A"` or `"B"`.
+        directories: one, or several.
+    """
+
+    def __init__(self, name: str, directories: Directories) -> None:
+        if isinstance(directories, str | os.PathLike):
+            directories = [directories]
+        self.name = name
+        self.directories = tuple(map(Path, directories))
+        if not self.directories:
+            raise InvalidArgument(f"There is no evaluation on the side of {name}.")
+        if len({path.resolve() for path in self.directories}) < len(self.directories):
+            raise InvalidArgument(f"An evaluation is there twice: {self.told}.")
+        self.results = [read_results(path) for path in self.directories]
 
     @property
-    def unknown(self) -> str | None:
-        """Why the two cannot be compared."""
-        for name, returns in (("A", self.returns_a), ("B", self.returns_b)):
+    def told(self) -> str:
+        return f"{self.name} ({', '.join(map(str, self.directories))})"
+
+    @property
+    def tasks(self) -> list[str]:
+        """The tasks that are in all evaluations."""
+        rest = [each.columns for each in self.results[1:]]
+        first = self.results[0].columns
+        return [task for task in first if all(task in other for other in rest)]
+
+    @property
+    def policies(self) -> list[str]:
+        return [each.plan.policy for each in self.results]
+
+    def without(self, tasks: Sequence[str]) -> tuple[str, ...]:
+        """Return the other tasks."""
+        return tuple(task for task in self.tasks if task not in tasks)
+
+    def returns(self, task: str) -> list[FloatArray]:
+        """Return those of the completed episodes of each evaluation."""
+        columns = [each.columns[task] for each in self.results]
+        return [each.total_reward[~each.failed] for each in columns]
+
+    def sample(self, task: str, is_single: bool) -> FloatArray:
+        """Return what the figures are of: returns, or the mean of each evaluation."""
+        returns = self.returns(task)
+        return returns[0] if is_single else np.array([r.mean() for r in returns])
+
+    def counts(self, task: str) -> tuple[int, int, int]:
+        """Return how many episodes were completed, failed, and returned no number."""
+        failed = sum(len(each.columns[task].failures) for each in self.results)
+        returns = np.concatenate(self.returns(task))
+        return len(returns), failed, _not_finite(returns)
+
+    def unknown(self, task: str) -> str | None:
+        """Return why there are no figures of a task."""
+        for path, returns in zip(self.directories, self.returns(task), strict=True):
+            name = self.name if len(self.results) == 1 else path
             if not len(returns):
                 return f"no episode of {name} was completed"
-            wrong = np.count_nonzero(~np.isfinite(returns))
-            if wrong:
+            if wrong := _not_finite(returns):
                 return (
                     f"{wrong} of {len(returns)} returns of {name} are NaN or infinite"
                 )
-            if np.abs(returns).max() > _LARGEST:
-                return f"returns of {name} are too large to be added up"
         return None
 
-    def differences(self) -> FloatArray:
-        """Return B - A for each seed and number that both have completed."""
-        of_a, of_b = _by_unit(self.a), _by_unit(self.b)
-        return np.array([of_b[unit] - of_a[unit] for unit in of_a if unit in of_b])
+
+def _not_finite(returns: FloatArray) -> int:
+    return int(np.count_nonzero(~np.isfinite(returns)))
 
 
-def _by_unit(columns: ResultColumns) -> dict[tuple[int, int], float]:
-    done = ~columns.failed
-    units = zip(
-        columns.seed[done].tolist(), columns.episode[done].tolist(), strict=True
-    )
-    return dict(zip(units, columns.total_reward[done].tolist(), strict=True))
+def _task_figures(
+    x: FloatArray, y: FloatArray, pairs: FloatArray, how: Bootstrap
+) -> dict[str, Estimate]:
+    mean_a, mean_b = statistics.mean(x), statistics.mean(y)
+    figures = {"mean A": mean_a, "mean B": mean_b, "difference": mean_b - mean_a}
+    if len(pairs):
+        figures["paired difference"] = statistics.mean(pairs)
+    figures[IMPROVEMENT] = statistics.improvement(y, x)
+    return {name: figure.estimate(how) for name, figure in figures.items()}
 
 
-def _compared_task(
-    task: str,
-    pair: _Pair,
-    found: intervals.ImprovementIntervals,
-    bootstrap: Bootstrap,
-) -> TaskComparison:
-    counts = {"a": len(pair.returns_a), "b": len(pair.returns_b)}
-    compared = TaskComparison(
-        task=task,
-        episodes_a=counts["a"],
-        episodes_b=counts["b"],
-        failed_a=len(pair.a.failures),
-        failed_b=len(pair.b.failures),
-        unknown=pair.unknown,
-    )
-    if pair.unknown is not None:
-        return compared
-    mean_a, mean_b = float(pair.returns_a.mean()), float(pair.returns_b.mean())
-    return dataclasses.replace(
-        compared,
-        mean_a=mean_a,
-        mean_b=mean_b,
-        difference=mean_b - mean_a,
-        difference_interval=found.differences.get(task),
-        probability=statistics.probability_of_improvement(
-            pair.returns_b, pair.returns_a
-        ),
-        probability_interval=found.probabilities.get(task),
-        interval_method=intervals.interval_method(counts),
-    )
-
-
-def _with_p_values(comparison: Comparison, p_values: Mapping[str, float]) -> Comparison:
-    adjusted = holm_adjusted(p_values)
-    tasks = tuple(
-        dataclasses.replace(
-            each,
-            p_value=p_values.get(each.task),
-            p_value_holm=adjusted.get(each.task),
+def _overall_figures(
+    samples: Mapping[str, tuple[FloatArray, FloatArray]],
+    scales: Mapping[str, tuple[float, float]],
+    how: Bootstrap,
+) -> dict[str, Estimate]:
+    figures = {}
+    if samples:
+        better = [statistics.improvement(y, x) for x, y in samples.values()]
+        figures[IMPROVEMENT] = statistics.average(better)
+    if scales:
+        iqm_a, iqm_b = (
+            statistics.interquartile_mean(
+                scaled(samples[task][side], scale) for task, scale in scales.items()
+            )
+            for side in (0, 1)
         )
-        for each in comparison.tasks
-    )
-    return dataclasses.replace(comparison, tasks=tasks)
+        figures |= {"IQM A": iqm_a, "IQM B": iqm_b, "IQM difference": iqm_b - iqm_a}
+    return {name: figure.estimate(how) for name, figure in figures.items()}
 
 
-def _with_pairs(
-    comparison: Comparison, known: Mapping[str, _Pair], bootstrap: Bootstrap
-) -> Comparison:
-    paired = {
-        task: _paired(task, pair.differences(), bootstrap)
-        for task, pair in known.items()
-    }
-    tasks = tuple(
-        dataclasses.replace(each, paired=paired.get(each.task))
-        for each in comparison.tasks
-    )
-    return dataclasses.replace(comparison, tasks=tasks)
+def _p_value(x: FloatArray, y: FloatArray) -> float:
+    """Return that of the two-sided Mann-Whitney test.
 
-
-def _paired(
-    task: str, differences: FloatArray, bootstrap: Bootstrap
-) -> PairedDifference | None:
-    if not len(differences):
-        return None
-    return PairedDifference(
-        len(differences),
-        float(differences.mean()),
-        intervals.mean_interval(
-            differences, stratum=f"paired:{task}", bootstrap=bootstrap
-        ),
-    )
-
-
-def _begin_alike(a: ReadResults, b: ReadResults) -> bool:
-    """Tell whether an episode of the same seed and number began in the same state."""
-    return (
-        a.plan.protocol == b.plan.protocol == SEEDED
-        and a.plan.env_kwargs == b.plan.env_kwargs
-    )
-
-
-def _mann_whitney(
-    a: Mapping[str, FloatArray], b: Mapping[str, FloatArray]
-) -> dict[str, float]:
-    """Return the two-sided p-value of the Mann-Whitney test of each task.
-
-    H. B. Mann and D. R. Whitney, Annals of Mathematical Statistics 18 (1947). Exact
-    for small samples without ties, else by the normal approximation with corrections
-    for ties and continuity, as scipy chooses. Where all returns are equal it is 1.
+    It is exact for small samples without equal values.
     """
-    if not a:
-        return {}
     try:
         # Here, because it takes longer to import than all else, and is optional.
         from scipy.stats import mannwhitneyu  # type: ignore[import-untyped] # no stubs
@@ -372,83 +320,92 @@ def _mann_whitney(
             purpose="Comparing evaluations",
             install='pip install "mjrec[evaluation]"',
         ) from error
+    if np.ptp(np.concatenate([x, y])) == 0:
+        # SciPy would divide zero by zero.
+        return 1.0
+    return float(mannwhitneyu(y, x, alternative="two-sided").pvalue)
+
+
+def _paired_differences(task: str, a: ReadResults, b: ReadResults) -> FloatArray:
+    """Return B - A of the episodes that began in the same state in both."""
+    if not (
+        a.plan.protocol == b.plan.protocol == SEEDED
+        and a.plan.env_kwargs == b.plan.env_kwargs
+    ):
+        return np.empty(0)
+    of_a, of_b = _by_unit(a.columns[task]), _by_unit(b.columns[task])
+    return np.array([of_b[unit] - of_a[unit] for unit in of_a if unit in of_b])
+
+
+def _by_unit(columns: ResultColumns) -> dict[tuple[int, int], float]:
+    done = ~columns.failed
+    units = zip(columns.seed[done], columns.episode[done], strict=True)
+    return dict(zip(units, columns.total_reward[done].tolist(), strict=True))
+
+
+def _scales(results: Sequence[ReadResults]) -> dict[str, tuple[float, float]]:
+    """Return the returns that count as 0 and as 1, of tasks where all say the same."""
+    said: dict[str, set[tuple[float, float] | None]] = {}
+    for each in results:
+        for summary in each.summaries:
+            said.setdefault(summary.task, set()).add(summary.score_range)
+    # A file may say anything.
     return {
-        task: 1.0
-        if np.ptp(np.concatenate([a[task], b[task]])) == 0
-        else float(mannwhitneyu(b[task], a[task], alternative="two-sided").pvalue)
-        for task in a
+        task: scale
+        for task, (scale, *others) in said.items()
+        if not others and scale is not None and scale[0] < scale[1]
     }
 
 
-def _compared_scores(
-    a: ReadResults, b: ReadResults, known: Mapping[str, _Pair], bootstrap: Bootstrap
-) -> ScoreComparison | None:
-    ranges_a, ranges_b = _score_ranges(a), _score_ranges(b)
-    scores_a: dict[str, FloatArray] = {}
-    scores_b: dict[str, FloatArray] = {}
-    for task, pair in known.items():
-        scale = ranges_a.get(task)
-        if scale is not None and scale == ranges_b.get(task) and _is_usable(scale):
-            scores_a[task] = scaled(pair.returns_a, scale)
-            scores_b[task] = scaled(pair.returns_b, scale)
-    if not scores_a:
-        return None
-    iqm_a = statistics.interquartile_mean_across(scores_a)
-    iqm_b = statistics.interquartile_mean_across(scores_b)
-    return ScoreComparison(
-        tasks=tuple(scores_a),
-        iqm_a=iqm_a,
-        iqm_b=iqm_b,
-        difference=iqm_b - iqm_a,
-        interval=intervals.iqm_difference_interval(
-            scores_b, scores_a, bootstrap=bootstrap
-        ),
-    )
-
-
-def _is_usable(scale: tuple[float, float]) -> bool:
-    """Tell whether a range, which comes from a file, leaves returns finite."""
-    low, high = scale
-    return 1 / _LARGEST < high - low < _LARGEST
-
-
-def _score_ranges(results: ReadResults) -> dict[str, tuple[float, float] | None]:
-    return {summary.task: summary.score_range for summary in results.summaries}
-
-
-def _cautions(
-    a: ReadResults, b: ReadResults, pairs: Mapping[str, _Pair]
-) -> Iterator[str]:
-    for name, of_a, of_b in _different(a.plan, b.plan, _CONDITIONS):
+def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[str]:
+    for side, other in ((a, b), (b, a)):
+        if len(side.results) == 1 < len(other.results):
+            yield (
+                f"{side.name} is a single evaluation: how much another training would "
+                "differ is not known, and there are no intervals"
+            )
+    for name, of_a, of_b in _different(a, b, _conditions):
         yield (
             f"{name} was {of_a} in A and is {of_b} in B: returns under different "
             "conditions do not tell which policy is better"
         )
-    for task, pair in pairs.items():
-        for name, columns in (("A", pair.a), ("B", pair.b)):
-            if columns.failures:
+    for task in tasks:
+        for name, failed, completed in zip(
+            "AB", task.failed, task.episodes, strict=True
+        ):
+            if failed:
                 yield (
-                    f"{task}: {len(columns.failures)} of {len(columns)} episodes of "
+                    f"{task.task}: {failed} of {failed + completed} episodes of "
                     f"{name} failed; the figures are of the others"
                 )
 
 
-def _remarks(a: ReadResults, b: ReadResults) -> Iterator[str]:
-    for name, of_a, of_b in _different(a.plan, b.plan, _CHOICES):
-        yield f"{name}: {of_a} in A, {of_b} in B"
-    for package in sorted({*a.versions, *b.versions}):
-        of_a, of_b = (each.versions.get(package, "none") for each in (a, b))
-        if of_a != of_b:
-            yield f"{package}: {of_a} in A, {of_b} in B"
+def _conditions(results: ReadResults) -> Mapping[str, object]:
+    """Return what changes returns though the policy is the same."""
+    plan = results.plan
+    return {"max_steps": plan.max_steps, "env_kwargs": plan.env_kwargs}
+
+
+def _choices(results: ReadResults) -> Mapping[str, object]:
+    """Return what chooses which episodes are seen, and what ran them."""
+    plan = results.plan
+    chosen = {name: getattr(plan, name) for name in ("protocol", "seeds", "episodes")}
+    return {**chosen, **results.versions}
 
 
 def _different(
-    a: EvaluationPlan, b: EvaluationPlan, names: Sequence[str]
+    a: _Side, b: _Side, facts: Callable[[ReadResults], Mapping[str, object]]
 ) -> Iterator[tuple[str, str, str]]:
-    for name in names:
-        of_a, of_b = getattr(a, name), getattr(b, name)
-        if of_a != of_b:
-            yield name, _told(of_a), _told(of_b)
+    """Yield the facts that are not the same everywhere, as each side says them."""
+    said = [[facts(each) for each in side.results] for side in (a, b)]
+    for name in dict.fromkeys(name for side in said for fact in side for name in fact):
+        of_a, of_b = ([fact.get(name, "none") for fact in side] for side in said)
+        if any(value != of_a[0] for value in (*of_a, *of_b)):
+            yield name, _listed(of_a), _listed(of_b)
+
+
+def _listed(values: Iterable[object]) -> str:
+    return " or ".join(dict.fromkeys(map(_told, values)))
 
 
 def _told(value: object) -> str:

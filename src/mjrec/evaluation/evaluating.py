@@ -45,10 +45,11 @@ from .planning import check_score_ranges, plan_from
 from .policy_objects import SentPolicy, sent_policy
 from .recorded_files import RecordedFiles
 from .results_files import PLAN_NAME, ChosenEpisode, write_results
-from .summaries import AcrossTasks, Bootstrap, TaskSummary
-from .summarizing import (
+from .statistics import Bootstrap
+from .summaries import (
+    AcrossTasks,
+    TaskSummary,
     default_score_range,
-    split_by_scale,
     summarize_across,
     summarize_results,
 )
@@ -87,7 +88,7 @@ def evaluate(
     quality: str = "full",
     env_kwargs: Mapping[str, Any] | None = None,
     score_ranges: Mapping[str, tuple[float, float]] | None = None,
-    bootstrap: Bootstrap | None = None,
+    confidence: float = 0.95,
     on_progress: _Tell | None = None,
     engine: Executor | str | None = None,
 ) -> Evaluation:
@@ -135,7 +136,7 @@ def evaluate(
         env_kwargs: more arguments for each environment.
         score_ranges: the returns that count as 0 and as 1, by task, for what is said
             over all tasks. Those of the dm_control suite have theirs.
-        bootstrap: how confidence intervals are made.
+        confidence: the share of intervals that hold the true value.
         on_progress: called several times a second with how far it is.
         engine: where the work runs, instead of processes of this one: an engine, or
             `"local"`, `"ray"` or `"slurm"`. Its workers draw the videos, too, those of
@@ -155,6 +156,7 @@ def evaluate(
         Error: an argument, a task or the policy cannot be. All of these are told
             before anything is run or written.
     """
+    how = Bootstrap(confidence=confidence)
     given = given_engine(engine, workers)
     local = LocalEngine(workers)
     place = Path(directory)
@@ -182,7 +184,7 @@ def evaluate(
     if begun is not None:
         check_continues(place, begun, plan)
     tell = on_progress or (lambda _: None)
-    results = _Results(plan, place, ranges=ranges, bootstrap=bootstrap or Bootstrap())
+    results = _Results(plan, place, ranges=ranges, bootstrap=how)
     with contextlib.ExitStack() as stack:
         runs = _run(
             given or local,
@@ -481,6 +483,4 @@ def _summarized(
         ]
         for of in runs
     }
-    scores, left_out = split_by_scale(returns, scales)
-    across = summarize_across(scores, left_out=left_out, bootstrap=bootstrap)
-    return summaries, across
+    return summaries, summarize_across(returns, scales, bootstrap=bootstrap)

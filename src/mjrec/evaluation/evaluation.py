@@ -10,7 +10,8 @@ from pathlib import Path
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
 from .results_files import ChosenEpisode
-from .summaries import AcrossTasks, Bootstrap, TaskSummary
+from .statistics import Bootstrap
+from .summaries import AcrossTasks, TaskSummary
 
 
 @dataclass(frozen=True, kw_only=True)
