@@ -38,7 +38,6 @@ from mjrec.evaluation.results_files import read_results
 from mjrec.evaluation.splitting import batches_of
 from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.locks import try_lock
-from mjrec.formats.video_metadata import metadata_path
 
 PENDULUM = "InvertedPendulum-v5"
 DOUBLE = "InvertedDoublePendulum-v5"
@@ -159,16 +158,10 @@ def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
     assert (best.role, worst.role) == ("best", "worst")
     assert best.seed * 2 + best.episode == returns.index(max(returns))
     assert worst.seed * 2 + worst.episode == returns.index(min(returns))
-    assert {path.name for path in evaluation.videos} == {
-        video.name for video in columns.videos.values()
-    }
+    assert {path.name for path in evaluation.videos} == {*columns.videos.values()}
     assert evaluation.pending == {}
-    for index, video in columns.videos.items():
-        path = read.folder(PENDULUM) / video.name
-        assert path.stat().st_size > 0
-        assert video.sha256 is not None
-        assert video.sha256 in metadata_path(path).read_text()
-        assert columns.video_prefix(index) == path.stem
+    for name in columns.videos.values():
+        assert (read.folder(PENDULUM) / name).stat().st_size > 0
 
 
 @pytest.mark.thorough

@@ -6,12 +6,9 @@ from __future__ import annotations
 from collections.abc import Container
 from pathlib import Path
 
-from ..formats.json_fields import field, read_object, text
 from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
 from ..formats.spans import recordings_in_flight
-from ..formats.video_metadata import metadata_path
 from .episode_results import EpisodeResult
-from .result_columns import ResultVideo
 from .result_tables import EpisodeFiles
 
 _TRAJECTORIES = (".h5",)
@@ -42,15 +39,16 @@ class RecordedFiles:
             return EpisodeFiles()
         trajectory = trajectory_prefix(infix, result.episode_id)
         return EpisodeFiles(
+            folder=self._folder.name,
             trajectory=self._first(trajectory, _TRAJECTORIES),
             video=self._video(result, video_prefix(infix, result.episode_id)),
         )
 
-    def _video(self, result: EpisodeResult, prefix: str) -> ResultVideo | None:
+    def _video(self, result: EpisodeResult, prefix: str) -> str | None:
         name = self._first(prefix, _VIDEOS)
         if name is not None:
-            return ResultVideo(name, _sha256(self._folder / name))
-        return ResultVideo(f"{prefix}.mp4", None) if self._is_chosen(result) else None
+            return name
+        return f"{prefix}.mp4" if self._is_chosen(result) else None
 
     def _is_chosen(self, result: EpisodeResult) -> bool:
         return result.unit in self._chosen
@@ -58,11 +56,3 @@ class RecordedFiles:
     def _first(self, prefix: str, suffixes: tuple[str, ...]) -> str | None:
         names = (prefix + suffix for suffix in suffixes)
         return next((name for name in names if name in self._names), None)
-
-
-def _sha256(video: Path) -> str | None:
-    """Return what a video's metadata says, which is written with it."""
-    try:
-        return field(read_object(metadata_path(video)), "file_sha256", text)
-    except (OSError, ValueError):
-        return None

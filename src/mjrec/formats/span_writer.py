@@ -47,6 +47,10 @@ from .trajectory_log import pack_change
 # A new log begins with the next recording then.
 _LONG = 64 << 20
 
+# The tail of a log of one recording is that much shorter: making it takes longer than
+# all else at the start of an episode.
+_TAILS_OF_ONE = 8
+
 ROW_HEAD = struct.Struct("=qqdQ")
 
 
@@ -101,7 +105,8 @@ class SpanLogs:
             self.close()
         if self._log is None:
             path = self.directory / states_name(self._infix, next(self._numbers))
-            self._log = OpenLog(path, facts, dtype, tail_bytes=self._tail_bytes)
+            tail = self._tail_bytes // _TAILS_OF_ONE if alone else self._tail_bytes
+            self._log = OpenLog(path, facts, dtype, tail_bytes=tail)
         span = SpanWriter(self._log, name, facts)
         if alone:
             self._log.is_alone = True
