@@ -22,6 +22,7 @@ _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 # Nothing in an environment says with which arguments it was made.
 _made: weakref.WeakKeyDictionary[Any, dict[str, Any]] = weakref.WeakKeyDictionary()
+_never_reset: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def make_dm_control(
@@ -54,6 +55,7 @@ def make_dm_control(
     except Exception as error:
         raise dm_control_failure(f"dm_control/{domain}-{task}", error) from error
     _made[environment.task] = arguments
+    _never_reset.add(environment.task)
     return _limited(environment, options)
 
 
@@ -86,6 +88,7 @@ def begin_episode(env: dm_env.Environment, seeds: EpisodeSeeds) -> Any:
     Raises:
         InvalidArgument: the environment has no random state.
     """
+    _never_reset.discard(getattr(env, "task", None))
     _random_state(env).seed(seeds.environment)
     if not callable(getattr(env, "seed", print)):
         env.seed = seeds.environment
@@ -110,8 +113,8 @@ def begin_stream(env: dm_env.Environment, seed: int, seeds: EpisodeSeeds) -> Any
     Raises:
         InvalidArgument: the environment has no random state.
     """
-    made = arguments_of(env) or {}
-    if made.get("task_kwargs", {}).get("random") != seed:
+    made, task = arguments_of(env) or {}, getattr(env, "task", None)
+    if made.get("task_kwargs", {}).get("random") != seed or task not in _never_reset:
         _random_state(env).seed(seed)
     return next_episode(env, seeds)
 
@@ -124,9 +127,18 @@ def next_episode(env: dm_env.Environment, seeds: EpisodeSeeds) -> Any:
     Returns:
         The first observation.
     """
+    _never_reset.discard(getattr(env, "task", None))
     if not callable(getattr(env, "seed", print)):
         env.seed = None
     return env.reset().observation
+
+
+def draws_when_made(env: dm_env.Environment) -> bool:
+    """Tell whether a task, which was just made, has drawn its model from its seed."""
+    seed = (arguments_of(env) or {}).get("task_kwargs", {}).get("random")
+    state = _random_state(env).get_state(legacy=False)["state"]
+    fresh = np.random.RandomState(seed).get_state(legacy=False)["state"]
+    return any(not np.array_equal(state[name], fresh[name]) for name in state)
 
 
 def step_limit(env: dm_env.Environment) -> int:

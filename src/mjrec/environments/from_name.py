@@ -37,6 +37,7 @@ class NamedEnvironment:
             whether it is the episode's last.
         scenes: returns what is known of its pictures and its states.
         step_limit: after how many steps its episodes end.
+        draws_when_made: its model depends on the seed that it was made with.
         view: `camera`, `height` and `width` as far as the monitor is to be given
             them; empty where the environment itself shows what was asked for.
     """
@@ -49,6 +50,7 @@ class NamedEnvironment:
     step: Callable[[Any, Any], tuple[Any, bool]]
     scenes: Callable[[], Scenes]
     step_limit: int
+    draws_when_made: bool = False
     view: dict[str, Any] = field(default_factory=dict)
 
     def has_deferrable_pictures(self) -> bool:
@@ -142,6 +144,7 @@ def _dm_control(name: DmControlName, options: EnvironmentOptions) -> NamedEnviro
         step=module.step,
         scenes=lambda: dm_control_scenes(environment),
         step_limit=module.step_limit(environment),
+        draws_when_made=module.draws_when_made(environment),
         view=_dm_control_view(environment, options),
     )
 

@@ -15,19 +15,6 @@ from .episode_results import EpisodeResult
 _TRUTH = {1: True, 0: False, -1: None}
 
 
-@dataclass(frozen=True)
-class ResultVideo:
-    """The video of an episode.
-
-    Attributes:
-        name: its base name in the task's monitor directory.
-        sha256: of the file; None where it was pending when the results were written.
-    """
-
-    name: str
-    sha256: str | None
-
-
 @dataclass(frozen=True, kw_only=True)
 class ResultColumns:
     """The episodes of one task, in the order of the plan: by seed, then by number.
@@ -48,9 +35,10 @@ class ResultColumns:
         seconds: `(n,) float64`, how long it took, likewise.
         monitor: `(n,) int32`, index into `monitors`, or -1.
         monitors: the infixes of the monitors that recorded them.
+        folders: of these, the monitor directories, in that of the evaluation.
         episode_id: `(n,) int64`, the number in that monitor, or -1.
         has_trajectory: `(n,) bool`.
-        videos: by index, of those that have one.
+        videos: by index, the base names of the videos of those that get one.
     """
 
     task: str
@@ -66,9 +54,10 @@ class ResultColumns:
     seconds: NDArray[np.float64]
     monitor: NDArray[np.int32]
     monitors: Sequence[str]
+    folders: Sequence[str]
     episode_id: NDArray[np.int64]
     has_trajectory: NDArray[np.bool_]
-    videos: Mapping[int, ResultVideo] = field(default_factory=dict)
+    videos: Mapping[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.seed)

@@ -12,7 +12,7 @@ Truth is `true`, `false`, or empty where nothing is known; numbers are as Python
 `timing.csv` holds what is different in every run: wall times, and which files an
 episode is in. Its rows are those of the same episodes, in the same order::
 
-    task,seed,episode,start,seconds,monitor,episode_id,trajectory,video,video_sha256
+    task,seed,episode,start,seconds,folder,monitor,episode_id,trajectory,video
 
 What is read may have been written by anybody: everything is checked, no row can be
 longer than `_LONGEST_LINE`, and rows go into columns, never into objects.
@@ -37,15 +37,15 @@ from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
 from ..formats.regular_files import open_regular
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
-from .result_columns import ResultColumns, ResultVideo
+from .result_columns import ResultColumns
 
 _RESULTS = (
     *("task", "seed", "episode", "return", "length"),
     *("terminated", "truncated", "success", "failure"),
 )
 _TIMING = (
-    *("task", "seed", "episode", "start", "seconds", "monitor", "episode_id"),
-    *("trajectory", "video", "video_sha256"),
+    *("task", "seed", "episode", "start", "seconds", "folder", "monitor"),
+    *("episode_id", "trajectory", "video"),
 )
 
 # A name, a few numbers and one line of an error; csv's own limit for a field is twice
@@ -56,7 +56,7 @@ _MOST_ROWS = 4_000_000
 
 _WHOLE = re.compile(r"[0-9]{1,18}", re.ASCII)
 _NUMBER = re.compile(r"-?([0-9]{1,40}(\.[0-9]{1,40})?(e[+-]?[0-9]{1,4})?|inf)|nan")
-_SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
+_FOLDER = re.compile(r"(?!\.)[^/\0]{1,255}/(?!\.)[^/\0]{1,255}")
 _TRUTH = {"true": 1, "false": 0, "": -1}
 
 
@@ -65,12 +65,15 @@ class EpisodeFiles:
     """The files of an episode.
 
     Attributes:
+        folder: its monitor directory, in that of the evaluation; None where it has no
+            files.
         trajectory: the base name of its trajectory, None where it has none.
-        video: its video, finished or pending; None where it gets none.
+        video: that of its video, finished or pending; None where it gets none.
     """
 
+    folder: str | None = None
     trajectory: str | None = None
-    video: ResultVideo | None = None
+    video: str | None = None
 
 
 def write_results_table(file: TextIO, results: Iterable[EpisodeResult]) -> None:
@@ -140,10 +143,10 @@ class _Columns:
         self.start_time = array("d")
         self.seconds = array("d")
         self.monitor = array("i")
-        self.monitors: dict[str, int] = {}
+        self.monitors: dict[tuple[str, str], int] = {}
         self.episode_id = array("q")
         self.has_trajectory = array("b")
-        self.videos: dict[int, ResultVideo] = {}
+        self.videos: dict[int, str] = {}
 
     def add_result(self, values: Sequence[str]) -> None:
         total_reward, length, terminated, truncated, success, failure = values
@@ -158,14 +161,14 @@ class _Columns:
         self.success.append(_truth(success))
 
     def add_timing(self, values: Sequence[str]) -> None:
-        start, seconds, monitor, episode_id, trajectory, video, sha256 = values
+        start, seconds, folder, monitor, episode_id, trajectory, video = values
         index = len(self.start_time)
         self.start_time.append(_number(start))
         self.seconds.append(_number(seconds))
-        self.monitor.append(self._monitor(monitor))
+        self.monitor.append(self._monitor(folder, monitor))
         self.episode_id.append(_whole(episode_id) if episode_id else -1)
         if not monitor:
-            if episode_id or trajectory or video or sha256:
+            if folder or episode_id or trajectory or video:
                 raise ValueError("an episode without a monitor has files")
             self.has_trajectory.append(False)
             return
@@ -178,7 +181,7 @@ class _Columns:
             _is_of(trajectory, trajectory_prefix(infix, number), (".h5",))
         )
         if _is_of(video, video_prefix(infix, number), (".mp4", ".json", ".avi")):
-            self.videos[index] = ResultVideo(video, _sha256(sha256))
+            self.videos[index] = video
 
     def finished(
         self, task: str, plan: EvaluationPlan, *, with_timing: bool
@@ -199,7 +202,8 @@ class _Columns:
             start_time=np.frombuffer(self.start_time, dtype=np.float64),
             seconds=np.frombuffer(self.seconds, dtype=np.float64),
             monitor=np.frombuffer(self.monitor, dtype=np.int32),
-            monitors=tuple(self.monitors),
+            monitors=tuple(monitor for _, monitor in self.monitors),
+            folders=tuple(folder for folder, _ in self.monitors),
             episode_id=np.frombuffer(self.episode_id, dtype=np.int64),
             has_trajectory=np.frombuffer(self.has_trajectory, dtype=np.bool_),
             videos=self.videos,
@@ -212,12 +216,16 @@ class _Columns:
         self.episode_id = array("q", [-1]) * count
         self.has_trajectory = array("b", [0]) * count
 
-    def _monitor(self, text: str) -> int:
-        if not text:
+    def _monitor(self, folder: str, monitor: str) -> int:
+        if not monitor:
             return -1
-        if text not in self.monitors and Infix.parse(text) is None:
-            raise ValueError(f"{text!r:.80} is not the infix of a monitor")
-        return self.monitors.setdefault(text, len(self.monitors))
+        known = folder, monitor
+        if known not in self.monitors:
+            if Infix.parse(monitor) is None:
+                raise ValueError(f"{monitor!r:.80} is not the infix of a monitor")
+            if not _FOLDER.fullmatch(folder):
+                raise ValueError(f"{folder!r:.80} is not the folder of a monitor")
+        return self.monitors.setdefault(known, len(self.monitors))
 
 
 def _results_row(result: EpisodeResult) -> list[str]:
@@ -233,16 +241,15 @@ def _results_row(result: EpisodeResult) -> list[str]:
 
 
 def _timing_row(result: EpisodeResult, files: EpisodeFiles) -> list[str]:
-    video = files.video
     return [
         *_unit(result),
         _shown(result.start_time),
         _shown(result.seconds),
-        result.monitor or "",
-        "" if result.episode_id is None else str(result.episode_id),
+        files.folder or "",
+        (files.folder and result.monitor) or "",
+        "" if result.episode_id is None or not files.folder else str(result.episode_id),
         files.trajectory or "",
-        "" if video is None else video.name,
-        "" if video is None else video.sha256 or "",
+        files.video or "",
     ]
 
 
@@ -347,12 +354,6 @@ def _printable(text: str) -> str:
     if not text.isprintable() or len(text) > _LONGEST_FAILURE:
         raise ValueError(f"{text!r:.80} is not one line")
     return text
-
-
-def _sha256(text: str) -> str | None:
-    if text and not _SHA256.fullmatch(text):
-        raise ValueError(f"{text!r:.80} is no SHA-256")
-    return text or None
 
 
 def _is_of(name: str, prefix: str, suffixes: Sequence[str]) -> bool:

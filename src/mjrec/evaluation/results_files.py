@@ -8,7 +8,7 @@
     ├── results.json        plan, choice of videos, summaries, versions: written last
     ├── results.csv         one row for each episode
     ├── timing.csv          wall times and files of the same episodes
-    └── <folder>/           a monitor directory for each task
+    └── <task>/<chunk>/     monitor directories, for each task a few
 
 `results.json` and `results.csv` follow from the plan and from what is installed: they
 are the same, byte for byte, whatever the number of workers, and however often the
@@ -53,6 +53,7 @@ PLAN_NAME = "evaluation.json"
 RESULTS_NAME = "results.json"
 _TABLE_NAME = "results.csv"
 _TIMING_NAME = "timing.csv"
+RESULT_NAMES = (RESULTS_NAME, _TABLE_NAME, _TIMING_NAME, PLAN_NAME)
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class ReadResults:
     columns: Mapping[str, ResultColumns]
 
     def folder(self, task: str) -> Path:
-        """Return a task's monitor directory."""
+        """Return the folder with a task's monitor directories."""
         (name,) = (each.folder for each in self.plan.tasks if each.name == task)
         return self.directory / name
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from ..errors import UnreadableFile
 from ..evaluation.results_files import ReadResults, read_results, read_summaries
 from ..evaluation.summaries import AcrossTasks, Bootstrap, TaskSummary
+from ..formats.monitor_directory import monitor_directories_in
 from ..results.episodes import episodes_of
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
@@ -322,9 +323,8 @@ class _Gathering:
 
     def _add_below(self, directory: Path) -> None:
         """Add the monitor directories of an evaluation without results."""
-        for folder in sorted(directory.iterdir()):
-            if folder.is_dir() and not folder.is_symlink() and monitors_of(folder):
-                self._add_monitors(folder)
+        for folder in monitor_directories_in(directory):
+            self._add_monitors(folder)
 
     def _note_disagreement(
         self, source: str, summary: TaskSummary, columns: EpisodeColumns
@@ -404,8 +404,9 @@ class _Gathering:
     def _monitors_of(self, folder: Path, *, reads_episodes: bool) -> _Monitors:
         """Return the monitors of a task."""
         monitors = _Monitors(self._problems, reads_episodes=reads_episodes)
-        for monitor in self._monitors(folder):
-            monitors.add(monitor)
+        for chunk in monitor_directories_in(folder) if folder.is_dir() else ():
+            for monitor in self._monitors(chunk):
+                monitors.add(monitor)
         return monitors
 
     def _monitors(self, directory: Path) -> Iterator[MonitorResults]:
