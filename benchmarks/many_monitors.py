@@ -24,8 +24,8 @@ from mjrec.evaluation.plan import Batch, EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.plan_file import write_plan
 from mjrec.evaluation.recorded_files import RecordedFiles
 from mjrec.evaluation.results_files import write_results
-from mjrec.evaluation.summaries import Bootstrap
-from mjrec.evaluation.summarizing import summarize_results
+from mjrec.evaluation.statistics import Bootstrap
+from mjrec.evaluation.summaries import summarize_results
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.formats.manifest import (
     Manifest,

@@ -24,8 +24,8 @@ from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.progress_counts import LedgerCounts
 from mjrec.evaluation.results_files import write_results
 from mjrec.evaluation.settling import settle_monitor
-from mjrec.evaluation.summaries import Bootstrap
-from mjrec.evaluation.summarizing import summarize_results
+from mjrec.evaluation.statistics import Bootstrap
+from mjrec.evaluation.summaries import summarize_results
 from mjrec.recorder.keep_rules import UNDECIDED
 from mjrec.rendering.recordings import remove_unfinished
 

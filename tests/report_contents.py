@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from mjrec.evaluation.summaries import Bootstrap
-from mjrec.evaluation.summarizing import summarize_across, summarize_task
+from mjrec.evaluation.statistics import Bootstrap
+from mjrec.evaluation.summaries import summarize_across, summarize_task
 from mjrec.reporting.contents import (
     EpisodeColumns,
     ReportContents,

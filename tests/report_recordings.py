@@ -16,8 +16,8 @@ from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.result_columns import ResultVideo
 from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.results_files import ChosenEpisode, write_results
-from mjrec.evaluation.summaries import AcrossTasks, Bootstrap
-from mjrec.evaluation.summarizing import summarize_results
+from mjrec.evaluation.statistics import Bootstrap
+from mjrec.evaluation.summaries import AcrossTasks, summarize_results
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.json_text import dumps
 

@@ -49,12 +49,16 @@ def run(
 
 def test_a_table_says_what_came_of_it(run: Run, tmp_path: Path) -> None:
     """Each task has a row, and the videos and the directory are named."""
-    status, out, err = run(TASK, "--policy", "few_policies:zero", "--keep", "best")
+    status, out, err = run(
+        *(TASK, "--policy", "few_policies:zero"),
+        *("--keep", "best", "--confidence", "0.9"),
+    )
     assert status == 0
     header, row = (
         line for line in out.splitlines() if line.lstrip().startswith(("task ", TASK))
     )
     assert header.split()[0] == "task"
+    assert " 90 % " in header
     assert row.split()[:3] == [TASK, "2", "5"]
     assert "1 video:" in out
     assert str(tmp_path / "e") in out

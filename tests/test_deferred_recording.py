@@ -530,3 +530,19 @@ def test_without_a_simulation_there_are_actions_and_rewards(tmp_path: Path) -> N
     assert recorded.facts["observation_parts"] == [["arm", [2]], ["grip", [1]]]
     assert recorded.facts["irregular_actions_from"] == 1
     assert recorded.facts["rate"] == "20"
+
+
+def test_it_is_known_in_which_dtype_actions_were_given(tmp_path: Path) -> None:
+    """An environment that gets another one gives other rewards."""
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4)
+    kinds = ["float32", "float32", "float64", "float64"] + 4 * ["float64"]
+    with mjrec.Monitor(env, tmp_path, False, trajectory_callable=True) as monitor:
+        for step, kind in enumerate(kinds):
+            if step % 4 == 0:
+                monitor.reset(seed=1)
+            monitor.step(np.full(1, 0.1, kind))
+    said = [
+        mjrec.load_trajectory(path).facts["action_dtypes"]
+        for path in sorted(tmp_path.glob("*.h5"))
+    ]
+    assert said == [[[0, "float32"], [2, "float64"]], [[0, "float64"]]]

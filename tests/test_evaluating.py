@@ -35,7 +35,7 @@ from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.results_files import read_results
-from mjrec.evaluation.splitting import batches_of
+
 from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.locks import try_lock
 from mjrec.formats.video_metadata import metadata_path
@@ -68,9 +68,9 @@ def contents(directory: Path) -> dict[str, bytes]:
 
 
 def begun(directory: Path) -> int:
-    """Return how many episodes were begun in all, by the ledgers."""
-    ledgers = directory.glob("*/mjrec.evaluation.*.jsonl")
-    return sum(path.read_text().count('{"begun"') for path in ledgers)
+    """Return how many episodes were begun in all, by the journals."""
+    journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
+    return sum(path.read_text().count('{"begun"') for path in journals)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_every_episode_of_every_task_and_seed_is_there(reference: Path) -> None:
         for episode in (0, 1)
     ]
     assert all(each.failure is None and each.length <= 5 for each in results)
-    assert len(list(reference.glob("*/*.h5"))) == 8
+    assert len(list(reference.glob("*/*/*.h5"))) == 8
     assert begun(reference) == 8
 
 
@@ -307,7 +307,7 @@ def test_results_are_there_before_an_engine_has_drawn(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "e", **options, on_progress=interrupt)
     before = contents(tmp_path / "e")
-    drawn = list(tmp_path.glob("e/*/*.mp4"))
+    drawn = list(tmp_path.glob("e/*/*/*.mp4"))
     assert 1 <= len(drawn) < 4
     stamps = [path.stat().st_mtime_ns for path in drawn]
     evaluation = run(tmp_path / "e", **options, resume=True)
@@ -514,8 +514,8 @@ def slow_run(place: Path, name: str, *arguments: str) -> subprocess.Popen[bytes]
 
 
 def ended(directory: Path) -> int:
-    ledgers = directory.glob("*/mjrec.evaluation.*.jsonl")
-    return sum(path.read_bytes().count(b'{"ended"') for path in ledgers)
+    journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
+    return sum(path.read_bytes().count(b'"evaluation": {') for path in journals)
 
 
 @pytest.fixture(scope="module")
@@ -562,7 +562,7 @@ def test_a_killed_evaluation_goes_on_where_it_was(
     # Each once; those that the two workers were at, once more.
     assert 24 <= begun(killed) <= 26
     assert ended(killed) == 24
-    assert len(list(killed.glob("*/*.mp4"))) == 2
+    assert len(list(killed.glob("*/*/*.mp4"))) == 2
 
 
 @pytest.mark.thorough

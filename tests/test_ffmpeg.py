@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -81,26 +79,6 @@ def test_a_failure_has_command_status_and_the_end_of_stderr() -> None:
         run_ffmpeg(["-hide_banner", "-i", "missing.mp4", "-f", "null", "-"])
     assert caught.value.command[-1] == "-"
     assert caught.value.returncode not in (0, None)
-
-
-def test_a_fork_does_not_keep_the_pipe_open() -> None:
-    """The encoder sees the end of its input although a forked child lives on."""
-    code = (
-        "import os, signal\n"
-        "from mjrec.formats.ffmpeg import FfmpegProcess\n"
-        "arguments = '-v error -f rawvideo -pixel_format gray -video_size 8x8 "
-        "-i - -f null -'\n"
-        "process = FfmpegProcess(arguments.split(), what='', reads=True)\n"
-        "child = os.fork()\n"
-        "if child == 0:\n"
-        "    signal.pause()\n"
-        "process.write(bytes(64))\n"
-        "process.end_input()\n"
-        "process.wait()\n"
-        "process.release()\n"
-        "os.kill(child, signal.SIGKILL)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 @pytest.fixture

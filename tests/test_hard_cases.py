@@ -208,6 +208,11 @@ def test_large_observations_and_actions_that_change(tmp_path: Path) -> None:
     given[4] = 0
     np.testing.assert_array_equal(trajectory.actions, given)
     assert trajectory.facts["irregular_actions_from"] == 4
+    assert trajectory.facts["action_dtypes"] == [[0, "float32"]]
+    [journal] = tmp_path.glob("*.jsonl")
+    events = [json.loads(line) for line in journal.read_text().splitlines()]
+    [odd] = [event["action"] for event in events if "action" in event]
+    assert odd == {"episode_id": 0, "step": 4, "value": [[float(np.float32(0.1))]]}
 
 
 def test_a_state_that_is_reset_away_is_not_shown(tmp_path: Path) -> None:

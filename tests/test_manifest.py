@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 
 import pytest
@@ -83,26 +82,14 @@ def test_nan_and_infinity_come_back(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["../s", "a/b", "/etc/passwd", "..", ".", "", "a\\b", "a\0b"]
-)
-def test_a_name_outside_the_directory_is_refused(path: Path, name: str) -> None:
-    """As statistics, video or metadata."""
-    for stats, videos in ((name, []), ("s", [[name, "m"]]), ("s", [["v", name]])):
-        path.write_text(json.dumps({"stats": stats, "videos": videos, "env_info": {}}))
-        with pytest.raises(UnreadableFile, match="not the name of a file"):
-            read_manifest(path)
-
-
-@pytest.mark.parametrize(
     ("content", "reason"),
     [
         ('{"stats": "s", "videos": []', "not whole JSON"),
-        ('{"stats": "s", "stats": "t"}', "the key 'stats' is there twice"),
-        ("null", "an object belongs there, not null"),
         ('{"videos": [], "env_info": {}}', "it has no 'stats'"),
         ('{"stats": 1, "videos": [], "env_info": {}}', "a text belongs there"),
         ('{"stats": "s", "videos": [["a"]], "env_info": {}}', "not 1 names"),
-        ('{"stats": "s", "videos": [], "env_info": []}', "an object belongs"),
+        ('{"stats": "..", "videos": [], "env_info": {}}', "not the name of a file"),
+        ('{"stats": "s", "videos": [["a/b", "c"]], "env_info": {}}', "'a/b' is not"),
         ('{"stats": "s", "videos": [], "env_info": {}, "mjrec": 1}', "'mjrec'"),
     ],
 )
@@ -115,26 +102,22 @@ def test_damage_of_a_manifest_is_named(path: Path, content: str, reason: str) ->
 
 
 @pytest.mark.parametrize(
-    ("content", "reason"),
+    ("right", "wrong", "reason"),
     [
-        ("[" * 100_000, "nested too deeply"),
-        ('{"timestamps": "\udcff"}', "UTF-8"),
-        (STATS_TEXT.replace("[3, 4]", '"34"'), "a list belongs there"),
-        (STATS_TEXT.replace("[3, 4]", "[3, true]"), "not true or false"),
-        (STATS_TEXT.replace("[3, 4]", "[3, 4.5]"), "'episode_lengths' is wrong"),
-        (STATS_TEXT.replace("[3, 4]", "[3]"), "1 episode_lengths"),
-        (STATS_TEXT.replace('["t", "e"]', '["t"]'), "1 episode_types for 2"),
-        (STATS_TEXT.replace("1.5", "9" * 400), "larger than a float"),
+        ("[3, 4]", '"34"', "a list belongs there"),
+        ("[3, 4]", "[3, true]", "not true or false"),
+        ("[3, 4]", "[3, 4.5]", "'episode_lengths' is wrong"),
+        ("[3, 4]", "[3]", "1 episode_lengths"),
+        ('["t", "e"]', '["t"]', "1 episode_types for 2"),
+        ("1.5", "9" * 400, "larger than a float"),
     ],
 )
-def test_damage_of_statistics_is_named(path: Path, content: str, reason: str) -> None:
-    """Each kind is one clear error; a pipe in the file's place is not waited for."""
+def test_damage_of_statistics_is_named(
+    path: Path, right: str, wrong: str, reason: str
+) -> None:
+    """Each kind is one clear error."""
     with pytest.raises(UnreadableFile, match=f"{path.name}: No such file"):
         read_stats_file(path)
-    path.write_bytes(os.fsencode(content))
+    path.write_text(STATS_TEXT.replace(right, wrong))
     with pytest.raises(UnreadableFile, match=reason):
-        read_stats_file(path)
-    path.unlink()
-    os.mkfifo(path)
-    with pytest.raises(UnreadableFile, match="not a regular file"):
         read_stats_file(path)

@@ -17,7 +17,8 @@ import pytest
 from report_contents import HOSTILE, columns, contents, task, video
 
 from mjrec.errors import MissingDependency
-from mjrec.evaluation.summaries import AcrossTasks, Interval, Profile, TaskSummary
+from mjrec.evaluation.statistics import Interval
+from mjrec.evaluation.summaries import AcrossTasks, Profile, TaskSummary
 from mjrec.reporting.contents import ReportContents, Verdict
 from mjrec.reporting.curves import evaluation_curve, learning_curve, profile_curve
 from mjrec.reporting.numbers import decimals_for, number, whole_number

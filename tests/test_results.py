@@ -135,8 +135,18 @@ def test_types_belong_to_their_episodes(
     assert load(tmp_path)["episode_types"] == merged
 
 
-def test_every_monitor_keeps_its_place_in_every_list(tmp_path: Path) -> None:
-    """With a manifest or without, with episodes or without; in gym's order."""
+def test_every_monitor_keeps_its_place_in_every_list(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With a manifest or without, with episodes or without; in gym's order.
+
+    Where there is none, or no directory, the result is None, as in gym.
+    """
+    assert mjrec.load_results(tmp_path / "missing") is None
+    assert mjrec.load_results(str(tmp_path)) is None
+    assert [record.levelname for record in caplog.records] == ["ERROR", "ERROR"]
+    assert f"There is no directory {tmp_path / 'missing'}" in caplog.text
+    assert f"There are no manifests in {tmp_path}" in caplog.text
     write_saved(tmp_path, "0.7", start=None)
     write_saved(tmp_path, "1.7", start=0.1)
     third = write_journal(tmp_path, "2.7", 1)
@@ -148,17 +158,6 @@ def test_every_monitor_keeps_its_place_in_every_list(tmp_path: Path) -> None:
     assert results["initial_reset_timestamps"] == [None, 0.1, 100.5, 0.5]
     assert results["data_sources"] == [3, 2]
     assert results["initial_reset_timestamp"] == 0.5
-
-
-def test_no_directory_is_none_and_an_error_in_the_log(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """As in gym; the same for a directory without manifests."""
-    assert mjrec.load_results(tmp_path / "missing") is None
-    assert mjrec.load_results(str(tmp_path)) is None
-    assert [record.levelname for record in caplog.records] == ["ERROR", "ERROR"]
-    assert f"There is no directory {tmp_path / 'missing'}" in caplog.text
-    assert f"There are no manifests in {tmp_path}" in caplog.text
 
 
 def test_unequal_env_infos_are_merged_with_one_warning(

@@ -21,13 +21,8 @@ from mjrec.evaluation.results_files import (
     read_results,
     write_results,
 )
-from mjrec.evaluation.summaries import (
-    AcrossTasks,
-    Bootstrap,
-    Interval,
-    Profile,
-    TaskSummary,
-)
+from mjrec.evaluation.statistics import Bootstrap, Interval
+from mjrec.evaluation.summaries import AcrossTasks, Profile, TaskSummary
 
 SHA = "ab" * 32
 VIDEO = "openaigym.video.0.w.video000000.mp4"

@@ -11,11 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from full_disk import file_size_limit
 from processes import forked, kill_self
 
 import mjrec.formats.row_log as row_log
-from mjrec.errors import FileNotWritten
 from mjrec.formats.row_log import TAIL_HEAD, RowLog, RowLogReader, tail_path
 
 WORDS = 4
@@ -153,24 +151,6 @@ def test_a_killed_process_loses_no_counted_row(
     check(path, counted + is_written)
 
 
-def test_a_full_disk_costs_no_row_where_nothing_is_mapped(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As on network file systems. What finds no room is in memory, one row at most."""
-    monkeypatch.setattr(row_log, "_may_be_mapped", lambda _: False)
-    log = RowLog(path, WORDS, tail_bytes=SMALL)
-    add(log, 5)
-    with file_size_limit(5 * SIZE + 3):
-        for _ in range(3):
-            with pytest.raises(FileNotWritten, match=rf"{path.name}: File too large"):
-                add(log)
-        assert log.count == 6
-        check(path, 5)
-    add(log, 20)
-    log.close()
-    check(path, 26)
-
-
 class Interrupt(BaseException):
     """As Ctrl-C raises it."""
 
@@ -198,22 +178,20 @@ def test_an_interrupted_write_is_taken_up_again(
     check(path, 3 * CAPACITY)
 
 
-@pytest.mark.parametrize(
-    "head",
-    [
-        b"",
-        struct.pack("=QQ", 9, WORDS),
-        struct.pack("=QQQ", 9, WORDS + 1, CAPACITY),
-        struct.pack("=QQQ", 9, WORDS, CAPACITY + 1),
-        struct.pack("=QQQ", 9, WORDS, 1 << 63),
-        struct.pack("=QQQ", 9, WORDS, 0),
-        bytes(24),
-    ],
-)
-def test_a_tail_of_something_else_is_passed_over(path: Path, head: bytes) -> None:
+HEADS = {
+    "short": struct.pack("=QQ", 9, WORDS),
+    "other rows": struct.pack("=QQQ", 9, WORDS + 1, CAPACITY),
+    "beyond its end": struct.pack("=QQQ", 9, WORDS, CAPACITY + 1),
+    "no rows": struct.pack("=QQQ", 9, WORDS, 0),
+}
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_tail_of_something_else_is_passed_over(path: Path, head: str) -> None:
     """What it says would lead beyond it, or to rows of another size."""
     log = RowLog(path, WORDS)
     add(log, 5)
     log.close()
-    tail_path(path).write_bytes(head.ljust(len(head) and TAIL_HEAD + SMALL, b"\0"))
+    size = 16 if head == "short" else TAIL_HEAD + SMALL
+    tail_path(path).write_bytes(HEADS[head].ljust(size, b"\0"))
     check(path, 5)

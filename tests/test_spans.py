@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import signal
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,14 +19,9 @@ from trajectories_by_hand import add_row, new_logs
 from trajectory_contents import TrajectoryContent, content_of
 
 from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
-from mjrec.formats import span_writer, spans
+from mjrec.formats import row_log, span_writer, spans
 from mjrec.formats.locks import Lock
-from mjrec.formats.monitor_directory import (
-    Infix,
-    clip_part_name,
-    lock_name,
-    trajectory_prefix,
-)
+from mjrec.formats.monitor_directory import lock_name, trajectory_prefix
 from mjrec.formats.row_log import tail_path
 from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.spans import (
@@ -107,7 +100,6 @@ def test_model_changes_come_back(logs: SpanLogs, path: Path) -> None:
     """Names, kinds and values; of a row that was never counted there is none."""
     fields = {
         "geom_rgba": np.arange(8, dtype=np.float32).reshape(2, 4),
-        "opt.gravity": np.array([0, 0, -9.81]),
         "stat.extent": np.float64(2.5),
         "mat_texid": np.array([[1, 2]], ">i4"),
         "eq_active": np.array([True]),
@@ -125,9 +117,8 @@ def test_model_changes_come_back(logs: SpanLogs, path: Path) -> None:
     first, second = read(path).model_changes
     assert (first.step, second.step, list(second.fields)) == (0, 1, ["a"])
     for name, values in fields.items():
-        np.testing.assert_array_equal(first.fields[name], values)
-        assert first.fields[name].shape == values.shape
-        assert first.fields[name].dtype == values.dtype.newbyteorder("<")
+        little = np.asarray(values).astype(values.dtype.newbyteorder("<"))
+        np.testing.assert_array_equal(first.fields[name], little, strict=True)
     [last] = read(episode(path.parent, 28)).model_changes
     assert list(last.fields) == ["b"]
 
@@ -146,20 +137,6 @@ def test_what_no_file_can_hold_is_refused(
     check(read(path), 4)
     with pytest.raises(ValueError, match=r"no dtype|cannot name"):
         row_dtype(snapshot=packed([(name, (values.dtype, (1,)))]))
-
-
-# --- what is written while it is read ------------------------------------------------
-
-
-def test_a_living_recording_can_be_read(logs: SpanLogs, path: Path) -> None:
-    """A reader has what there was when it was opened, and keeps it."""
-    span = write(logs, 2)
-    with open_recording(path) as reader:
-        write(logs, 30, first=3, span=span)
-        check(content_of(reader), 2)
-        logs.close()
-        check(content_of(reader), 2)
-    check(read(path), 30)
 
 
 def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path: Path) -> None:
@@ -299,19 +276,20 @@ def test_a_stale_tail_ends_a_recording(logs: SpanLogs, path: Path, stale: str) -
 def test_a_log_that_changes_while_it_is_read_is_an_error(
     logs: SpanLogs, path: Path
 ) -> None:
-    """Never rows of something else."""
-    write(logs, 30)
-    with open_recording(path) as living:
+    """Never rows of something else; what is added behind them is nothing to it."""
+    span = write(logs, 2)
+    with open_recording(path) as reader:
+        write(logs, 30, first=3, span=span)
         logs.close()
-        _, log, *_ = files_of(path.parent)
-        with open_recording(path) as reader:
-            os.truncate(log, 5 * ROW)
-            for one in (reader, living):
-                with pytest.raises(UnreadableFile, match=r"\.log: its "):
-                    one.states(0, 31)
-            log.write_bytes(bytes(100 * ROW))
-            with pytest.raises(UnreadableFile, match="changed while it was read"):
-                reader.snapshots(0, 4)
+        check(content_of(reader), 2)
+    _, log, *_ = files_of(path.parent)
+    with open_recording(path) as reader:
+        os.truncate(log, 5 * ROW)
+        with pytest.raises(UnreadableFile, match=r"\.log: its "):
+            reader.states(0, 31)
+        log.write_bytes(bytes(100 * ROW))
+        with pytest.raises(UnreadableFile, match="changed while it was read"):
+            reader.snapshots(0, 4)
 
 
 # --- a full disk ---------------------------------------------------------------------
@@ -361,21 +339,28 @@ def test_what_a_full_disk_did_not_let_be_said_is_said_later(
     check(read(episode(path.parent, 28)), 5)
 
 
+@pytest.mark.parametrize("is_mapped", [True, False])
 def test_a_full_disk_costs_no_step_that_was_recorded(
-    logs: SpanLogs, path: Path
+    logs: SpanLogs, path: Path, monkeypatch: pytest.MonkeyPatch, is_mapped: bool
 ) -> None:
-    """The step that finds no room is refused; with room again all goes on."""
+    """The step that finds no room is refused, or kept in memory where none is mapped.
+
+    With room again all goes on.
+    """
+    monkeypatch.setattr(row_log, "_may_be_mapped", lambda _: is_mapped)
     span = write(logs, 3)
     with file_size_limit(6000):
         with pytest.raises(FileNotWritten, match=r"\.log: File too large"):
             write(logs, 1000, first=4, span=span)
         recorded = span.steps
         assert 3 < recorded < 100
-        check(read(path), recorded)
+        check(read(path), recorded - (not is_mapped))
         with pytest.raises(FileNotWritten, match=r"\.log: File too large"):
             logs.close()
     write(logs, recorded + 8, first=recorded + 1, span=span)
     logs.close()
+    _, _, tail, _ = files_of(path.parent)
+    assert not tail.exists()
     check(read(path), recorded + 8)
 
 
@@ -485,109 +470,3 @@ def test_a_list_by_the_name_of_one_that_was_removed_is_another(
         logs.release()
         for file in files_of(tmp_path):
             file.unlink(missing_ok=True)
-
-
-# --- files of another making ---------------------------------------------------------
-
-
-def put(path: Path, rows: Any = DTYPE.descr, version: int = 1, **more: Any) -> None:
-    """Put a list of somebody else's there."""
-    head = {"format": "mjrec spans", "version": version, "rows": rows, "facts": {}}
-    begin = {"begin": path.stem, "row": 0, "look": 0, "facts": {}, **more}
-    found = path.with_name("openaigym.states.0.1.000000.spans")
-    found.write_text(f"{json.dumps(head)}\n{json.dumps(begin)}\n")
-    found.with_suffix(".log").touch()
-
-
-HEAD = DTYPE.descr[:4]
-
-
-@pytest.mark.parametrize(
-    ("rows", "reason"),
-    [
-        ([], "do not lie"),
-        (5, "cannot be read"),
-        ([*HEAD, ["state", "<f8"]], "the state of a row"),
-        ([*HEAD, ["state", [["a", "<f4"], ["", "|V4"]]]], "not all float64"),
-        ([*HEAD, ["snapshot", [["a/b", "<f8"]]]], "cannot name an array"),
-        ([*HEAD, ["action", "|O"]], "no dtype of a trajectory"),
-        ([*HEAD, ["action", "<f8", [1 << 62]]], "cannot be read"),
-        ([*HEAD, ["action", "|u1"]], "do not lie"),
-        ([*HEAD, ["other", "<f8"]], "do not lie"),
-    ],
-)
-def test_a_hostile_row_is_refused(path: Path, rows: Any, reason: str) -> None:
-    """Each is one clear error, as often as it is read."""
-    put(path, rows)
-    for _ in range(2):
-        with pytest.raises(UnreadableFile, match=reason) as error:
-            read(path)
-        assert error.value.path.suffix == ".spans"
-    assert recordings_in_flight(path.parent) == []
-
-
-def test_a_newer_format_is_refused_with_the_way_out(path: Path) -> None:
-    """Nothing of it is guessed at, and it is not removed."""
-    put(path, version=12)
-    with pytest.raises(UnreadableFile, match=r"newer mjrec, in .* 12.* 1: update mjr"):
-        read(path)
-    found, *_ = files_of(path.parent)
-    remove_if_done(found)
-    assert found.exists()
-    # One that was cut within its first line is of nothing.
-    for size in (100, 0):
-        os.truncate(found, size)
-        assert recordings_in_flight(path.parent) == []
-        with pytest.raises(UnreadableFile, match="no such file, and no log of it"):
-            read(path)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *(
-            "../x",
-            "..",
-            "",
-            "a\0b",
-            "\ud800",
-            f"../{NAME}",
-            f"{NAME}.h5",
-            f"{NAME}" * 9,
-        ),
-        trajectory_prefix(Infix(0, "2"), 27),
-        clip_part_name(Infix(1, "1"), 0, 0),
-    ],
-)
-def test_only_names_of_the_monitor_are_believed(path: Path, name: str) -> None:
-    """No path leads out of the directory, or to another monitor's files."""
-    put(path, begin=name)
-    assert recordings_in_flight(path.parent) == []
-    assert not is_in_flight(path)
-
-
-RECORD = "{{'descr': [('a', {})], 'fortran_order': False, 'shape': {}}}"
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        "",
-        RECORD.format("'<f8'", "(2,)"),
-        RECORD.format("'|O'", "()"),
-        "[" * 60_000,
-        "__import__('os')",
-    ],
-)
-def test_a_hostile_model_change_is_refused(
-    logs: SpanLogs, path: Path, header: str
-) -> None:
-    """Its header is believed only where it fits what is there."""
-    write(logs, 0)
-    *_, looks = files_of(path.parent)
-    start = b"\x93NUMPY\1\0" + struct.pack("<H", len(header))
-    payload = start + header.encode() + bytes(8)
-    looks.write_bytes(struct.pack("<QqQ", 0, 0, len(payload)) + payload)
-    with pytest.raises(UnreadableFile, match="change of the model") as error:
-        read(path)
-    assert error.value.path == looks

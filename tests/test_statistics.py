@@ -1,209 +1,346 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from scipy.stats import mannwhitneyu, trim_mean
+from scipy import stats
 
+from mjrec import InvalidArgument
+from mjrec.evaluation import statistics
 from mjrec.evaluation.statistics import (
+    LARGE_SAMPLE,
+    PERCENTILE_BOOTSTRAP,
+    Bootstrap,
+    Figure,
     FloatArray,
+    Interval,
+    average,
+    improvement,
     interquartile_mean,
-    interquartile_mean_across,
-    mean_probability_of_improvement,
-    normal_quantile,
+    mean,
     optimality_gap,
     performance_profile,
-    placements,
-    probability_of_improvement,
-    standard_deviation,
-    task_means,
     wilson_interval,
 )
-from score_samples import TENTHS, X, Y, samples
 
-RETURNS = npst.arrays(
-    np.float64,
-    st.integers(1, 12),
-    # Few different ones, so that many are equal.
-    elements=st.integers(-4, 4).map(float),
-)
+TENTHS = np.linspace(0, 1, 11)
+USUAL = Bootstrap()
+QUICK = Bootstrap(resamples=500)
+
+# Ten runs of six tasks; the figures below are what rliable 1.2.0 says of them.
+X = [
+    np.array([0.43, 0.65, 0.13, 0.56, 0.11, 0.05, 0.35, 0.49, 0.39, 0.22]),
+    np.array([0.29, 0.55, 0.41, 0.67, 0.79, 0.42, 0.32, 0.22, 0.51, 0.42]),
+    np.array([0.24, 0.16, 0.32, 0.55, 0.5, 0.77, 0.46, 0.46, 0.34, 0.39]),
+    np.array([0.41, 0.36, 0.19, 0.23, 0.49, 0.66, 0.22, 0.33, 0.18, 0.21]),
+    np.array([0.42, 0.67, 0.7, 0.36, 0.3, 0.27, 0.19, 0.59, 0.86, 0.15]),
+    np.array([0.15, 0.2, 0.07, 0.44, 0.52, 0.44, 0.5, 0.57, 0.39, 0.09]),
+]
+Y = [
+    np.array([0.36, 0.61, 0.54, 0.35, 0.61, 0.78, 0.53, 0.63, 0.62, 0.33]),
+    np.array([0.44, 0.29, 0.56, 0.42, 0.15, 0.84, 0.28, 0.58, 0.42, 0.35]),
+    np.array([0.24, 0.37, 0.7, 0.69, 0.42, 0.17, 0.75, 0.14, 0.41, 0.67]),
+    np.array([0.19, 0.52, 0.33, 0.76, 0.42, 0.38, 0.42, 0.79, 0.5, 0.54]),
+    np.array([0.5, 0.31, 0.46, 0.72, 0.51, 0.5, 0.21, 0.51, 0.31, 0.23]),
+    np.array([0.74, 0.59, 0.47, 0.19, 0.72, 0.71, 0.14, 0.67, 0.66, 0.49]),
+]
+
+# Few different ones, so that many are equal.
+SAMPLE = npst.arrays(np.float64, st.integers(1, 12), elements=st.integers(-4, 4))
 
 
 def array(*values: float) -> FloatArray:
     return np.array(values, dtype=np.float64)
 
 
+def normal(count: int, center: float = 500.0, *, seed: int = 0) -> FloatArray:
+    return np.random.default_rng(seed).normal(center, 100, count)
+
+
+def ends(interval: Interval | None) -> list[float]:
+    assert interval is not None
+    return [interval.low, interval.high]
+
+
+@pytest.fixture
+def large_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the large-sample intervals of whatever is asked."""
+    monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
+
+
 @pytest.mark.parametrize(
-    ("values", "mean"),
+    ("values", "expected"),
     [
-        ([5], 5),
-        ([1, 9], 5),
-        ([1, 2, 9], 4),  # one is more than a quarter: none is left out
+        ([1, 2, 9], 4),  # one is more than a quarter: none is cut off
         ([100, 2, 4, -50], 3),
         ([1, 2, 3, 4, 100], 3),
-        ([8, 1, 7, 2, 6, 3, 5, 4], 4.5),
         ([0, 0, 0, 0, 1, 1, 1, 1], 0.5),
     ],
 )
-def test_interquartile_mean_by_hand(values: list[float], mean: float) -> None:
-    """A quarter, rounded down, is left out at each end."""
-    assert interquartile_mean(array(*values)) == mean
-
-
-@given(RETURNS)
-def test_interquartile_mean_is_the_trimmed_mean(values: FloatArray) -> None:
-    """What scipy says."""
-    assert interquartile_mean(values) == pytest.approx(trim_mean(values, 0.25))
-
-
-def test_standard_deviation_is_that_of_a_sample() -> None:
-    """Squares 9, 1, 1, 1, 0, 0, 4, 16 around 5 over 7."""
-    values = array(2, 4, 4, 4, 5, 5, 7, 9)
-    assert standard_deviation(values) == pytest.approx((32 / 7) ** 0.5)
-
-
-@pytest.mark.parametrize("function", [interquartile_mean, standard_deviation])
-def test_nothing_has_no_figures(function: object) -> None:
-    """It is an error, and no NaN."""
-    with pytest.raises(ValueError, match=r"."):
-        function(array())  # type: ignore[operator]
-
-
-@pytest.mark.parametrize(
-    ("successes", "n", "low", "high"),
-    [
-        # Newcombe (1998), table I, method 3.
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-        (0, 20, 0.0000, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-        # Solved by hand: z^2 / (n + z^2), and its mirror image.
-        (0, 10, 0.0000, 0.2775),
-        (10, 10, 0.7225, 1.0000),
-    ],
-)
-def test_wilson_interval_as_published(
-    successes: int, n: int, low: float, high: float
-) -> None:
-    """To the digits that were printed."""
-    interval = wilson_interval(successes, n)
-    assert (round(interval.low, 4), round(interval.high, 4)) == (low, high)
-
-
-@given(st.integers(1, 500), st.data(), st.floats(0.5, 0.999))
-def test_wilson_ends_solve_the_score_equation(
-    n: int, data: st.DataObject, confidence: float
-) -> None:
-    """|k/n - p| = z sqrt(p (1 - p) / n), and k/n is inside."""
-    successes = data.draw(st.integers(0, n))
-    interval = wilson_interval(successes, n, confidence)
-    rate, z = successes / n, normal_quantile(confidence)
-    assert 0 <= interval.low <= rate <= interval.high <= 1
-    for end in (interval.low, interval.high):
-        assert (rate - end) ** 2 == pytest.approx(z**2 * end * (1 - end) / n, abs=1e-9)
-
-
-def test_wilson_interval_without_failures_ends_at_one() -> None:
-    """Exactly: a page that says 0.9999999 would be wrong."""
-    assert wilson_interval(7, 7).high == 1
-    assert wilson_interval(0, 7).low == 0
-
-
-@pytest.mark.parametrize(("successes", "n"), [(0, 0), (3, 2), (-1, 2)])
-def test_impossible_shares_are_refused(successes: int, n: int) -> None:
-    """More successes than trials are a mistake of the caller."""
-    with pytest.raises(ValueError, match="cannot be"):
-        wilson_interval(successes, n)
-
-
-def test_normal_quantile_is_in_every_table() -> None:
-    """1.96 for 95 %."""
-    assert normal_quantile(0.95) == pytest.approx(1.959963984540054)
-    assert normal_quantile(0.99) == pytest.approx(2.5758293035489004)
+def test_interquartile_mean_by_hand(values: list[float], expected: float) -> None:
+    """A quarter, rounded down, is cut off at each end."""
+    assert interquartile_mean([array(*values)]).value == expected
 
 
 def test_figures_across_tasks_are_rliables() -> None:
     """To the last digit but rounding."""
-    x, y = samples(X), samples(Y)
-    assert interquartile_mean_across(x) == pytest.approx(0.37966666666666665)
-    assert optimality_gap(x) == pytest.approx(0.6111666666666666)
-    assert task_means(x).mean() == pytest.approx(0.38883333333333336)
-    assert np.median(task_means(x)) == pytest.approx(0.3785)
-    assert mean_probability_of_improvement(x, y) == pytest.approx(0.3625)
+    assert interquartile_mean(X).value == pytest.approx(0.37966666666666665)
+    assert optimality_gap(X).value == pytest.approx(0.6111666666666666)
+    better = average(improvement(x, y) for x, y in zip(X, Y, strict=True))
+    assert better.value == pytest.approx(0.3625)
     profile = [1, 57 / 60, 48 / 60, 39 / 60, 29 / 60, 15 / 60, 8 / 60, 3 / 60, 1 / 60]
-    assert performance_profile(x, TENTHS) == pytest.approx([*profile, 0, 0])
+    assert performance_profile(X, TENTHS).values == pytest.approx([*profile, 0, 0])
 
 
-def test_rliables_own_test_values() -> None:
-    """Those of its metrics_test.py."""
-    x = {"a": array(1, 2, 1, 2), "b": array(2, 2, 1, 1)}
-    y = {"a": array(1, 2, 3), "b": array(1, 2, 3)}
-    assert [interquartile_mean_across(each) for each in (x, y)] == [1.5, 2]
-    assert [np.median(task_means(each)) for each in (x, y)] == [1.5, 2]
-    assert mean_probability_of_improvement(x, y) == pytest.approx(1 / 3)
+def test_intervals_across_tasks_are_rliables() -> None:
+    """Those of its stratified bootstrap of 20000 (profile: 5000), to their noise."""
+    found = ends(interquartile_mean(X).interval(USUAL))
+    assert found == pytest.approx([0.3243, 0.4340], abs=0.004)
+    found = ends(optimality_gap(X).interval(USUAL))
+    assert found == pytest.approx([0.5653, 0.6570], abs=0.004)
+    better = average(improvement(x, y) for x, y in zip(X, Y, strict=True))
+    assert ends(better.interval(USUAL)) == pytest.approx([0.2658, 0.4629], abs=0.004)
+    band = performance_profile(X, TENTHS).ends(USUAL)
+    assert band is not None
+    low = [1.0, 0.9, 0.7, 0.533, 0.367, 0.15, 0.05, 0, 0, 0, 0]
+    high = [1.0, 1.0, 0.883, 0.767, 0.6, 0.35, 0.217, 0.1, 0.05, 0, 0]
+    assert band[0] == pytest.approx(low, abs=0.018)
+    assert band[1] == pytest.approx(high, abs=0.018)
 
 
 def test_tasks_count_alike_however_many_episodes_they_have() -> None:
     """Gap and profile are means over tasks; the interquartile mean is of episodes."""
-    scores = {"few": array(1.0, 1.0), "many": np.zeros(98)}
-    assert optimality_gap(scores) == 0.5
-    assert performance_profile(scores, array(0.5)) == [0.5]
-    assert interquartile_mean_across(scores) == 0
+    scores = [array(1.0, 1.0), np.zeros(98)]
+    assert optimality_gap(scores).value == 0.5
+    assert performance_profile(scores, array(0.5)).values == [0.5]
+    assert interquartile_mean(scores).value == 0
 
 
-def test_more_than_one_makes_up_for_nothing() -> None:
-    """A score of 3 is no shorter of 1 than a score of 1."""
-    assert optimality_gap({"a": array(0, 1, 3)}) == pytest.approx(1 / 3)
-    assert optimality_gap({"a": array(0, 1, 3)}, gamma=2) == pytest.approx(1)
+def test_scores_at_a_threshold_and_above_one() -> None:
+    """Equal is not above; more than 1 makes up for nothing."""
+    profile = performance_profile([array(0.0, 0.5, 1.0, 1.0)], array(0, 0.5, 1))
+    assert profile.values.tolist() == [0.75, 0.5, 0]
+    assert optimality_gap([array(0, 1, 3)]).value == pytest.approx(1 / 3)
 
 
-def test_equal_to_the_threshold_is_not_above_it() -> None:
-    """A strict inequality, as in the paper."""
-    scores = {"a": array(0.0, 0.5, 1.0, 1.0)}
-    assert performance_profile(scores, array(0, 0.5, 1)).tolist() == [0.75, 0.5, 0]
-
-
-def test_placements_by_hand() -> None:
-    """Of 1, 2, 2, 4: none is below 1, which equals one; and so on."""
-    assert placements(array(1, 2, 5), array(1, 2, 2, 4)).tolist() == [0.125, 0.5, 1]
+@given(st.lists(SAMPLE, min_size=2, max_size=4), st.randoms(use_true_random=False))
+def test_figures_of_a_resample_are_scipys_of_what_was_drawn(
+    samples: list[FloatArray], random: object
+) -> None:
+    """Each formula, which is of counts, on the values themselves."""
+    rng = np.random.default_rng(random.getrandbits(32))  # type: ignore[attr-defined]
+    # The counts are those of sorted values.
+    samples = [np.sort(sample) for sample in samples]
+    drawn = [rng.integers(len(s), size=len(s)) for s in samples]
+    counts = [
+        np.bincount(d, minlength=len(s))[None]
+        for d, s in zip(drawn, samples, strict=True)
+    ]
+    values = [s[d] for d, s in zip(drawn, samples, strict=True)]
+    x, y = values[:2]
+    with np.errstate(all="ignore"):
+        # Only the statistic is asked for: its p-value of equal values is 0/0.
+        u = stats.mannwhitneyu(x, y, method="asymptotic").statistic
+    pooled = np.concatenate(values)
+    for figure, expected in (
+        (mean(samples[0]), x.mean()),
+        (mean(samples[0]) - mean(samples[1]), x.mean() - y.mean()),
+        (improvement(samples[0], samples[1]), u / (len(x) * len(y))),
+        (interquartile_mean(samples), stats.trim_mean(pooled, 0.25)),
+        (average(map(mean, samples)), np.mean([v.mean() for v in values])),
+        (
+            performance_profile(samples, array(0.0, 1.0)),
+            np.mean([[(v > 0).mean(), (v > 1).mean()] for v in values], axis=0),
+        ),
+    ):
+        of = [counts[k] for k in range(len(figure.sizes))]
+        assert figure.of(of)[0] == pytest.approx(expected)
 
 
 def test_probability_of_improvement_by_hand() -> None:
     """Ages of five men and four women with diabetes, of scipy's manual: U is 17."""
     men, women = array(19, 22, 16, 29, 24), array(20, 11, 17, 12)
-    assert probability_of_improvement(men, women) == 17 / 20
+    assert improvement(men, women).value == 17 / 20
+    assert improvement(men, men).value == 0.5
 
 
-@given(RETURNS, RETURNS)
-def test_probability_of_improvement_is_mann_whitneys(
-    x: FloatArray, y: FloatArray
+@pytest.mark.parametrize(
+    ("successes", "n", "low", "high"),
+    # Newcombe (1998), table I, method 3.
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (1, 29, 0.0061, 0.1718)],
+)
+def test_wilson_interval_as_published(
+    successes: int, n: int, low: float, high: float
 ) -> None:
-    """U over the number of pairs, as scipy counts it."""
-    # Only the statistic is asked for: its p-value of equal values is 0/0.
-    with np.errstate(all="ignore"):
-        u = mannwhitneyu(x, y, method="asymptotic").statistic
-    assert probability_of_improvement(x, y) == pytest.approx(u / (len(x) * len(y)))
+    """To the digits that were printed."""
+    found = ends(wilson_interval(successes, n, 0.95))
+    assert [round(end, 4) for end in found] == [low, high]
 
 
-@given(RETURNS, RETURNS, st.integers(-5, 5))
-def test_probability_of_improvement_is_symmetric(
-    x: FloatArray, y: FloatArray, shift: int
+@given(st.integers(1, 500), st.data(), st.floats(0.5, 0.999))
+def test_wilson_interval_is_scipys(
+    n: int, data: st.DataObject, confidence: float
 ) -> None:
-    """One is better or the other, and where zero lies does not matter."""
-    chance = probability_of_improvement(x, y)
-    assert chance + probability_of_improvement(y, x) == pytest.approx(1)
-    assert probability_of_improvement(x + shift, y + shift) == chance
-    assert probability_of_improvement(x, x) == pytest.approx(0.5)
+    """And it ends at exactly 0 or 1 where all were alike."""
+    k = data.draw(st.integers(0, n))
+    found = ends(wilson_interval(k, n, confidence))
+    expected = stats.binomtest(k, n).proportion_ci(confidence, method="wilson")
+    assert found == pytest.approx([expected.low, expected.high], abs=1e-12)
+    assert found[0] == 0 or k > 0
+    assert found[1] == 1 or k < n
 
 
-@given(RETURNS)
-def test_order_of_episodes_does_not_matter(values: FloatArray) -> None:
-    """Not even for the last digit."""
-    shuffled = values[::-1]
-    assert interquartile_mean(values) == interquartile_mean(shuffled)
-    assert performance_profile({"a": values}, TENTHS).tolist() == (
-        performance_profile({"a": shuffled}, TENTHS).tolist()
+def test_bootstrap_of_two_values_by_hand() -> None:
+    """The mean of two draws from 0 and 1 is 0, 1/2, 1 with chances 1/4, 1/2, 1/4."""
+    figure = mean(array(0, 1))
+    assert figure.interval(USUAL) == Interval(0, 1)
+    assert figure.interval(Bootstrap(confidence=0.4)) == Interval(0.5, 0.5)
+
+
+FIGURES: dict[str, tuple[Callable[..., Figure], Callable[..., FloatArray]]] = {
+    "mean": (lambda x, _: mean(x), lambda x, _: x.mean(axis=-1)),
+    "difference": (
+        lambda x, y: mean(x) - mean(y),
+        lambda x, y: x.mean(axis=-1) - y.mean(axis=-1),
+    ),
+    "iqm": (
+        lambda x, y: interquartile_mean([x, y]),
+        lambda x, y: stats.trim_mean(np.concatenate([x, y], axis=-1), 0.25, axis=-1),
+    ),
+    "gap": (
+        lambda x, y: optimality_gap([x / 600, y / 600]),
+        lambda x, y: (
+            1 - (np.minimum(x / 600, 1).mean(-1) + np.minimum(y / 600, 1).mean(-1)) / 2
+        ),
+    ),
+    "improvement": (
+        improvement,
+        lambda x, y: (x[..., :, None] > y[..., None, :]).mean(axis=(-1, -2)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_intervals_are_scipys(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By resampling to a few percent of their width; for large samples, to a tenth."""
+    of_ours, of_scipys = FIGURES[name]
+    x, y = normal(60), normal(90, 550, seed=1)
+    figure = of_ours(x, y)
+    low, high = ends(figure.interval(USUAL))
+    expected = stats.bootstrap(
+        (x, y),
+        lambda x, y, axis: of_scipys(x, y),
+        vectorized=True,
+        n_resamples=10_000,
+        batch=500,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    assert [low, high] == pytest.approx(list(expected), abs=0.04 * (high - low))
+    assert figure.interval_method == PERCENTILE_BOOTSTRAP
+    monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
+    assert figure.interval_method == LARGE_SAMPLE
+    assert ends(figure.interval(USUAL)) == pytest.approx(
+        [low, high], abs=0.1 * (high - low)
     )
+
+
+def test_large_sample_band_of_a_profile(monkeypatch: pytest.MonkeyPatch) -> None:
+    """That of the bootstrap, to a tenth of its width."""
+    profile = performance_profile([normal(200) / 1000, normal(300) / 1000], array(0.5))
+    resampled = np.array(profile.ends(USUAL))
+    monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
+    found = np.array(profile.ends(USUAL))
+    assert found == pytest.approx(resampled, abs=0.1 * float(np.ptp(resampled)))
+
+
+def test_same_seed_same_interval() -> None:
+    """With any version of NumPy, whatever the order; and another seed another."""
+    values = np.arange(10.0)
+    first = interquartile_mean([values]).interval(QUICK)
+    assert mean(values).interval(QUICK) == Interval(2.8, 6.4)
+    assert interquartile_mean([values[::-1]]).interval(QUICK) == first
+    other = Bootstrap(resamples=500, seed=1)
+    assert interquartile_mean([values]).interval(other) != first
+
+
+def test_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However little memory is used."""
+    (whole,) = statistics._resamples([20], QUICK)
+    monkeypatch.setattr(statistics, "_BLOCK", 600)
+    blocks = [counts for (counts,) in statistics._resamples([20], QUICK)]
+    assert len(blocks) > 9
+    assert np.array_equal(np.concatenate(blocks), whole[0])
+
+
+def test_draws_are_even() -> None:
+    """Each of seven episodes is drawn a seventh of the time; a row has seven."""
+    ((counts,),) = statistics._resamples([7], USUAL)
+    assert counts.sum(axis=0) == pytest.approx(np.full(7, 10_000), rel=0.04)
+    assert (counts.sum(axis=1) == 7).all()
+
+
+def test_a_single_value_has_no_interval() -> None:
+    """One of no width would say that all is known."""
+    for figure in (mean(array(1)), improvement(array(1, 2), array(3))):
+        assert (figure.interval(QUICK), figure.interval_method) == (None, None)
+
+
+def covered(figure: Callable[[int], Figure], true: float, *, times: int) -> float:
+    """Return how often an interval of 95 % holds the true value."""
+    inside = 0
+    for k in range(times):
+        low, high = ends(figure(k).interval(Bootstrap(resamples=1000, seed=k)))
+        inside += low <= true <= high
+    return inside / times
+
+
+SIMULATED: dict[str, tuple[Callable[[int], Figure], float]] = {
+    "mean": (lambda k: mean(normal(30, seed=k)), 500),
+    "iqm": (lambda k: interquartile_mean([normal(50, seed=k)]), 500),
+    "difference": (
+        lambda k: mean(normal(30, seed=k)) - mean(normal(40, 450, seed=9000 + k)),
+        50,
+    ),
+    "improvement": (
+        lambda k: improvement(normal(30, seed=k), normal(30, seed=9000 + k)),
+        0.5,
+    ),
+    # Ten trainings of each of five tasks, as rliable has it.
+    "runs": (
+        lambda k: interquartile_mean(normal(10, seed=100 * k + t) for t in range(5)),
+        500,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ["mean", "improvement"])
+def test_intervals_hold_the_true_value_as_often_as_they_say(name: str) -> None:
+    """Of 300 samples of 30, about 95 of 100; the bootstrap is known to be a bit low."""
+    assert 0.90 <= covered(*SIMULATED[name], times=300) <= 0.985
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", SIMULATED)
+@pytest.mark.parametrize("is_large", [False, True])
+def test_coverage(name: str, is_large: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 2000 samples, by both methods."""
+    # Takes more than five seconds: resamples each of them a thousand times.
+    if is_large:
+        monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
+    assert 0.92 <= covered(*SIMULATED[name], times=2000) <= 0.965
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"resamples": 0}, {"resamples": 10**7}, {"confidence": 1.0}, {"seed": -1}],
+)
+def test_impossible_bootstraps_are_refused(wrong: dict[str, int]) -> None:
+    """Before anything is read or run."""
+    with pytest.raises(InvalidArgument, match="got"):
+        Bootstrap(**wrong)  # type: ignore[arg-type]

@@ -188,7 +188,10 @@ def test_each_state_follows_from_the_one_before(
 
 
 def test_the_model_is_that_of_the_step(tmp_path: Path) -> None:
-    """Step 0 is what the reset set; later changes hold from their steps on."""
+    """Step 0 is what the reset set; later changes hold from their steps on.
+
+    A step that is not there is an error that says how many there are.
+    """
     model = model_of("heap")
     changes = {
         0: {"geom_size": np.full((4, 3), 0.25), "opt.gravity": [0, 0, -1.5]},
@@ -204,19 +207,13 @@ def test_the_model_is_that_of_the_step(tmp_path: Path) -> None:
         np.testing.assert_array_equal(first.geom_rgba, model.geom_rgba)
         shades = [trajectory.model(step=k).geom_rgba[0, 0] for k in (3, 4, 5, 6, -1)]
         assert shades == [model.geom_rgba[0, 0], 0.5, 0.5, 0.75, 0.75]
-
-
-def test_steps_that_are_not_there_are_refused(tmp_path: Path) -> None:
-    """The message says how many there are."""
-    trajectory = mjrec.load_trajectory(Recording(tmp_path, model_of("heap")).path)
-    data = mujoco.MjData(trajectory.model())
+    data = mujoco.MjData(first)
     trajectory.set_state(data, -1)
     assert data.time == trajectory.time[-1]
-    for step in (13, -14):
-        with pytest.raises(InvalidArgument, match="holds 13 states"):
-            trajectory.set_state(data, step)
-        with pytest.raises(InvalidArgument, match="holds 13 states"):
-            trajectory.model(step)
+    for use in (trajectory.model, lambda step: trajectory.set_state(data, step)):
+        for step in (13, -14):
+            with pytest.raises(InvalidArgument, match="holds 13 states"):
+                use(step)
 
 
 def test_a_recording_without_a_simulation_has_no_model(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from mjrec.formats.video_names import (
     camera_part,
     further_parts,
     is_second_name,
-    second_name_of,
     tiled_name,
     with_part,
 )
@@ -67,14 +66,3 @@ def test_gymnasiums_names_are_second_names() -> None:
         *("ü-episode-1.mp4", "a-episode-\N{ARABIC-INDIC DIGIT ONE}.mp4", ""),
     ):
         assert not is_second_name(name)
-
-
-def test_what_belongs_to_a_video_is_called_alike() -> None:
-    """Further cameras and metadata, and nothing of another episode."""
-    second = "rl-video-episode-27.mp4"
-    for ending in ("mp4", "meta.json", "side.mp4", "side.meta.json"):
-        name = FIRST.removesuffix("mp4") + ending
-        expected = f"rl-video-episode-27.{ending}"
-        assert second_name_of(name, second, first=FIRST) == expected
-    other = FIRST.replace("27", "270")
-    assert second_name_of(other, second, first=FIRST) is None

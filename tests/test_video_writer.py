@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -81,14 +80,6 @@ def read(path: Path, pixel_format: str = "rgb24") -> list[Frame]:
     with av.open(str(path)) as container:
         frames = container.decode(video=0)
         return [frame.to_ndarray(format=pixel_format) for frame in frames]
-
-
-@pytest.fixture
-def no_process_stays() -> Iterator[None]:
-    """Fail if a child process is left, be it as a zombie."""
-    before = children()
-    yield
-    assert children() <= before
 
 
 def ffmpeg_under(
@@ -185,35 +176,34 @@ def test_an_odd_size_is_padded_by_one_pixel(
 
 
 @pytest.mark.parametrize(
-    ("codec", "name"),
-    [("ffv1", "a.mkv"), ("libx264rgb", "b.mkv"), ("utvideo", "c.avi")],
-)
-def test_lossless_codecs_keep_every_pixel(
-    tmp_path: Path, codec: str, name: str
-) -> None:
-    """They give back the very frames, odd sizes too."""
-    originals = [scene(number)[:31, :47] for number in range(6)]
-    result = record(tmp_path / name, originals, codec=codec)
-    shown = [frame[:31, :47] for frame in read(result.path)]
-    np.testing.assert_array_equal(shown, originals)
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
+    ("name", "options", "is_lossless"),
     [
-        *(("a.mp4", {"codec": "mpeg4"}), ("a.mov", {})),
+        ("a.mkv", {"codec": "ffv1"}, True),
+        ("b.mkv", {"codec": "libx264rgb"}, True),
+        ("c.avi", {"codec": "utvideo"}, True),
+        ("a.mp4", {"codec": "mpeg4"}, False),
+        ("a.mov", {}, False),
         # Lossless x264 is no profile High.
-        *(("a.mp4", {"crf": 0}), ("http:a %03d ü|'\".mp4", {})),
+        ("a.mp4", {"crf": 0}, False),
+        ("http:a %03d ü|'\".mp4", {}, False),
     ],
 )
 def test_other_codecs_files_and_names_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, options: dict[str, Any]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    options: dict[str, Any],
+    is_lossless: bool,
 ) -> None:
-    """What ffmpeg can encode; what a name holds means nothing to it."""
+    """What ffmpeg can encode, pixel for pixel; a name means nothing to it."""
     monkeypatch.chdir(tmp_path)
-    result = record(Path(name), map(numbered, range(30)), **options)
+    frames = [numbered(n, height=31, width=128)[:, :127] for n in range(9)]
+    result = record(Path(name), frames, **options)
     assert result.path == tmp_path / name
-    assert [number_of(frame) for frame in read(result.path)] == list(range(30))
+    shown = read(result.path)
+    assert [number_of(frame) for frame in shown] == list(range(9))
+    if is_lossless:
+        np.testing.assert_array_equal([each[:31, :127] for each in shown], frames)
 
 
 def test_the_result_tells_what_was_written(tmp_path: Path) -> None:
@@ -275,7 +265,7 @@ def test_a_file_has_its_name_at_the_end(tmp_path: Path) -> None:
     assert [one.name for one in tmp_path.iterdir()] == ["a.mp4"]
 
 
-@pytest.mark.usefixtures("no_process_stays")
+@pytest.mark.usefixtures("no_process_is_left")
 def test_abort_leaves_nothing_new(tmp_path: Path) -> None:
     """Neither file nor process nor result; a later close does nothing."""
     old = record(tmp_path / "a.mp4", [numbered(0)])
@@ -290,17 +280,7 @@ def test_abort_leaves_nothing_new(tmp_path: Path) -> None:
     assert hashlib.sha256(old.path.read_bytes()).hexdigest() == old.file_sha256
 
 
-def test_an_exception_inside_with_keeps_the_frames_so_far(tmp_path: Path) -> None:
-    """The caller's exception goes through and the file is playable."""
-    video = VideoWriter(tmp_path / "a.mp4", fps=40)
-    with pytest.raises(KeyboardInterrupt), video:  # noqa: PT012  the way out matters
-        for number in range(9):
-            video.write(numbered(number))
-        raise KeyboardInterrupt
-    assert [number_of(frame) for frame in read(video.path)] == list(range(9))
-
-
-@pytest.mark.usefixtures("no_process_stays")
+@pytest.mark.usefixtures("no_process_is_left")
 @pytest.mark.parametrize("more", [0, 5000])
 def test_a_killed_encoder_is_one_error(tmp_path: Path, more: int) -> None:
     """Of `write`, or of `close` where all was written. Nothing is left."""
@@ -317,7 +297,7 @@ def test_a_killed_encoder_is_one_error(tmp_path: Path, more: int) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.usefixtures("no_process_stays")
+@pytest.mark.usefixtures("no_process_is_left")
 @pytest.mark.parametrize("of_what", ["video", "hashes"])
 def test_a_full_disk_is_one_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, of_what: str
@@ -348,7 +328,7 @@ def test_a_full_disk_is_one_error(
     ],
     ids=["last lost", "doubled"],
 )
-@pytest.mark.usefixtures("no_process_stays")
+@pytest.mark.usefixtures("no_process_is_left")
 def test_a_file_with_other_frames_is_not_kept(
     tmp_path: Path, arguments: tuple[str, ...], left: int | str
 ) -> None:
@@ -368,9 +348,7 @@ def test_a_file_with_other_frames_is_not_kept(
     [
         ("a.mp4", {"fps": 0}, InvalidArgument, "fps"),
         ("a.mp4", {"crf": 52}, InvalidArgument, "crf"),
-        ("a.mp4", {"crf": "18"}, InvalidArgument, "crf"),
         ("a.mp4", {"codec": "mpeg4", "crf": 18}, InvalidArgument, "knows no crf"),
-        ("a.mp4", {"codec": 5}, InvalidArgument, "codec"),
         ("a.mp4", {"codec": "gif"}, InvalidArgument, "gif"),
         ("a.mp4", {"codec": "libx265x"}, UnknownName, "libx264"),
         ("a.mp4", {"encoder_arguments": "-g 1"}, InvalidArgument, "encoder_arguments"),
@@ -396,7 +374,7 @@ def test_what_cannot_work_fails_before_any_frame(
     assert [one.name for one in tmp_path.iterdir()] == ["dir.mp4"]
 
 
-@pytest.mark.usefixtures("default_signals", "no_process_stays")
+@pytest.mark.usefixtures("default_signals", "no_process_is_left")
 @pytest.mark.parametrize("end", ["close", "abort"])
 def test_an_interrupted_close_can_be_called_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str
@@ -451,9 +429,6 @@ def test_memory_does_not_grow_with_the_video(tmp_path: Path) -> None:
     assert peak < 10 << 20
 
 
-# Shell, before the real ffmpeg runs. The encoder is known by its output's name.
-
-
 def wait_for_end(pid: int) -> None:
     """Wait until a process that is no child of ours has ended."""
     try:
@@ -468,7 +443,7 @@ def wait_for_end(pid: int) -> None:
 
 @pytest.mark.usefixtures("default_signals")
 def test_ctrl_c_in_the_terminal_does_not_end_the_encoder(tmp_path: Path) -> None:
-    """SIGINT to the whole process group: the frames so far become the video."""
+    """SIGINT to the whole group; what leaves `with` keeps the frames so far."""
     code = (
         "with VideoWriter('a.mp4', fps=40) as video:\n"
         "    for number in range(50):\n"

@@ -9,7 +9,6 @@ import threading
 from typing import Any
 
 import pytest
-from interruption import ctrl_c_soon
 
 from mjrec.errors import ClosedError
 from mjrec.worker_thread import WorkerThread
@@ -34,22 +33,29 @@ def held() -> tuple[WorkerThread[Any], threading.Event, threading.Event, list[An
 
 
 def test_items_are_consumed_in_order_on_one_other_thread() -> None:
-    """Everything put before close, once, then the finish; after it nothing is taken."""
-    seen: list[tuple[int, str]] = []
-
-    def consume(item: int) -> None:
-        seen.append((item, threading.current_thread().name))
-
-    worker = WorkerThread[int](
-        consume, capacity=3, name="w", finish=lambda: consume(100)
-    )
-    for number in range(100):
-        worker.put(number)
+    """Every item, then the finish, while `put` waits; after `abort` that in hand."""
+    worker, in_hand, gate, seen = held()
+    worker.put(1)
+    assert in_hand.wait(30)
+    worker.put(2)
+    putter = threading.Thread(target=lambda: worker.put(3))
+    putter.start()
+    putter.join(0.05)
+    assert putter.is_alive()
+    gate.set()
+    putter.join(30)
     worker.close()
     worker.close()
-    assert seen == [(number, "mjrec-w") for number in range(101)]
+    assert seen == [1, 2, 3, "end"]
     with pytest.raises(ClosedError, match="w is closed"):
         worker.put(1)
+    worker, in_hand, gate, seen = held()
+    worker.put(1)
+    assert in_hand.wait(30)
+    worker.put(2)
+    threading.Timer(0.05, gate.set).start()
+    worker.abort()
+    assert seen == [1]
 
 
 @pytest.mark.parametrize("error", [KeyError("x"), SystemExit()])
@@ -74,34 +80,6 @@ def test_the_consumers_own_error_comes_home(error: BaseException) -> None:
     assert seen == [error]
 
 
-def test_put_waits_while_the_queue_is_full() -> None:
-    """With the consumer held, the third put of a queue of one does not return."""
-    worker, in_hand, gate, seen = held()
-    worker.put(1)
-    assert in_hand.wait(30)
-    worker.put(2)
-    putter = threading.Thread(target=lambda: worker.put(3))
-    putter.start()
-    putter.join(0.05)
-    assert putter.is_alive()
-    gate.set()
-    putter.join(30)
-    worker.close()
-    assert seen == [1, 2, 3, "end"]
-
-
-def test_abort_drops_what_waits() -> None:
-    """Only the item in hand is consumed, and the finish is left out."""
-    worker, in_hand, gate, seen = held()
-    worker.put(1)
-    assert in_hand.wait(30)
-    worker.put(2)
-    threading.Timer(0.05, gate.set).start()
-    worker.abort()
-    worker.abort()
-    assert seen == [1]
-
-
 @pytest.mark.parametrize("call", ["close", "abort"])
 def test_an_end_on_the_thread_itself_waits_for_nothing(call: str) -> None:
     """As when the consumer's garbage collection ends the worker's owner."""
@@ -115,18 +93,6 @@ def test_an_end_on_the_thread_itself_waits_for_nothing(call: str) -> None:
     worker.put(1)
     worker.close()
     assert seen == [1]
-
-
-def test_an_interrupted_close_can_be_called_again() -> None:
-    """The second waits for the thread as the first would have."""
-    worker, _, gate, seen = held()
-    worker.put(0)
-    for _ in range(2):
-        with ctrl_c_soon(), pytest.raises(KeyboardInterrupt):
-            worker.close()
-    gate.set()
-    worker.close()
-    assert seen == [0, "end"]
 
 
 def test_neither_forks_nor_the_interpreter_wait_for_the_thread() -> None:

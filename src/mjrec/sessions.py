@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from .environments.episode_seeds import episode_seeds
 from .environments.from_name import NamedEnvironment, environment_from_name
@@ -45,7 +45,8 @@ class Session:
         directory: the monitor directory.
         seed: of the session, a whole number from 0 to 2**32 - 1.
         episodes: how many.
-        policy: `random`, `zero` or `module:name`.
+        policy: see `environments.policies`.
+        policy_kwargs: more arguments for it.
         schedule: which episodes get a video: `cubic`, `all`, `none`, `every:N` or
             `at:0,5,9`; None is `cubic`, unless `monitor` has a `keep`.
         further_cameras: of more videos of the same episodes.
@@ -59,6 +60,7 @@ class Session:
     seed: int
     episodes: int = 1
     policy: str = "random"
+    policy_kwargs: Mapping[str, Any] = field(default_factory=dict)
     schedule: str | None = None
     further_cameras: tuple[str | int, ...] = ()
     made: EnvironmentOptions = field(default_factory=EnvironmentOptions)
@@ -111,7 +113,7 @@ def record_session(
         named = _environment(session, pictures=drawn)
         closing = stack.enter_context(contextlib.ExitStack())
         closing.callback(named.environment.close)
-        policy = load_policy(session.policy, named.environment)
+        policy = load_policy(session.policy, named.environment, session.policy_kwargs)
         view = dict(named.view)
         if session.further_cameras:
             # An environment that was made with its camera shows it by itself.

@@ -9,8 +9,8 @@ from ..errors import InvalidArgument
 from ..json_text import has_nan, loads
 
 
-def kwargs_of(text: str) -> dict[str, Any]:
-    """Return the arguments that `--env-kwargs` names.
+def kwargs_of(text: str, option: str = "--env-kwargs") -> dict[str, Any]:
+    """Return the arguments that an option names.
 
     Raises:
         InvalidArgument: it is no JSON object, or has a key twice, or NaN.
@@ -19,14 +19,14 @@ def kwargs_of(text: str) -> dict[str, Any]:
         kwargs = loads(text)
     except ValueError as error:
         raise InvalidArgument(
-            f"--env-kwargs must be a JSON object, got {text!r}: {error}."
+            f"{option} must be a JSON object, got {text!r}: {error}."
         ) from None
     if not isinstance(kwargs, dict):
-        raise InvalidArgument(f"--env-kwargs must be a JSON object, got {text!r}.")
+        raise InvalidArgument(f"{option} must be a JSON object, got {text!r}.")
     for name, value in kwargs.items():
         if has_nan(value):
             raise InvalidArgument(
-                f"--env-kwargs must be a JSON object, and {name!r} holds NaN, which "
+                f"{option} must be a JSON object, and {name!r} holds NaN, which "
                 "JSON has no number for."
             )
     return kwargs

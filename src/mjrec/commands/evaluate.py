@@ -23,7 +23,8 @@ from ..errors import InvalidArgument, UnknownName
 from ..evaluation.dataclass_json import to_json
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation, EvaluationProgress
-from ..evaluation.summaries import Interval, TaskSummary
+from ..evaluation.statistics import Interval
+from ..evaluation.summaries import TaskSummary
 from ..evaluation.task_sets import tasks_from
 from .counted import counted
 from .engine_options import NO_ENGINE, EngineOptions
@@ -76,6 +77,7 @@ def evaluate(
     env_kwargs: str = "{}",
     score_range: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     fail_under: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    confidence: float = 0.95,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
     engine_options: Annotated[
         tyro.conf.OmitArgPrefixes[EngineOptions], tyro.conf.arg(name="engine")
@@ -118,6 +120,7 @@ def evaluate(
             times.
         fail_under: TASK=VALUE. The exit status is 1 where the mean return of this task
             is below, or an episode of it failed. May be given several times.
+        confidence: the share of intervals that hold the true value.
         as_json: print one JSON object at the end, and nothing else.
         engine_options: where episodes are run and videos are drawn, in place of
             processes of this command.
@@ -153,6 +156,7 @@ def evaluate(
                 quality=quality,
                 env_kwargs=kwargs_of(env_kwargs),
                 score_ranges=ranges,
+                confidence=confidence,
                 on_progress=progress.show,
             )
     except KeyboardInterrupt:

@@ -40,6 +40,7 @@ def record(
     episodes: int = 1,
     max_steps: int | None = None,
     policy: str = "random",
+    policy_kwargs: str = "{}",
     seed: int | None = None,
     schedule: str | None = None,
     keep: str | None = None,
@@ -69,7 +70,10 @@ def record(
             no limit.
         policy: random, zero, or module:name. A class is built with the environment, a
             function is the policy, module:name() is called with the environment and
-            returns the policy.
+            returns the policy. Or a file that you trust: model.zip of
+            Stable-Baselines3, TorchScript (.pt) or ONNX (.onnx).
+        policy_kwargs: more arguments for the class, the call or the file's reader
+            (device), as a JSON object.
         seed: S; episode i starts from NumPy's SeedSequence([S, i]). A fresh one, which
             is printed, if it is not given.
         schedule: which episodes get a video: cubic (0, 1, 8, 27 ... and every 1000th),
@@ -108,6 +112,7 @@ def record(
         directory=out,
         episodes=episodes,
         policy=policy,
+        policy_kwargs=kwargs_of(policy_kwargs, "--policy-kwargs"),
         seed=seed,
         schedule=schedule,
         further_cameras=tuple(number_or_name(each) for each in camera[1:]),

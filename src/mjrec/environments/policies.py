@@ -8,6 +8,7 @@
                    policy; a class is built with the environment and then is one of
                    these
 `module:name()`    is called with the environment and returns one of these
+`model.zip`        a file: see `policy_files`
 =================  ==================================================================
 
 A policy is called with the observation, for dm_env that of the time step, and returns
@@ -19,32 +20,50 @@ with the same.
 from __future__ import annotations
 
 import contextlib
+import copy
 import importlib
 import inspect
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Protocol
+from types import MappingProxyType, ModuleType
+from typing import Any, Final
 
 import numpy as np
 
-from ..errors import Error, PolicyError, UnknownName
+from ..errors import Error, InvalidArgument, PolicyError, UnknownName
 from .episode_seeds import EpisodeSeeds
+from .policy_files import file_of_policy, policy_in_file
 from .working_directory import working_directory_importable
 
 _BUILT_IN = ("random", "zero")
 _FORMS = (
-    "Or give module:name (a class, a function or an object of yours) or module:name()."
+    "Or give module:name (a class, a function or an object of yours), module:name(), "
+    "or a file (model.zip of Stable-Baselines3, .pt of TorchScript, .onnx)."
 )
+_NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
-class Policy(Protocol):
-    """What chooses the actions."""
+class Policy:
+    """What chooses the actions in one environment.
+
+    Args:
+        environment: the Gymnasium or dm_env environment that is to be acted in.
+        name: `random` or `zero`.
+    """
+
+    def __init__(self, environment: Any, name: str) -> None:
+        # Not at the top: it loads Gymnasium.
+        from . import actions
+
+        self._space = actions.action_space(environment)
+        self._zero = actions.zero(self._space) if name == "zero" else None
+        self._checked = actions.checked
 
     def reset(self, seeds: EpisodeSeeds) -> None:
         """Prepare for an episode that has these seeds; before its first action."""
+        self._space.seed(seeds.actions)
 
     def __call__(self, observation: Any) -> Any:
         """Return the action at an observation, checked.
@@ -52,142 +71,41 @@ class Policy(Protocol):
         Raises:
             PolicyError: the policy raised, or gave something that is no action.
         """
-
-
-class Actions(Protocol):
-    """The actions that an environment takes."""
-
-    def seed(self, seed: int) -> None:
-        """Begin the sequence of drawn actions that belongs to a seed."""
-
-    def draw(self) -> Any:
-        """Return a random action."""
-
-    def zero(self) -> Any:
-        """Return the action nearest to zero."""
-
-    def checked(self, action: Any) -> Any:
-        """Return an action as the environment takes it, or raise `PolicyError`."""
-
-
-def load_policy(text: str, environment: Any) -> Policy:
-    """Return the policy that `text` names; the module says what it may name.
-
-    The working directory is importable while this runs. A policy that imports more
-    from there later on needs `working_directory_importable` around its use.
-
-    Args:
-        text: `random`, `zero`, `module:name` or `module:name()`.
-        environment: the Gymnasium or dm_env environment that is to be acted in.
-
-    Raises:
-        UnknownName: there is no such policy, module or name in it.
-        PolicyError: importing or building it raised, which is kept as the cause, or
-            what it names is no policy.
-    """
-    actions = _actions(environment)
-    match text:
-        case "random":
-            return _RandomPolicy(actions)
-        case "zero":
-            return _ZeroPolicy(actions)
-    with working_directory_importable():
-        chosen = _chosen(text, environment)
-    return _ForeignPolicy(text, _chooser(text, chosen), actions)
-
-
-def policy_from(chosen: Any, name: str, environment: Any) -> Policy:
-    """Return the policy that an object is, as `load_policy` treats `module:name`.
-
-    Args:
-        chosen: an object with `predict`, a function, or a class, which is built with
-            the environment and then is one of these.
-        name: what messages call it.
-        environment: the Gymnasium or dm_env environment that is to be acted in.
-
-    Raises:
-        PolicyError: building it raised, which is kept as the cause, or it is no
-            policy.
-    """
-    if inspect.isclass(chosen):
-        chosen = _built(chosen, name, environment)
-    return _ForeignPolicy(name, _chooser(name, chosen), _actions(environment))
-
-
-def policy_file(text: str) -> Path | None:
-    """Return the file of the module that a policy, which is loaded, comes from.
-
-    Args:
-        text: as given to `load_policy`.
-
-    Returns:
-        None for the built-in ones, and for modules that are in no file.
-    """
-    module = sys.modules.get(text.partition(":")[0]) if ":" in text else None
-    file = getattr(module, "__file__", None)
-    return None if file is None else Path(file)
-
-
-class _RandomPolicy:
-    def __init__(self, actions: Actions) -> None:
-        self._actions = actions
-
-    def reset(self, seeds: EpisodeSeeds) -> None:
-        self._actions.seed(seeds.actions)
-
-    def __call__(self, observation: Any) -> Any:
-        return self._actions.draw()
-
-
-class _ZeroPolicy:
-    def __init__(self, actions: Actions) -> None:
-        self._zero = actions.zero()
-
-    def reset(self, seeds: EpisodeSeeds) -> None:
-        """Do nothing: zero is zero."""
-
-    def __call__(self, observation: Any) -> Any:
+        if self._zero is None:
+            return self._space.sample()
         # Environments may keep, or write into, the action that they are given.
-        return self._zero.copy() if hasattr(self._zero, "copy") else self._zero
+        return copy.deepcopy(self._zero)
 
 
-class _Chooser(Protocol):
-    """A foreign policy in one form."""
-
-    def reset(self, seed: int) -> None: ...
-
-    def __call__(self, observation: Any) -> Any: ...
-
-
-class _ForeignPolicy:
+class _ForeignPolicy(Policy):
     """Guards a policy of the user's: names what raises, checks what it gives."""
 
-    def __init__(self, text: str, chooser: _Chooser, actions: Actions) -> None:
-        self._text = text
-        self._chooser = chooser
-        self._actions = actions
+    def __init__(self, environment: Any, name: str, chosen: Any) -> None:
+        super().__init__(environment, name)
+        self._name = name
+        self._reset = getattr(chosen, "reset", None)
+        # A policy of Stable-Baselines3 is a torch module too, and callable.
+        if callable(getattr(chosen, "predict", None)):
+            self._choose: Callable[[Any], Any] = _Predictor(chosen)
+        elif callable(chosen):
+            self._choose = chosen
+        else:
+            raise PolicyError(
+                f"The policy {name} gives {chosen!r}, which neither can be called nor "
+                "has predict()."
+            )
 
     def reset(self, seeds: EpisodeSeeds) -> None:
-        with _failures_named(f"reset({seeds.policy}) of the policy {self._text}"):
-            self._chooser.reset(seeds.policy)
+        if isinstance(self._choose, _Predictor):
+            self._choose.begin()
+        if callable(self._reset):
+            with _failures_named(f"reset({seeds.policy}) of the policy {self._name}"):
+                self._reset(seeds.policy)
 
     def __call__(self, observation: Any) -> Any:
-        with _failures_named(f"The policy {self._text}"):
-            action = self._chooser(observation)
-        return self._actions.checked(action)
-
-
-class _Function:
-    """Calls what is called with the observation."""
-
-    def __init__(self, function: Callable[[Any], Any]) -> None:
-        self._function = function
-
-    def reset(self, seed: int) -> None:
-        _reset_if_it_can(self._function, seed)
-
-    def __call__(self, observation: Any) -> Any:
-        return self._function(observation)
+        with _failures_named("The policy ", self._name):
+            action = self._choose(observation)
+        return self._checked(self._space, action)
 
 
 class _Predictor:
@@ -199,15 +117,17 @@ class _Predictor:
     """
 
     def __init__(self, predictor: Any) -> None:
-        self._predictor = predictor
+        self._predict = predictor.predict
+        parameters = inspect.signature(self._predict).parameters
+        # The first one is the observation, whatever it is called: `state`, for example.
+        self._taken = set(list(parameters)[1:])
+        if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            self._taken = {"state", "episode_start", "deterministic"}
+        self.begin()
+
+    def begin(self) -> None:
         self._state: Any = None
         self._first = True
-        self._takes = _options_of(predictor.predict)
-
-    def reset(self, seed: int) -> None:
-        self._state = None
-        self._first = True
-        _reset_if_it_can(self._predictor, seed)
 
     def __call__(self, observation: Any) -> Any:
         known = {
@@ -215,8 +135,8 @@ class _Predictor:
             "episode_start": np.array([self._first]),
             "deterministic": True,
         }
-        arguments = {name: known[name] for name in known if self._takes(name)}
-        predicted = self._predictor.predict(observation, **arguments)
+        arguments = {name: known[name] for name in known if name in self._taken}
+        predicted = self._predict(observation, **arguments)
         self._first = False
         if isinstance(predicted, tuple) and len(predicted) == 2:
             action, self._state = predicted
@@ -224,61 +144,120 @@ class _Predictor:
         return predicted
 
 
-def _actions(environment: Any) -> Actions:
-    # Of each framework only what the environment has loaded already is imported.
-    actions: Actions
-    if callable(getattr(environment, "action_spec", None)):
-        from .dm_env_actions import DmEnvActions
+def load_policy(
+    text: str, environment: Any, kwargs: Mapping[str, Any] = _NONE
+) -> Policy:
+    """Return the policy that `text` names; the module says what it may name.
 
-        actions = DmEnvActions(environment.action_spec())
+    The working directory is importable while this runs. A policy that imports more
+    from there later on needs `working_directory_importable` around its use.
+
+    Args:
+        text: `random`, `zero`, `module:name`, `module:name()` or a file.
+        environment: the Gymnasium or dm_env environment that is to be acted in.
+        kwargs: more arguments for what is built or called, or for reading the file.
+
+    Raises:
+        UnknownName: there is no such policy, module, name in it, or file.
+        InvalidArgument: `kwargs` for what takes none.
+        PolicyError: importing, reading or building it raised, which is kept as the
+            cause, or what it names is no policy.
+        MissingDependency: what reads such a file is not installed.
+    """
+    if text in _BUILT_IN:
+        _check_no_arguments(text, kwargs)
+        return Policy(environment, text)
+    with working_directory_importable():
+        path = file_of_policy(text)
+        if path is not None:
+            with _failures_named(f"Reading the policy {text}"):
+                chosen = policy_in_file(path, environment, **kwargs)
+            return _ForeignPolicy(environment, text, chosen)
+        return policy_from(*_found(text), environment, kwargs)
+
+
+def policy_from(
+    chosen: Any,
+    name: str,
+    environment: Any,
+    kwargs: Mapping[str, Any] = _NONE,
+) -> Policy:
+    """Return the policy that an object is, as `load_policy` treats `module:name`.
+
+    Args:
+        chosen: an object with `predict`, a function, or a class, which is built with
+            the environment and then is one of these.
+        name: what messages call it. Where it ends in `()`, `chosen` is called too.
+        environment: the Gymnasium or dm_env environment that is to be acted in.
+        kwargs: more arguments for a class.
+
+    Raises:
+        InvalidArgument: `kwargs` for what is not built.
+        PolicyError: building it raised, which is kept as the cause, or it is no
+            policy.
+    """
+    if inspect.isclass(chosen) or name.endswith("()"):
+        with _failures_named(f"Building the policy {name} with the environment"):
+            chosen = chosen(environment, **kwargs)
     else:
-        from .gymnasium_actions import GymnasiumActions
-
-        actions = GymnasiumActions(environment.action_space)
-    return actions
+        _check_no_arguments(name, kwargs)
+    return _ForeignPolicy(environment, name, chosen)
 
 
-def _chosen(text: str, environment: Any) -> Any:
-    """Return the object, or what the class or call gives, that `text` names."""
-    module_name, colon, name = text.partition(":")
-    called = name.endswith("()")
-    name = name.removesuffix("()")
-    if not (module_name and colon and name):
-        raise UnknownName("policy", text, _BUILT_IN, hint=_FORMS)
-    found = _find(_import(module_name, text), name)
-    if not called and not inspect.isclass(found):
-        return found
-    if not callable(found):
-        raise PolicyError(
-            f"The policy {text} is to be called, and {name} is {found!r}, which cannot "
-            f"be. Leave the parentheses away: {module_name}:{name}."
+def policy_file(text: str) -> Path | None:
+    """Return the file that a policy, which is loaded, comes from.
+
+    Args:
+        text: as given to `load_policy`.
+
+    Returns:
+        None for the built-in ones, and for modules that are in no file.
+    """
+    if ":" not in text:
+        return file_of_policy(text)
+    module = sys.modules.get(text.partition(":")[0])
+    file = getattr(module, "__file__", None)
+    return None if file is None else Path(file)
+
+
+def _check_no_arguments(name: str, kwargs: Mapping[str, Any]) -> None:
+    if kwargs:
+        raise InvalidArgument(
+            f"The policy {name} takes no arguments, got {dict(kwargs)}: a class, a "
+            "module:name() and a file take some."
         )
-    return _built(found, text, environment)
 
 
-def _built(make: Callable[[Any], Any], name: str, environment: Any) -> Any:
-    with _failures_named(f"Building the policy {name} with the environment"):
-        return make(environment)
+def _found(text: str) -> tuple[Any, str]:
+    """Return the object that `text` names, and the text."""
+    module_name, colon, name = text.partition(":")
+    if not (module_name and colon and name.removesuffix("()")):
+        raise UnknownName("policy", text, _BUILT_IN, hint=_FORMS)
+    found = _find(_import(module_name, text), name.removesuffix("()"))
+    if name.endswith("()") and not callable(found):
+        raise PolicyError(
+            f"The policy {text} is to be called, and {name[:-2]} is {found!r}, which "
+            f"cannot be. Leave the parentheses away: {text[:-2]}."
+        )
+    return found, text
 
 
 def _import(module_name: str, text: str) -> ModuleType:
-    try:
-        return importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
-            raise _failure(f"Importing {module_name} for the policy {text}") from error
-        raise UnknownName(
-            "module for a policy",
-            module_name,
-            _modules_here(),
-            hint=f"Looked in {Path.cwd()} and among what is installed.",
-        ) from error
-    except Exception as error:
-        raise _failure(f"Importing {module_name} for the policy {text}") from error
-
-
-def _modules_here() -> list[str]:
-    return sorted(p.stem for p in Path.cwd().glob("*.py") if p.stem.isidentifier())
+    with _failures_named(f"Importing {module_name} for the policy {text}"):
+        try:
+            return importlib.import_module(module_name)
+        except ModuleNotFoundError as error:
+            # What it imports itself may be missing, too.
+            if not f"{module_name}.".startswith(f"{error.name}."):
+                raise
+            raise UnknownName(
+                "module for a policy",
+                module_name,
+                sorted(
+                    p.stem for p in Path.cwd().glob("*.py") if p.stem.isidentifier()
+                ),
+                hint=f"Looked in {Path.cwd()} and among what is installed.",
+            ) from error
 
 
 def _find(module: ModuleType, name: str) -> Any:
@@ -302,49 +281,17 @@ def _offered(module: ModuleType) -> list[str]:
     )
 
 
-def _chooser(text: str, chosen: Any) -> _Chooser:
-    # A policy of Stable-Baselines3 is a torch module too, and callable.
-    if callable(getattr(chosen, "predict", None)):
-        return _Predictor(chosen)
-    if callable(chosen):
-        return _Function(chosen)
-    raise PolicyError(
-        f"The policy {text} gives {chosen!r}, which neither can be called nor has "
-        "predict()."
-    )
-
-
-def _reset_if_it_can(policy: Any, seed: int) -> None:
-    reset = getattr(policy, "reset", None)
-    if callable(reset):
-        reset(seed)
-
-
-def _options_of(predict: Callable[..., Any]) -> Callable[[str], bool]:
-    """Return what tells whether `predict` takes an argument beside the observation."""
-    parameters = inspect.signature(predict).parameters
-    # The first one is the observation, whatever it is called: `state`, for example.
-    names = list(parameters)[1:]
-    takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-    return lambda name: takes_all or name in names
-
-
 @contextlib.contextmanager
-def _failures_named(what: str) -> Iterator[None]:
+def _failures_named(*what: str) -> Iterator[None]:
+    """Turn what third-party code raises into one error of ours, with its place."""
     try:
         yield
     except Error:
         raise
     except Exception as error:
-        raise _failure(what) from error
-
-
-def _failure(what: str) -> PolicyError:
-    """Return the error for the exception that is being handled, with its place."""
-    _, error, trace = sys.exc_info()
-    text = f"{what} raised {type(error).__name__}: {error}"
-    # A syntax error says itself where it is.
-    if not isinstance(error, SyntaxError):
-        place = traceback.extract_tb(trace)[-1]
-        text += f" ({place.filename}, line {place.lineno})"
-    return PolicyError(f"{text}.")
+        text = f"{''.join(what)} raised {type(error).__name__}: {error}"
+        # A syntax error says itself where it is.
+        if not isinstance(error, SyntaxError):
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            text += f" ({place.filename}, line {place.lineno})"
+        raise PolicyError(f"{text}.") from error

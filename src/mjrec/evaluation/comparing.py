@@ -1,39 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparing two evaluations: how much better the second one is.
+"""Comparing evaluations: how much better B is than A.
 
 Every figure is of B against A: differences are B - A, and the probability of
-improvement is that of an episode of B having a higher return than one of A. What it
-says is of these two policies: two trainings of the same method differ as well, and an
-evaluation of one policy knows nothing of that.
+improvement is that of B having a higher return than A. Where each side is one
+evaluation, the figures are of its episodes, and say something of these two policies
+only. Where a side is several, one for each training, the figures are of the
+evaluations' means, and say something of the two methods: see `docs/statistics.md`.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
 from ..errors import InvalidArgument, MissingDependency
-from . import intervals, statistics
-from .plan import SEEDED, EvaluationPlan
+from . import statistics
+from .plan import SEEDED
 from .result_columns import ResultColumns
 from .results_files import ReadResults, read_results
-from .statistics import FloatArray
-from .summaries import Bootstrap, Interval
-from .summarizing import scaled
+from .statistics import Bootstrap, FloatArray, Interval
+from .summaries import scaled
 
-# Of the plan: what changes returns though the policy is the same.
-_CONDITIONS: Final = ("max_steps", "env_kwargs")
-# What only chooses which episodes are seen.
-_CHOICES: Final = ("protocol", "seeds", "episodes")
+Directories: TypeAlias = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
 _MOST_TOLD: Final = 10
-
-# A million of their squares can be added up.
-_LARGEST: Final = 1e150
 
 
 @dataclass(frozen=True)
@@ -61,12 +56,15 @@ class TaskComparison:
         episodes_b: likewise.
         failed_a: how many were not.
         failed_b: likewise.
-        mean_a: of the returns.
+        not_finite_a: how many of the completed ones have a return that is NaN or
+            infinite. Where any has, there are no figures.
+        not_finite_b: likewise.
+        mean_a: of the returns; of several evaluations that of their means.
         mean_b: likewise.
         difference: `mean_b - mean_a`.
         difference_interval: of that.
-        probability: that B is better: of an episode of B having a higher return than
-            one of A, where equal returns count half.
+        probability: that B is better, where equal returns count half: of an episode of
+            B against one of A, or of an evaluation's mean against another's.
         probability_interval: of that.
         p_value: of the two-sided Mann-Whitney test that neither tends to be higher.
         p_value_holm: that, adjusted (Holm) for the number of tasks.
@@ -81,6 +79,8 @@ class TaskComparison:
     episodes_b: int
     failed_a: int = 0
     failed_b: int = 0
+    not_finite_a: int = 0
+    not_finite_b: int = 0
     mean_a: float | None = None
     mean_b: float | None = None
     difference: float | None = None
@@ -96,14 +96,14 @@ class TaskComparison:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreComparison:
-    """The interquartile means of the scores of all tasks with the same scale in both.
+    """The interquartile means of the scores of all tasks with one scale everywhere.
 
     Attributes:
         tasks: which ones.
         iqm_a: the interquartile mean of their scores.
         iqm_b: likewise.
         difference: `iqm_b - iqm_a`.
-        interval: of that; None where a task has a single episode.
+        interval: of that; None where there is a single score of a task.
     """
 
     tasks: tuple[str, ...]
@@ -115,28 +115,31 @@ class ScoreComparison:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Evaluation B against evaluation A.
+    """B against A.
 
     Attributes:
-        a: the directory of the one.
-        b: the directory of the other.
+        a: the directories of the one side.
+        b: the directories of the other.
+        unit: what the figures are of, and is resampled: `"episodes"` of one evaluation
+            on each side, or `"evaluations"`.
         policy_a: what was evaluated in A.
         policy_b: what was evaluated in B.
-        cautions: what must be known before the figures are believed: that the two were
-            not made under the same conditions, or that episodes failed.
+        cautions: what must be known before the figures are believed: that not all was
+            made under the same conditions, or that episodes failed.
         remarks: in what else the two differ; their figures can be compared all the
             same.
-        only_in_a: tasks that are not in B.
-        only_in_b: tasks that are not in A.
-        tasks: those that are in both, in the order of A.
+        only_in_a: tasks that are not in all evaluations of B.
+        only_in_b: tasks that are not in all evaluations of A.
+        tasks: those that are everywhere, in the order of A.
         probability: that B is better, averaged over tasks; None where no task has one.
-        probability_interval: of that; None also where a task has a single episode.
-        scores: of all tasks that have the same scale in both; None where none has.
+        probability_interval: of that; None also where a task has a single value.
+        scores: of all tasks that have the same scale everywhere; None where none has.
         bootstrap: how intervals were made.
     """
 
-    a: Path
-    b: Path
+    a: tuple[Path, ...]
+    b: tuple[Path, ...]
+    unit: Literal["episodes", "evaluations"]
     policy_a: str
     policy_b: str
     cautions: tuple[str, ...]
@@ -156,64 +159,72 @@ class Comparison:
 
 
 def compare(
-    a: str | Path, b: str | Path, *, bootstrap: Bootstrap | None = None
+    a: Directories,
+    b: Directories,
+    *,
+    confidence: float = 0.95,
+    resamples: int = 10_000,
+    seed: int = 0,
 ) -> Comparison:
-    """Compare two evaluations; every figure is of B against A.
+    """Compare two evaluations, or two sets of them; every figure is of B against A.
+
+    Of one evaluation on each side, episodes are resampled: the figures are of these two
+    policies. Of several on a side (trainings of one method with different seeds), each
+    evaluation counts as its mean return, and these are resampled, for each task on its
+    own.
 
     Args:
-        a: the directory of an evaluation.
-        b: the directory of another.
-        bootstrap: how intervals are made; as `Bootstrap()` says, if None.
+        a: the directory of an evaluation, or several.
+        b: likewise.
+        confidence: the share of intervals that hold the true value.
+        resamples: of the bootstrap that intervals come from.
+        seed: of its generator.
 
     Raises:
         UnreadableFile: there is no finished evaluation in a directory, or it is
             damaged.
-        InvalidArgument: no task is in both.
+        InvalidArgument: no task is in all of them, or a directory is there twice.
         MissingDependency: scipy is not installed.
     """
-    return compare_results(
-        read_results(Path(a)), read_results(Path(b)), bootstrap or Bootstrap()
-    )
-
-
-def compare_results(a: ReadResults, b: ReadResults, bootstrap: Bootstrap) -> Comparison:
-    """Compare two evaluations that have been read; see `compare`."""
-    common = [task for task in a.columns if task in b.columns]
+    how = Bootstrap(resamples=resamples, seed=seed, confidence=confidence)
+    sides = of_a, of_b = _Side("A", a), _Side("B", b)
+    common = [task for task in of_a.tasks if task in of_b.tasks]
     if not common:
         raise InvalidArgument(
-            f"The two evaluations have no task in common: {a.directory} is of "
-            f"{', '.join(a.columns)}; {b.directory} is of {', '.join(b.columns)}."
+            "The evaluations have no task in common: "
+            + "; ".join(f"{side.told} has {', '.join(side.tasks)}" for side in sides)
         )
-    pairs = {task: _Pair(a.columns[task], b.columns[task]) for task in common}
-    known = {task: pair for task, pair in pairs.items() if pair.unknown is None}
-    returns_a = {task: pair.returns_a for task, pair in known.items()}
-    returns_b = {task: pair.returns_b for task, pair in known.items()}
-    found = intervals.improvement_intervals(returns_b, returns_a, bootstrap=bootstrap)
-    p_values = _mann_whitney(returns_a, returns_b)
-    comparison = Comparison(
-        a=a.directory,
-        b=b.directory,
-        policy_a=a.plan.policy,
-        policy_b=b.plan.policy,
-        cautions=tuple(_cautions(a, b, pairs)),
-        remarks=tuple(_remarks(a, b)),
-        only_in_a=tuple(task for task in a.columns if task not in pairs),
-        only_in_b=tuple(task for task in b.columns if task not in pairs),
-        tasks=tuple(
-            _compared_task(task, pair, found, bootstrap) for task, pair in pairs.items()
-        ),
-        probability=(
-            statistics.mean_probability_of_improvement(returns_b, returns_a)
-            if known
-            else None
-        ),
-        probability_interval=found.mean_probability,
-        scores=_compared_scores(a, b, known, bootstrap),
-        bootstrap=bootstrap,
+    is_single = len(of_a.results) == len(of_b.results) == 1
+    for side in sides:
+        side.is_single = is_single
+    tasks = [_compared_task(task, of_a, of_b, how) for task in common]
+    adjusted = holm_adjusted(
+        {each.task: each.p_value for each in tasks if each.p_value is not None}
     )
-    comparison = _with_p_values(comparison, p_values)
-    return (
-        _with_pairs(comparison, known, bootstrap) if _begin_alike(a, b) else comparison
+    known = [each.task for each in tasks if each.unknown is None]
+    better = statistics.average(
+        statistics.improvement(of_b.sample(task), of_a.sample(task)) for task in known
+    )
+    return Comparison(
+        a=of_a.directories,
+        b=of_b.directories,
+        unit="episodes" if is_single else "evaluations",
+        policy_a=_listed(each.plan.policy for each in of_a.results),
+        policy_b=_listed(each.plan.policy for each in of_b.results),
+        cautions=tuple(_cautions(of_a, of_b, tasks)),
+        remarks=tuple(
+            f"{name}: {in_a} in A, {in_b} in B"
+            for name, in_a, in_b in _different(of_a, of_b, _choices)
+        ),
+        only_in_a=tuple(task for task in of_a.tasks if task not in common),
+        only_in_b=tuple(task for task in of_b.tasks if task not in common),
+        tasks=tuple(
+            replace(each, p_value_holm=adjusted.get(each.task)) for each in tasks
+        ),
+        probability=better.value if known else None,
+        probability_interval=better.interval(how) if known else None,
+        scores=_compared_scores(of_a, of_b, known, how),
+        bootstrap=how,
     )
 
 
@@ -221,148 +232,114 @@ def holm_adjusted(p_values: Mapping[str, float]) -> dict[str, float]:
     """Return p-values that are adjusted for how many there are.
 
     The k-th smallest of m (from 0) times m - k, none smaller than one before it, at
-    most 1: S. Holm, "A Simple Sequentially Rejective Multiple Test Procedure",
-    Scandinavian Journal of Statistics 6 (1979). To call those below 0.05 different is
-    to be wrong about any of them in at most 5 of 100 comparisons.
+    most 1. To call those below 0.05 different is to be wrong about any of them in at
+    most 5 of 100 comparisons.
     """
     adjusted: dict[str, float] = {}
     largest = 0.0
     for k, name in enumerate(sorted(p_values, key=lambda name: p_values[name])):
         largest = max(largest, min(1.0, p_values[name] * (len(p_values) - k)))
         adjusted[name] = largest
-    return {name: adjusted[name] for name in p_values}
+    return adjusted
 
 
-class _Pair:
-    """The episodes of one task in both evaluations."""
+class _Side:
+    """The evaluations of one side.
 
-    def __init__(self, a: ResultColumns, b: ResultColumns) -> None:
-        self.a = a
-        self.b = b
-        self.returns_a = a.total_reward[~a.failed]
-        self.returns_b = b.total_reward[~b.failed]
+    Args:
+        name: `"A"` or `"B"`.
+        directories: one, or several.
+    """
+
+    def __init__(self, name: str, directories: Directories) -> None:
+        if isinstance(directories, str | os.PathLike):
+            directories = [directories]
+        self.name = name
+        self.directories = tuple(map(Path, directories))
+        if not self.directories:
+            raise InvalidArgument(f"There is no evaluation on the side of {name}.")
+        if len({path.resolve() for path in self.directories}) < len(self.directories):
+            raise InvalidArgument(f"An evaluation is there twice: {self.told}.")
+        self.results = [read_results(path) for path in self.directories]
+        # Whether the other side is one evaluation, too.
+        self.is_single = True
 
     @property
-    def unknown(self) -> str | None:
-        """Why the two cannot be compared."""
-        for name, returns in (("A", self.returns_a), ("B", self.returns_b)):
+    def told(self) -> str:
+        return f"{self.name} ({', '.join(map(str, self.directories))})"
+
+    @property
+    def tasks(self) -> list[str]:
+        """The tasks that are in all evaluations."""
+        rest = [each.columns for each in self.results[1:]]
+        first = self.results[0].columns
+        return [task for task in first if all(task in other for other in rest)]
+
+    def returns(self, task: str) -> list[FloatArray]:
+        """Return those of the completed episodes of each evaluation."""
+        columns = [each.columns[task] for each in self.results]
+        return [each.total_reward[~each.failed] for each in columns]
+
+    def sample(self, task: str) -> FloatArray:
+        """Return what the figures are of."""
+        returns = self.returns(task)
+        if self.is_single:
+            return returns[0]
+        return np.array([each.mean() for each in returns])
+
+    def failed(self, task: str) -> int:
+        return sum(len(each.columns[task].failures) for each in self.results)
+
+    def unknown(self, task: str) -> str | None:
+        """Return why there are no figures of a task."""
+        for path, returns in zip(self.directories, self.returns(task), strict=True):
+            name = self.name if len(self.results) == 1 else path
             if not len(returns):
                 return f"no episode of {name} was completed"
-            wrong = np.count_nonzero(~np.isfinite(returns))
-            if wrong:
+            if wrong := _not_finite(returns):
                 return (
                     f"{wrong} of {len(returns)} returns of {name} are NaN or infinite"
                 )
-            if np.abs(returns).max() > _LARGEST:
-                return f"returns of {name} are too large to be added up"
         return None
 
-    def differences(self) -> FloatArray:
-        """Return B - A for each seed and number that both have completed."""
-        of_a, of_b = _by_unit(self.a), _by_unit(self.b)
-        return np.array([of_b[unit] - of_a[unit] for unit in of_a if unit in of_b])
+
+def _not_finite(returns: FloatArray) -> int:
+    return int(np.count_nonzero(~np.isfinite(returns)))
 
 
-def _by_unit(columns: ResultColumns) -> dict[tuple[int, int], float]:
-    done = ~columns.failed
-    units = zip(
-        columns.seed[done].tolist(), columns.episode[done].tolist(), strict=True
-    )
-    return dict(zip(units, columns.total_reward[done].tolist(), strict=True))
-
-
-def _compared_task(
-    task: str,
-    pair: _Pair,
-    found: intervals.ImprovementIntervals,
-    bootstrap: Bootstrap,
-) -> TaskComparison:
-    counts = {"a": len(pair.returns_a), "b": len(pair.returns_b)}
+def _compared_task(task: str, a: _Side, b: _Side, how: Bootstrap) -> TaskComparison:
+    returns_a, returns_b = (np.concatenate(side.returns(task)) for side in (a, b))
     compared = TaskComparison(
         task=task,
-        episodes_a=counts["a"],
-        episodes_b=counts["b"],
-        failed_a=len(pair.a.failures),
-        failed_b=len(pair.b.failures),
-        unknown=pair.unknown,
+        episodes_a=len(returns_a),
+        episodes_b=len(returns_b),
+        failed_a=a.failed(task),
+        failed_b=b.failed(task),
+        not_finite_a=_not_finite(returns_a),
+        not_finite_b=_not_finite(returns_b),
+        unknown=a.unknown(task) or b.unknown(task),
     )
-    if pair.unknown is not None:
+    if compared.unknown is not None:
         return compared
-    mean_a, mean_b = float(pair.returns_a.mean()), float(pair.returns_b.mean())
-    return dataclasses.replace(
+    x, y = a.sample(task), b.sample(task)
+    mean_a, mean_b = statistics.mean(x), statistics.mean(y)
+    difference, better = mean_b - mean_a, statistics.improvement(y, x)
+    return replace(
         compared,
-        mean_a=mean_a,
-        mean_b=mean_b,
-        difference=mean_b - mean_a,
-        difference_interval=found.differences.get(task),
-        probability=statistics.probability_of_improvement(
-            pair.returns_b, pair.returns_a
-        ),
-        probability_interval=found.probabilities.get(task),
-        interval_method=intervals.interval_method(counts),
+        mean_a=mean_a.value,
+        mean_b=mean_b.value,
+        difference=difference.value,
+        difference_interval=difference.interval(how),
+        probability=better.value,
+        probability_interval=better.interval(how),
+        p_value=_mann_whitney(x, y),
+        paired=_paired(task, a.results[0], b.results[0], how) if a.is_single else None,
+        interval_method=difference.interval_method,
     )
 
 
-def _with_p_values(comparison: Comparison, p_values: Mapping[str, float]) -> Comparison:
-    adjusted = holm_adjusted(p_values)
-    tasks = tuple(
-        dataclasses.replace(
-            each,
-            p_value=p_values.get(each.task),
-            p_value_holm=adjusted.get(each.task),
-        )
-        for each in comparison.tasks
-    )
-    return dataclasses.replace(comparison, tasks=tasks)
-
-
-def _with_pairs(
-    comparison: Comparison, known: Mapping[str, _Pair], bootstrap: Bootstrap
-) -> Comparison:
-    paired = {
-        task: _paired(task, pair.differences(), bootstrap)
-        for task, pair in known.items()
-    }
-    tasks = tuple(
-        dataclasses.replace(each, paired=paired.get(each.task))
-        for each in comparison.tasks
-    )
-    return dataclasses.replace(comparison, tasks=tasks)
-
-
-def _paired(
-    task: str, differences: FloatArray, bootstrap: Bootstrap
-) -> PairedDifference | None:
-    if not len(differences):
-        return None
-    return PairedDifference(
-        len(differences),
-        float(differences.mean()),
-        intervals.mean_interval(
-            differences, stratum=f"paired:{task}", bootstrap=bootstrap
-        ),
-    )
-
-
-def _begin_alike(a: ReadResults, b: ReadResults) -> bool:
-    """Tell whether an episode of the same seed and number began in the same state."""
-    return (
-        a.plan.protocol == b.plan.protocol == SEEDED
-        and a.plan.env_kwargs == b.plan.env_kwargs
-    )
-
-
-def _mann_whitney(
-    a: Mapping[str, FloatArray], b: Mapping[str, FloatArray]
-) -> dict[str, float]:
-    """Return the two-sided p-value of the Mann-Whitney test of each task.
-
-    H. B. Mann and D. R. Whitney, Annals of Mathematical Statistics 18 (1947). Exact
-    for small samples without ties, else by the normal approximation with corrections
-    for ties and continuity, as scipy chooses. Where all returns are equal it is 1.
-    """
-    if not a:
-        return {}
+def _mann_whitney(x: FloatArray, y: FloatArray) -> float:
+    """Return the two-sided p-value; exact for small samples without equal values."""
     try:
         # Here, because it takes longer to import than all else, and is optional.
         from scipy.stats import mannwhitneyu  # type: ignore[import-untyped] # no stubs
@@ -372,83 +349,127 @@ def _mann_whitney(
             purpose="Comparing evaluations",
             install='pip install "mjrec[evaluation]"',
         ) from error
-    return {
-        task: 1.0
-        if np.ptp(np.concatenate([a[task], b[task]])) == 0
-        else float(mannwhitneyu(b[task], a[task], alternative="two-sided").pvalue)
-        for task in a
-    }
+    if np.ptp(np.concatenate([x, y])) == 0:
+        # SciPy would divide zero by zero.
+        return 1.0
+    return float(mannwhitneyu(y, x, alternative="two-sided").pvalue)
+
+
+def _paired(
+    task: str, a: ReadResults, b: ReadResults, how: Bootstrap
+) -> PairedDifference | None:
+    if not (
+        a.plan.protocol == b.plan.protocol == SEEDED
+        and a.plan.env_kwargs == b.plan.env_kwargs
+    ):
+        # Episodes of the same seed and number began in different states.
+        return None
+    of_a, of_b = _by_unit(a.columns[task]), _by_unit(b.columns[task])
+    pairs = [of_b[unit] - of_a[unit] for unit in of_a if unit in of_b]
+    if not pairs:
+        return None
+    difference = statistics.mean(np.array(pairs))
+    return PairedDifference(len(pairs), difference.value, difference.interval(how))
+
+
+def _by_unit(columns: ResultColumns) -> dict[tuple[int, int], float]:
+    done = ~columns.failed
+    units = zip(columns.seed[done], columns.episode[done], strict=True)
+    return dict(zip(units, columns.total_reward[done].tolist(), strict=True))
 
 
 def _compared_scores(
-    a: ReadResults, b: ReadResults, known: Mapping[str, _Pair], bootstrap: Bootstrap
+    a: _Side, b: _Side, tasks: Sequence[str], how: Bootstrap
 ) -> ScoreComparison | None:
-    ranges_a, ranges_b = _score_ranges(a), _score_ranges(b)
-    scores_a: dict[str, FloatArray] = {}
-    scores_b: dict[str, FloatArray] = {}
-    for task, pair in known.items():
-        scale = ranges_a.get(task)
-        if scale is not None and scale == ranges_b.get(task) and _is_usable(scale):
-            scores_a[task] = scaled(pair.returns_a, scale)
-            scores_b[task] = scaled(pair.returns_b, scale)
-    if not scores_a:
+    scales = _scales([*a.results, *b.results])
+    scaled_tasks = tuple(task for task in tasks if task in scales)
+    if not scaled_tasks:
         return None
-    iqm_a = statistics.interquartile_mean_across(scores_a)
-    iqm_b = statistics.interquartile_mean_across(scores_b)
+    iqm_a, iqm_b = (
+        statistics.interquartile_mean(
+            scaled(side.sample(task), scales[task]) for task in scaled_tasks
+        )
+        for side in (a, b)
+    )
+    difference = iqm_b - iqm_a
     return ScoreComparison(
-        tasks=tuple(scores_a),
-        iqm_a=iqm_a,
-        iqm_b=iqm_b,
-        difference=iqm_b - iqm_a,
-        interval=intervals.iqm_difference_interval(
-            scores_b, scores_a, bootstrap=bootstrap
-        ),
+        tasks=scaled_tasks,
+        iqm_a=iqm_a.value,
+        iqm_b=iqm_b.value,
+        difference=difference.value,
+        interval=difference.interval(how),
     )
 
 
-def _is_usable(scale: tuple[float, float]) -> bool:
-    """Tell whether a range, which comes from a file, leaves returns finite."""
-    low, high = scale
-    return 1 / _LARGEST < high - low < _LARGEST
+def _scales(results: Sequence[ReadResults]) -> dict[str, tuple[float, float]]:
+    """Return the returns that count as 0 and as 1, of tasks where all say the same."""
+    said: dict[str, set[tuple[float, float] | None]] = {}
+    for each in results:
+        for summary in each.summaries:
+            said.setdefault(summary.task, set()).add(summary.score_range)
+    # A file may say anything.
+    return {
+        task: scale
+        for task, (scale, *others) in said.items()
+        if not others and scale is not None and scale[0] < scale[1]
+    }
 
 
-def _score_ranges(results: ReadResults) -> dict[str, tuple[float, float] | None]:
-    return {summary.task: summary.score_range for summary in results.summaries}
-
-
-def _cautions(
-    a: ReadResults, b: ReadResults, pairs: Mapping[str, _Pair]
-) -> Iterator[str]:
-    for name, of_a, of_b in _different(a.plan, b.plan, _CONDITIONS):
+def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[str]:
+    for side, other in ((a, b), (b, a)):
+        if len(side.results) == 1 < len(other.results):
+            yield (
+                f"{side.name} is a single evaluation: how much another training would "
+                "differ is not known, and there are no intervals"
+            )
+    for name, of_a, of_b in _different(a, b, _conditions):
         yield (
             f"{name} was {of_a} in A and is {of_b} in B: returns under different "
             "conditions do not tell which policy is better"
         )
-    for task, pair in pairs.items():
-        for name, columns in (("A", pair.a), ("B", pair.b)):
-            if columns.failures:
+    for task in tasks:
+        for name, failed, completed in (
+            ("A", task.failed_a, task.episodes_a),
+            ("B", task.failed_b, task.episodes_b),
+        ):
+            if failed:
                 yield (
-                    f"{task}: {len(columns.failures)} of {len(columns)} episodes of "
+                    f"{task.task}: {failed} of {failed + completed} episodes of "
                     f"{name} failed; the figures are of the others"
                 )
 
 
-def _remarks(a: ReadResults, b: ReadResults) -> Iterator[str]:
-    for name, of_a, of_b in _different(a.plan, b.plan, _CHOICES):
-        yield f"{name}: {of_a} in A, {of_b} in B"
-    for package in sorted({*a.versions, *b.versions}):
-        of_a, of_b = (each.versions.get(package, "none") for each in (a, b))
-        if of_a != of_b:
-            yield f"{package}: {of_a} in A, {of_b} in B"
+def _conditions(results: ReadResults) -> Mapping[str, object]:
+    """Return what changes returns though the policy is the same."""
+    plan = results.plan
+    return {"max_steps": plan.max_steps, "env_kwargs": plan.env_kwargs}
+
+
+def _choices(results: ReadResults) -> Mapping[str, object]:
+    """Return what chooses which episodes are seen, and what ran them."""
+    plan = results.plan
+    return {
+        "protocol": plan.protocol,
+        "seeds": plan.seeds,
+        "episodes": plan.episodes,
+        **results.versions,
+    }
 
 
 def _different(
-    a: EvaluationPlan, b: EvaluationPlan, names: Sequence[str]
+    a: _Side, b: _Side, facts: Callable[[ReadResults], Mapping[str, object]]
 ) -> Iterator[tuple[str, str, str]]:
-    for name in names:
-        of_a, of_b = getattr(a, name), getattr(b, name)
-        if of_a != of_b:
-            yield name, _told(of_a), _told(of_b)
+    """Yield the facts that are not the same everywhere, as each side says them."""
+    results = [*a.results, *b.results]
+    for name in dict.fromkeys(name for each in results for name in facts(each)):
+        values = [facts(each).get(name, "none") for each in results]
+        if any(value != values[0] for value in values):
+            split = len(a.results)
+            yield name, _listed(values[:split]), _listed(values[split:])
+
+
+def _listed(values: Iterable[object]) -> str:
+    return " or ".join(dict.fromkeys(map(_told, values)))
 
 
 def _told(value: object) -> str:

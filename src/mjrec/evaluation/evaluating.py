@@ -47,8 +47,8 @@ from .planning import check_score_ranges, plan_from
 from .policy_objects import SentPolicy, sent_policy
 from .result_tables import EpisodeFiles
 from .results_files import PLAN_NAME, RESULT_NAMES, ChosenEpisode, write_results
-from .summaries import Bootstrap
-from .summarizing import (
+from .statistics import Bootstrap
+from .summaries import (
     default_score_range,
     split_by_scale,
     summarize_across,
@@ -92,7 +92,7 @@ def evaluate(
     env_kwargs: Mapping[str, Any] | None = None,
     policy_kwargs: Mapping[str, Any] | None = None,
     score_ranges: Mapping[str, tuple[float, float]] | None = None,
-    bootstrap: Bootstrap | None = None,
+    confidence: float = 0.95,
     on_progress: _Tell | None = None,
     engine: Executor | str | None = None,
 ) -> Evaluation:
@@ -150,7 +150,7 @@ def evaluate(
         policy_kwargs: more arguments for the policy.
         score_ranges: the returns that count as 0 and as 1, by task, for what is said
             over all tasks. Those of the dm_control suite have theirs.
-        bootstrap: how confidence intervals are made.
+        confidence: the share of intervals that hold the true value.
         on_progress: called several times a second with how far it is.
         engine: where the work runs, instead of processes of this one: an executor, or
             `"local"`, `"ray"` or `"slurm"`. Its workers draw the videos, too, those of
@@ -170,6 +170,7 @@ def evaluate(
         Error: an argument, a task or the policy cannot be. All of these are raised
             before anything is run or written.
     """
+    how = Bootstrap(confidence=confidence)
     options: dict[str, Any] = {
         "episodes": episodes,
         "keep": keep,
@@ -206,7 +207,7 @@ def evaluate(
 
     def take(plan: EvaluationPlan, tasks: Sequence[TaskRun]) -> None:
         """Write the results, before videos are drawn: that takes long."""
-        found = _evaluation_of(plan, tasks, place, ranges, bootstrap or Bootstrap())
+        found = _evaluation_of(plan, tasks, place, ranges, how)
         _write(found)
         results.append(found)
 

@@ -14,7 +14,8 @@ from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
 from .result_tables import EpisodeFiles
 from .results_files import ChosenEpisode
-from .summaries import AcrossTasks, Bootstrap, TaskSummary
+from .statistics import Bootstrap
+from .summaries import AcrossTasks, TaskSummary
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,7 +46,8 @@ from .result_tables import (
     write_results_table,
     write_timing_table,
 )
-from .summaries import AcrossTasks, Bootstrap, TaskSummary
+from .statistics import Bootstrap
+from .summaries import AcrossTasks, TaskSummary
 
 FORMAT_VERSION = 1
 PLAN_NAME = "evaluation.json"

@@ -173,7 +173,7 @@ class Evaluator:
     def _make_policy(self, environment: Any) -> Policy:
         name = self._plan.policy
         if self._policy is None:
-            return load_policy(name, environment)
+            return load_policy(name, environment, self._plan.policy_kwargs)
         try:
             with working_directory_importable():
                 # Through our own pipe, from the process that evaluates.
@@ -183,7 +183,7 @@ class Evaluator:
                 f"The policy {name} could not be made again in a worker process: "
                 f"{_in_one_line(error)}. Give its name instead, policy='module:name'."
             ) from error
-        return policy_from(chosen, name, environment)
+        return policy_from(chosen, name, environment, self._plan.policy_kwargs)
 
 
 class _ChunkRun:

@@ -59,12 +59,12 @@ _BLOCK = 4096
 MOST_EPISODES = 10**15
 
 # In their order: what the run is; its machine, packages and code; an episode that is
-# no part of the statistics; a clip that is over; an episode whose video falls out while
-# its trajectory stays; what could not be recorded; which videos were kept; the end;
-# that another process has put the directory in order; and of an evaluation's episodes,
-# that one begins, or has failed.
+# no part of the statistics; a clip that is over; an action that does not fit into rows;
+# an episode whose video falls out while its trajectory stays; what could not be
+# recorded; which videos were kept; the end; that another process has put the directory
+# in order; and of an evaluation's episodes, that one begins, or has failed.
 EVENTS = (
-    *("run", "surroundings", "cut", "clip", "dropped"),
+    *("run", "surroundings", "cut", "clip", "action", "dropped"),
     *("fault", "keep", "closed", "recovered", "begun", "failed"),
 )
 

@@ -96,6 +96,8 @@ class Recording:
         self._fast: FastPath | None = None
         self._irregular: set[str] = set()
         self._action: StepArray | None = None
+        # From which step on they were given as what.
+        self._action_dtypes: list[list[Any]] = []
         self._observation = None if observation is None else step_array(observation)
         # What belongs to step 0 waits here until there is a span.
         self._first_state = np.full(_words(self._state), np.nan)
@@ -136,13 +138,11 @@ class Recording:
         if self.is_stopped:
             return
         if self._span is None and action is not None:
-            usual = self._run.action
-            if usual is None or not usual.set(action):
-                usual = action_array(action)
-                self._run.action = usual or self._run.action
-            self._action = usual
+            self._action = self._array_for(action)
         if self._action is not None and not self._action.set(action):
             self._note_irregular("actions")
+            where = {"episode_id": self._run.episode.episode_id, "step": self.steps}
+            self._run.journal.note("action", {**where, "value": action})
 
     def step(
         self,
@@ -303,6 +303,8 @@ class Recording:
             observation=None if observation is None else observation.kind,
         )
         facts = {**self._facts, **self._parts(), **self._measured_pace()}
+        if action is not None and action.given is not None:
+            facts["action_dtypes"] = self._action_dtypes = [[0, action.given.name]]
         span = self._logs.begin(self._name, facts, dtype, alone=self._is_alone)
         try:
             own = None if self._start is None else self._start.model_fields
@@ -373,6 +375,25 @@ class Recording:
             for name, array in arrays.items()
             if array is not None and array.parts is not None
         }
+
+    def _array_for(self, action: Any) -> StepArray | None:
+        """Return memory for actions like the first: that of before, where it fits."""
+        array = self._run.action
+        if array is not None:
+            array.on_other_dtype = self._note_action_dtype
+        if array is None or not array.set(action):
+            array = action_array(action)
+            self._run.action = array or self._run.action
+            if array is not None:
+                array.on_other_dtype = self._note_action_dtype
+        return array
+
+    def _note_action_dtype(self) -> None:
+        if self._span is not None and self._action is not None:
+            given = self._action.given
+            assert given is not None
+            self._action_dtypes = [*self._action_dtypes, [self.steps, given.name]]
+            self.note(action_dtypes=self._action_dtypes)
 
     def _note_irregular(self, what: str) -> None:
         if what not in self._irregular:

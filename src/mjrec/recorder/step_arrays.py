@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,9 @@ class StepArray:
         values: the array that was set last; always the same memory.
         parts: the names and shapes of a dictionary's arrays, which lie one behind the
             other; None for a plain array.
+        given: the dtype of the array that was set last, as it came; None before the
+            first one, and for dictionaries.
+        on_other_dtype: called when `given` has changed.
     """
 
     def __init__(
@@ -36,8 +39,9 @@ class StepArray:
         self.parts = parts
         self.values: NDArray[Any] = np.zeros(shape, dtype)
         self._shape = self.values.shape
-        # Of the array before, which the next one is usually like.
-        self._usual: np.dtype[Any] | None = None
+        # The next one's is usually the same.
+        self.given: np.dtype[Any] | None = None
+        self.on_other_dtype: Callable[[], object] = lambda: None
         # What goes in without a loss: integers into floats, and not the other way.
         self._kinds = "fiub" if dtype.kind == "f" else "iub"
         if dtype.kind == "u":
@@ -56,7 +60,7 @@ class StepArray:
         # The usual case, at every step.
         if (
             type(value) is _ARRAY
-            and value.dtype is self._usual
+            and value.dtype is self.given
             and value.shape == self._shape
         ):
             self.values[...] = value
@@ -70,8 +74,9 @@ class StepArray:
         except (AttributeError, KeyError, TypeError, ValueError):
             fits = False
         self.values[...] = array if fits else 0
-        if fits and self.parts is None:
-            self._usual = array.dtype
+        if fits and self.parts is None and array.dtype is not self.given:
+            self.given = array.dtype
+            self.on_other_dtype()
         return fits
 
     def _joined(self, value: Mapping[str, Any]) -> NDArray[np.float64]:

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.summaries import AcrossTasks, Bootstrap, TaskSummary
+from ..evaluation.statistics import Bootstrap
+from ..evaluation.summaries import AcrossTasks, TaskSummary
 
 
 @dataclass(frozen=True, kw_only=True)

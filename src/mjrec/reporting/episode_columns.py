@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from ..evaluation.result_columns import ResultColumns
-from ..evaluation.summaries import Bootstrap, TaskSummary
-from ..evaluation.summarizing import default_score_range, summarize_task
+from ..evaluation.statistics import Bootstrap
+from ..evaluation.summaries import TaskSummary, default_score_range, summarize_task
 from ..results.episodes import Episode
 from .contents import EpisodeColumns
 

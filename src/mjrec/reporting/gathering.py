@@ -22,7 +22,8 @@ from pathlib import Path
 
 from ..errors import UnreadableFile
 from ..evaluation.results_files import ReadResults, read_results, read_summaries
-from ..evaluation.summaries import AcrossTasks, Bootstrap, TaskSummary
+from ..evaluation.statistics import Bootstrap
+from ..evaluation.summaries import AcrossTasks, TaskSummary
 from ..formats.monitor_directory import monitor_directories_in
 from ..results.episodes import episodes_of
 from ..results.journal_or_stats import MonitorResults

@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MissingDependency
-from ..evaluation.intervals import PERCENTILE_BOOTSTRAP
-from ..evaluation.summaries import AcrossTasks, Bootstrap, Interval, TaskSummary
+from ..evaluation.statistics import PERCENTILE_BOOTSTRAP, Bootstrap, Interval
+from ..evaluation.summaries import AcrossTasks, TaskSummary
 from .contents import EpisodeColumns, ReportContents, ReportTask, ReportVideo, Verdict
 from .curves import SERIES, evaluation_curve, learning_curve, profile_curve
 from .numbers import NOTHING, decimals_for, number, whole_number
@@ -376,8 +376,8 @@ def _words_of(method: str | None, bootstrap: Bootstrap) -> str | None:
     """Return how intervals were made, with what that method depends on."""
     if method != PERCENTILE_BOOTSTRAP:
         return method
-    told = f"{bootstrap.method}, {whole_number(bootstrap.resamples)} resamples"
-    return f"{told}, seed {bootstrap.seed}"
+    resamples = f"{whole_number(bootstrap.resamples)} resamples"
+    return f"{method} over episodes, {resamples}, seed {bootstrap.seed}"
 
 
 class _Note(NamedTuple):

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The actions of an environment, as a space: drawn, zero, and checked."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+from gymnasium import Space, spaces
+
+from ..errors import PolicyError
+
+# One of dm_env's, or a dictionary, list or tuple of such, however deep.
+_Spec: TypeAlias = Any
+
+# dm_control says 1e10 (mjMAXVAL) for actuators without limits.
+_ENDLESS = 1e10
+
+
+def action_space(environment: Any) -> Space[Any]:
+    """Return the space of an environment's actions, from which may be drawn.
+
+    It is a copy: drawing here and drawing there do not disturb each other.
+
+    Args:
+        environment: of Gymnasium or dm_env. A list of specs becomes a `Tuple`.
+
+    Raises:
+        PolicyError: it takes actions that are no numbers.
+    """
+    if not callable(getattr(environment, "action_spec", None)):
+        own: Space[Any] = copy.deepcopy(environment.action_space)
+        return own
+    return _space_of(environment.action_spec())
+
+
+def zero(space: Space[Any]) -> Any:
+    """Return the action nearest to zero.
+
+    Raises:
+        PolicyError: the space has no such thing.
+    """
+    match space:
+        case spaces.Box():
+            return np.clip(0, space.low, space.high).astype(space.dtype)
+        case spaces.Discrete():
+            return 0 if space.contains(0) else int(space.start)
+        case spaces.MultiDiscrete():
+            last = space.start + space.nvec - 1
+            return np.clip(0, space.start, last).astype(space.dtype)
+        case spaces.MultiBinary():
+            return np.zeros(space.shape, space.dtype)
+        case spaces.Dict():
+            return {name: zero(part) for name, part in space.spaces.items()}
+        case spaces.Tuple():
+            return tuple(zero(part) for part in space.spaces)
+    raise PolicyError(f'The policy "zero" knows no zero of the action space {space}.')
+
+
+def checked(space: Space[Any], action: Any) -> Any:
+    """Return an action as the environment takes it.
+
+    Numbers of a `Box` may be of any type and out of its bounds, which the environments
+    clip themselves, but must be finite and of its shape. The members of a `Discrete`
+    space may be NumPy's, of one element, and become `int`.
+
+    Raises:
+        PolicyError: it is no action.
+    """
+    try:
+        return _taken(space, action)
+    # Some spaces raise anything for what is nothing like one of their members.
+    except Exception:
+        raise PolicyError(
+            f"The policy must give an action of {space}, got {action!r}."
+        ) from None
+
+
+def _space_of(spec: _Spec) -> Space[Any]:
+    if isinstance(spec, Mapping):
+        return spaces.Dict({name: _space_of(part) for name, part in spec.items()})
+    if isinstance(spec, list | tuple):
+        return spaces.Tuple([_space_of(part) for part in spec])
+    if hasattr(spec, "num_values"):
+        return spaces.Discrete(int(spec.num_values))
+    if np.dtype(spec.dtype).kind not in "fiu":
+        raise PolicyError(
+            f"Policies are known for actions that are numbers, not for {spec!r}."
+        )
+    low = np.broadcast_to(getattr(spec, "minimum", -np.inf), spec.shape)
+    high = np.broadcast_to(getattr(spec, "maximum", np.inf), spec.shape)
+    with warnings.catch_warnings():
+        # That bounds lose digits as numbers of the spec's own type.
+        warnings.simplefilter("ignore")
+        return spaces.Box(
+            np.where(low <= -_ENDLESS, -np.inf, low),
+            np.where(high >= _ENDLESS, np.inf, high),
+            spec.shape,
+            spec.dtype,
+        )
+
+
+def _taken(space: Space[Any], action: Any) -> Any:
+    match space:
+        case spaces.Box():
+            # A ValueError where lists are of unequal lengths.
+            array = np.asarray(action)
+            if array.dtype.kind not in "fiub" or array.shape != space.shape:
+                raise ValueError(action)
+            if not np.isfinite(array).all():
+                raise ValueError(action)
+            return action
+        case spaces.Dict():
+            if action.keys() != space.spaces.keys():
+                raise ValueError(action)
+            return {n: _taken(part, action[n]) for n, part in space.spaces.items()}
+        case spaces.Tuple():
+            return tuple(
+                _taken(part, each)
+                for part, each in zip(space.spaces, action, strict=True)
+            )
+        case spaces.Discrete() if np.size(action) == 1:
+            number = np.asarray(action)
+            action = int(number.item()) if number.dtype.kind in "iu" else action
+    if not space.contains(action):
+        raise ValueError(action)
+    return action

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Policies in files: model.zip, TorchScript and ONNX act as their libraries say."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import mjrec
+from mjrec.commands import main
+from mjrec.environments.episode_seeds import EpisodeSeeds
+from mjrec.environments.policies import load_policy, policy_file
+
+SEEDS = EpisodeSeeds(environment=1, actions=2, policy=3)
+
+# Of torch, which prefers its newer formats.
+pytestmark = pytest.mark.filterwarnings("ignore:.*torch:DeprecationWarning")
+
+
+@pytest.mark.parametrize(
+    ("name", "library", "extra"),
+    [
+        ("a.zip", "stable_baselines3", "stable-baselines3"),
+        ("a.pt", "torch", "torch"),
+        ("a.onnx", "onnxruntime", "onnx"),
+    ],
+)
+def test_a_missing_library_is_named(
+    name: str,
+    library: str,
+    extra: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With the line that installs it."""
+    for module in [m for m in sys.modules if m.partition(".")[0] == library]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, library, None)
+    (tmp_path / name).touch()
+    env = gymnasium.make("InvertedPendulum-v5")
+    with pytest.raises(
+        mjrec.MissingDependency, match=rf'pip install "mjrec\[{extra}\]"'
+    ):
+        load_policy(str(tmp_path / name), env)
+
+
+@pytest.mark.stable_baselines3
+@pytest.mark.parametrize(
+    ("algorithm", "env_id", "options"),
+    [
+        ("PPO", "InvertedPendulum-v5", {"use_sde": True, "n_steps": 64}),
+        ("SAC", "InvertedPendulum-v5", {}),
+        ("TD3", "InvertedPendulum-v5", {}),
+        ("DQN", "CartPole-v1", {}),
+    ],
+)
+def test_a_saved_model_acts_as_it_predicts(
+    algorithm: str, env_id: str, options: dict[str, Any], tmp_path: Path
+) -> None:
+    """Deterministically and within its bounds; also where observations are float64."""
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    env = gymnasium.make(env_id)
+    model = getattr(stable_baselines3, algorithm)(
+        "MlpPolicy",
+        env,
+        seed=0,
+        device="cpu",
+        policy_kwargs={"net_arch": [8]},
+        **options,
+    )
+    path = tmp_path / "model.zip"
+    model.save(path)
+    policy = load_policy(str(path), env)
+    assert policy_file(str(path)) == path
+    for seed in range(5):
+        observation, _ = env.reset(seed=seed)
+        policy.reset(SEEDS)
+        expected, _ = model.predict(observation, deterministic=True)
+        assert np.array_equal(
+            policy(observation * 50),
+            model.predict(observation * 50, deterministic=True)[0],
+        )
+        assert np.array_equal(policy(observation), expected)
+    with pytest.raises(mjrec.PolicyError, match="unexpected keyword argument 'speed'"):
+        load_policy(str(path), env, {"speed": 2})
+
+
+@pytest.mark.stable_baselines3
+def test_what_is_in_no_such_file_is_refused(tmp_path: Path) -> None:
+    """Weights are no network; a zip file is no model."""
+    torch = pytest.importorskip("torch")
+    env = gymnasium.make("InvertedPendulum-v5")
+    torch.save(torch.nn.Linear(4, 1).state_dict(), tmp_path / "weights.pt")
+    with pytest.raises(mjrec.PolicyError, match=r"holds no network: .*torch\.jit"):
+        load_policy(str(tmp_path / "weights.pt"), env)
+    (tmp_path / "other.zip").write_bytes(b"PK\x05\x06" + bytes(18))
+    with pytest.raises(mjrec.PolicyError, match=r"other\.zip"):
+        load_policy(str(tmp_path / "other.zip"), env)
+
+
+def exported(directory: Path, kind: str) -> Path:
+    """Write the network that gives twice the sum of an observation, and its double."""
+    torch = pytest.importorskip("torch")
+    network = torch.nn.Linear(3, 2, bias=False)
+    with torch.no_grad():
+        network.weight[:] = torch.tensor([[2.0] * 3, [4.0] * 3])
+    path = directory / f"network.{kind}"
+    if kind == "onnx":
+        pytest.importorskip("onnxruntime")
+        pytest.importorskip("onnx")
+        torch.onnx.export(network, torch.zeros(1, 3), path, dynamo=False)
+    elif kind == "pt2":
+        torch.export.save(torch.export.export(network, (torch.zeros(1, 3),)), path)
+    else:
+        torch.jit.trace(network, torch.zeros(1, 3)).save(str(path))
+    return path
+
+
+@pytest.mark.stable_baselines3
+@pytest.mark.parametrize("kind", ["pt", "pt2", "onnx"])
+def test_a_network_gets_a_row_and_gives_one(kind: str, tmp_path: Path) -> None:
+    """Of float32, whatever the observation is made of; actions are kept in bounds."""
+    env: Any = type("Env", (), {"action_space": spaces.Box(-1, 1, (2,), np.float32)})
+    policy = load_policy(str(exported(tmp_path, kind)), env)
+    policy.reset(SEEDS)
+    assert policy(np.array([0.1, 0.2, -0.1])).tolist() == pytest.approx([0.4, 0.8])
+    parts = {"pose": np.array([[0.1], [0.2]]), "speed": -0.1}
+    assert policy(parts).tolist() == pytest.approx([0.4, 0.8])
+    assert policy(np.array([1, 2, 3])).tolist() == [1, 1]
+
+
+@pytest.mark.stable_baselines3
+def test_a_network_is_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By its file's name, from the command line."""
+    torch = pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    torch.jit.trace(torch.nn.Linear(4, 1), torch.zeros(1, 4)).save("net.pt")
+    arguments = ["--policy", "net.pt", "--policy-kwargs", '{"device": "cpu"}', "--json"]
+    arguments += ["--render", "off", "--out", "out", "--max-steps", "3"]
+    assert main(["record", "InvertedPendulum-v5", *arguments]) == 0
+    assert json.loads(capsys.readouterr().out)["episodes"][0]["length"] == 3
