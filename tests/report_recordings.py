@@ -13,7 +13,6 @@ import mjrec
 from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.result_columns import ResultVideo
 from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.results_files import ChosenEpisode, write_results
 from mjrec.evaluation.statistics import Bootstrap
@@ -124,17 +123,19 @@ def write_evaluation(
             for r in results
             if r.task == task.name and r.total_reward is not None
         ]
-        write_journal(directory / task.folder, infix, task.name, entries)
+        folder = directory / task.folder / "seed-000"
+        write_journal(folder, infix, task.name, entries)
     if not finished:
         content = {"format_version": 1, "plan": to_json(plan)}
         (directory / "evaluation.json").write_text(dumps(content))
         return
-    shown = videos or {}
+    shown, folders = videos or {}, {each.name: each.folder for each in plan.tasks}
 
     def files(result: EpisodeResult) -> EpisodeFiles:
         first = result.unit == units[0] and result.task in shown
         return EpisodeFiles(
-            video=ResultVideo(shown[result.task], None) if first else None
+            folder=f"{folders[result.task]}/seed-000",
+            video=shown[result.task] if first else None,
         )
 
     write_results(

@@ -33,7 +33,7 @@ from benchmarks.tables import table_of
 from rich.console import Console
 
 import mjrec
-from mjrec.evaluation.ledger import read_ledgers
+from mjrec.evaluation.chunk_results import read_chunk
 from mjrec.evaluation.results_files import read_results
 
 ROOT = Path(__file__).parents[1]
@@ -210,7 +210,7 @@ def test_written_monitors_are_as_recorded_ones(tmp_path: Path) -> None:
     assert results["episode_lengths"] == [1000] * 6
     listed = mjrec.iter_episodes(tmp_path / "task")
     assert [episode.episode_id for episode in listed] == [*range(6)]
-    assert len(read_ledgers(tmp_path / "task")) == 6
+    assert len(read_chunk(tmp_path / "task", TASK).results) == 6
     assert not mjrec.recover(tmp_path / "task")
 
 

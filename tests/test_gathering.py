@@ -281,10 +281,10 @@ def test_videos_of_an_evaluation_know_their_episode(
     corridor: Any, tmp_path: Path
 ) -> None:
     """By monitor and number; the best of the task is called so."""
-    record(corridor, tmp_path / "a-x", 1, uid="batch")
-    [journal] = (tmp_path / "a-x").glob("*.jsonl")
+    record(corridor, tmp_path / "a-x" / "seed-000", 1, uid="batch")
+    [journal] = tmp_path.glob("a-x/*/*.jsonl")
     journal.unlink()
-    [path] = (tmp_path / "a-x").glob("*.mp4")
+    [path] = tmp_path.glob("a-x/*/*.mp4")
     infix = infix_of(path.name)
     assert infix is not None
     write_evaluation(tmp_path, ["a/x"], videos={"a/x": path.name}, infix=infix)
@@ -343,8 +343,8 @@ def test_videos_are_shown_without_the_table_of_their_files(
     corridor: Any, tmp_path: Path, there: str | None
 ) -> None:
     """That it is missing, or is none, is told; no pipe is waited for."""
-    record(corridor, tmp_path / "a-x", 1, uid="batch")
-    [video] = (tmp_path / "a-x").glob("*.mp4")
+    record(corridor, tmp_path / "a-x" / "seed-000", 1, uid="batch")
+    [video] = tmp_path.glob("a-x/*/*.mp4")
     infix = infix_of(video.name)
     assert infix is not None
     write_evaluation(tmp_path, ["a/x"], videos={"a/x": video.name}, infix=infix)

@@ -112,8 +112,8 @@ def chunks_of(plan: EvaluationPlan, known: Sequence[Chunk]) -> tuple[Chunk, ...]
     stops = {seed: chunk.stop for chunk in known for seed in chunk.seeds}
     left: dict[int, list[int]] = {}
     for seed in sorted(plan.seeds):
-        left.setdefault(stops.get(seed, 0), []).append(seed)
-    left.pop(plan.episodes, None)
+        if (first := stops.get(seed, 0)) < plan.episodes:
+            left.setdefault(first, []).append(seed)
     total = sum((plan.episodes - first) * len(seeds) for first, seeds in left.items())
     most = min(_MOST_EPISODES_OF_CHUNK, math.ceil(total / _USUAL_CHUNKS))
     chunks = list(known)
