@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..child_python import carried
-from ..errors import Error, GLError
+from ..errors import DirectoryNotWritable, Error, GLError
 from ..formats.locks import wait_for_lock
 from ..gl import use_gl
 from ..rendering.recovery import recover
@@ -109,9 +109,12 @@ class EvaluationWorker:
 
     def _run(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         folder = self._directory / arguments["folder"]
-        folder.mkdir(parents=True, exist_ok=True)
-        # That of a run whose driver was killed may be at it still.
-        lock = wait_for_lock(folder / _LOCK, f"{os.getpid()}\n")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            # That of a run whose driver was killed may be at it still.
+            lock = wait_for_lock(folder / _LOCK, f"{os.getpid()}\n")
+        except OSError as error:
+            raise DirectoryNotWritable(folder, error.strerror) from error
         try:
             recover(folder)
             with noting_models() as models:
