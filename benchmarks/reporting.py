@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import importlib.util
 import shutil
 import tempfile
@@ -20,7 +19,7 @@ import numpy as np
 import mjrec
 from mjrec.formats.journal import JournalEntry, JournalWriter
 from mjrec.reporting.gathering import gather
-from mjrec.reporting.media_files import ReportProgress
+from mjrec.reporting.media import ReportProgress
 
 from .children import call
 from .process_memory import peak_memory
@@ -160,8 +159,6 @@ def seconds_to_write(directory: str, report: str) -> float:
         at.setdefault(progress.what, []).append(time.perf_counter())
 
     shutil.rmtree(report, ignore_errors=True)
-    # matplotlib is loaded by the first figure of a process, whatever that shows.
-    importlib.import_module("matplotlib.figure")
     start = time.perf_counter()
     mjrec.write_report(directory, report, on_progress=note)
     seconds = time.perf_counter() - start
@@ -200,7 +197,7 @@ def milliseconds_to_open(page: str, empty: str) -> float:
 def memory_to_load(directory: str) -> float:
     """Return the peak of this process's memory, in MB, after loading the results."""
     contents = gather(directory)
-    if not contents.tasks[0].episodes.length.size:
+    if not len(contents.tasks[0].episodes):
         raise RuntimeError("nothing was loaded")
     return peak_memory()
 

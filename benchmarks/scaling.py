@@ -172,8 +172,7 @@ def _list(directory: Path) -> _Work:
 
 def _report(directory: Path) -> _Work:
     write_report = mjrec.write_report
-    for name in ("jinja2", "matplotlib.figure"):
-        importlib.import_module(name)
+    importlib.import_module("jinja2")
     report = directory.with_name(f"{directory.name}-report")
     shutil.rmtree(report, ignore_errors=True)
     return lambda: write_report(directory, report)

@@ -24,7 +24,7 @@ from processes import children
 from trajectories_by_hand import Painter
 
 from mjrec.formats.ffmpeg import ffmpeg_executable
-from mjrec.rendering import pool as shared_pool
+from mjrec.rendering import finish as finishing
 
 _HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 
@@ -41,6 +41,7 @@ def own_state_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep the list of the tests' models out of the home directory."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
 
 
@@ -220,7 +221,7 @@ def stuck_encoder(
 def painter(monkeypatch: pytest.MonkeyPatch) -> Painter:
     """Draw without processes and without OpenGL; the encoder is the real one."""
     painter = Painter()
-    monkeypatch.setattr(shared_pool, "WorkerPool", lambda count: painter)
+    monkeypatch.setattr(finishing, "WorkerPool", lambda count, **rest: painter)
     return painter
 
 

@@ -5,24 +5,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjrec.evaluation.statistics import Bootstrap
-from mjrec.evaluation.summaries import summarize_across, summarize_task
+from mjrec.evaluation.summaries import AcrossTasks, summarize_across, summarize_task
 from mjrec.reporting.contents import (
-    EpisodeColumns,
+    EPISODE,
     ReportContents,
     ReportTask,
     ReportVideo,
+    Verdict,
 )
 
 _FEW = Bootstrap(resamples=50)
 
 # Markup, quotes, what ends a script, a comment and a template, a mark that turns the
-# direction of writing, line ends that JSON allows and JavaScript did not, a formula for
-# matplotlib, and a name that never ends.
+# direction of writing, line ends that JSON allows and JavaScript did not, a formula,
+# and a name that never ends.
 HOSTILE = (
     "<script>alert(1)</script>",
     "</script><script>alert(2)</script>",
@@ -38,66 +40,56 @@ HOSTILE = (
 )
 
 
-def columns(
+def task(
+    name: str,
     returns: Sequence[float],
     *,
     seeds: int = 1,
-    runs: Sequence[str] | None = None,
     failures: Mapping[int, str] | None = None,
-    videos: Mapping[int, Sequence[int]] | None = None,
-) -> EpisodeColumns:
-    """Return episodes of equally many in each run."""
+    score_range: tuple[float, float] | None = (0.0, 1000.0),
+    **changes: Any,
+) -> ReportTask:
+    """Return a task of equally many episodes of each seed, or of monitors (`runs`)."""
     count = len(returns)
     each = max(1, count // seeds)
-    outcome = np.full(count, 2, np.uint8)
-    rewards = np.array(returns, np.float64)
-    for index in failures or {}:
-        outcome[index] = 4
-        rewards[index] = np.nan
-    return EpisodeColumns(
-        run=np.arange(count) // each,
-        runs=runs,
-        episode=np.arange(count) % each,
-        total_reward=rewards,
-        length=np.arange(count) % 7 + 10,
-        end_time=1.7e9 + np.arange(count),
-        outcome=outcome,
-        success=np.full(count, -1, np.int8),
-        failures=failures or {},
-        videos=videos or {},
-    )
-
-
-def task(name: str, episodes: EpisodeColumns, **changes: Any) -> ReportTask:
-    """Return a task with those episodes; runs that have names are monitors."""
-    known = episodes.total_reward[np.isfinite(episodes.total_reward)]
-    summary = summarize_task(
-        name,
-        total_rewards=known,
-        runs=len(np.unique(episodes.run)),
-        failed=len(episodes.failures),
-        score_range=changes.pop("score_range", (0.0, 1000.0)),
-        bootstrap=_FEW,
-    )
+    episodes = np.zeros(count, EPISODE)
+    episodes["run"] = np.arange(count) // each
+    episodes["episode"] = np.arange(count) % each
+    episodes["total_reward"] = returns
+    episodes["length"] = np.arange(count) % 7 + 10
+    episodes["end_time"] = 1.7e9 + np.arange(count)
+    episodes["outcome"] = 2
+    episodes["success"] = -1
+    failed = list(failures or {})
+    episodes["outcome"][failed] = 4
+    episodes["total_reward"][failed] = np.nan
+    known = episodes["total_reward"]
     made = ReportTask(
         name=name,
         source="evaluation",
-        is_evaluation=episodes.runs is None,
-        summary=summary,
+        is_evaluation="runs" not in changes,
+        summary=summarize_task(
+            name,
+            total_rewards=known[np.isfinite(known)],
+            runs=len(np.unique(episodes["run"])),
+            failed=len(failed),
+            score_range=score_range,
+            bootstrap=_FEW,
+        ),
         episodes=episodes,
+        failures=failures or {},
         provenance=[("Policy", "random"), ("Selection rule", "best, median and worst")],
     )
     return replace(made, **changes)
 
 
-def video(task: int = 0, index: int | None = 0, **changes: Any) -> ReportVideo:
+def video(index: int | None = 0, **changes: Any) -> ReportVideo:
     """Return a video, whose file need not be there."""
     made = ReportVideo(
-        task=task,
+        path=Path("evaluation/a b.mp4"),
         index=index,
         file="videos/a b.mp4",
         poster="videos/a b.png",
-        name="a b.mp4",
         roles=("best",),
         height=48,
         width=64,
@@ -113,16 +105,57 @@ def contents(*tasks: ReportTask, **changes: Any) -> ReportContents:
     """Return a report of them, or of two tasks of five seeds."""
     if not tasks:
         tasks = (
-            task("dm_control/walker-walk", columns(_returns(900, 40), seeds=5)),
-            task("dm_control/cheetah-run", columns(_returns(600, 100), seeds=5)),
+            task("dm_control/walker-walk", _returns(900, 40), seeds=5),
+            task("dm_control/cheetah-run", _returns(600, 100), seeds=5),
         )
-    scores = {t.name: t.episodes.total_reward / 1000 for t in tasks}
-    finite = all(np.isfinite(s).all() and len(s) for s in scores.values())
-    across = {"evaluation": summarize_across(scores, bootstrap=_FEW)} if finite else {}
+    returns = {t.name: t.episodes["total_reward"] for t in tasks}
+    scales = dict.fromkeys(returns, (0.0, 1000.0))
+    finite = all(np.isfinite(s).all() and len(s) for s in returns.values())
+    told = summarize_across(returns, scales, bootstrap=_FEW)
+    across = {"evaluation": told} if finite else {}
     made = ReportContents(
-        title="An evaluation", tasks=tasks, across=across, bootstrap=_FEW
+        title="An evaluation", tasks=list(tasks), across=across, bootstrap=_FEW
     )
     return replace(made, **changes)
+
+
+def hostile_report() -> ReportContents:
+    """Return contents in which every text is one that means harm."""
+    tasks = [
+        task(
+            text,
+            [1.0, 2.0, 3.0],
+            source=text,
+            failures={1: text},
+            provenance=[(text, text), ("Selection rule", text)],
+            videos=[
+                video(
+                    path=Path(text),
+                    file=text,
+                    poster=text,
+                    camera=text,
+                    sha256=text,
+                    command=text,
+                    notes=[text],
+                )
+            ],
+            **({"runs": [text]} if i % 2 else {}),
+        )
+        for i, text in enumerate(HOSTILE)
+    ]
+    scores = AcrossTasks(
+        tasks=tuple(HOSTILE), left_out={text: text for text in HOSTILE}, iqm=0.5
+    )
+    return contents(
+        *tasks,
+        title=HOSTILE[0],
+        across=dict.fromkeys(HOSTILE, scores),
+        problems=list(HOSTILE),
+        verdicts=[
+            Verdict(source=text, passed=False, counts={text: 1}, level=text)
+            for text in HOSTILE
+        ],
+    )
 
 
 def _returns(mean: float, spread: float) -> list[float]:

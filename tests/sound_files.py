@@ -11,10 +11,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from result_files import write_journal, write_saved
 from trajectories_by_hand import INFIX, add_row, write_log
 
-from mjrec.formats.journal import JournalEntry, JournalWriter
-from mjrec.formats.manifest import Manifest, StatsFile, write_manifest, write_stats_file
 from mjrec.formats.monitor_directory import trajectory_prefix
 from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.spans import list_paths
@@ -28,23 +27,16 @@ SPHERE = '<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>'
 
 
 def manifest(directory: Path) -> Path:
-    path = directory / "openaigym.manifest.0.7.manifest.json"
-    write_manifest(path, Manifest("openaigym.s.stats.json", (), {"env_id": "A-v0"}))
-    return path
+    return write_saved(directory, "0.7", 3)
 
 
 def stats(directory: Path) -> Path:
-    path = directory / "openaigym.episode_batch.0.7.stats.json"
-    write_stats_file(path, StatsFile(1.0, (2.0,), (3,), (4.0,), ("t",)))
-    return path
+    write_saved(directory, "0.7", 3)
+    return directory / "openaigym.episode_batch.0.7.stats.json"
 
 
 def journal(directory: Path) -> Path:
-    path = directory / "openaigym.episodes.0.7.jsonl"
-    writer = JournalWriter(path)
-    writer.append(JournalEntry(0, 3, 4.0, "t", 1.0, 2.0, 7, None, True, False))
-    writer.close()
-    return path
+    return write_journal(directory, "0.7", 3)
 
 
 def metadata(directory: Path) -> Path:

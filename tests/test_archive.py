@@ -8,6 +8,7 @@ import io
 import json
 import os
 import tarfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -89,69 +90,58 @@ def test_a_hundred_videos_fit_and_no_more(tmp_path: Path) -> None:
     )
 
 
-def test_a_name_can_be_there_only_once(tmp_path: Path) -> None:
-    """For videos, for metadata, and for a file given as both."""
+# The names of videos and their metadata, of which the last is refused.
+NAMES = [
+    *((["a.mp4\n"], "'a.mp4\\n' is no name for a video"), (["a.mkv"], "'a.mkv' is no")),
+    (["ð.mp4"], "'ð.mp4' is no name for a video"),
+    (["a.mp4 a.json"], "'a.json' is no name for metadata"),
+    (["a.mp4 manifest.json"], "'manifest.json' is no name for metadata"),
+    (["b.meta.json a.meta.json"], "'b.meta.json' is the name of metadata"),
+    (["manifest.json"], "the archive's own list"),
+    (["Manifest.json"], "the archive's own list"),
+    # In gym's order: pair by pair, and in each presence, doubles, names.
+    (["-"], "There is no video"),
+    (["a.mp4 -"], "There is no metadata"),
+    (["b+c.mp4", "-"], "no name for a video"),
+    (["-", "b+c.mp4"], "There is no video"),
+    (["a.mp4", "other/a.mp4"], "'a.mp4' is there twice (the second time as "),
+    (["a.mp4", "b.mp4 other/a.meta.json"], "'a.meta.json' is there twice"),
+    (["b.meta.json b.meta.json"], "'b.meta.json' is there twice"),
+]
+
+
+@pytest.mark.parametrize(("names", "reason"), NAMES)
+def test_names_differ_are_plain_and_say_what_they_are(
+    tmp_path: Path, names: list[str], reason: str
+) -> None:
+    """ASCII letters, digits and three signs; nothing after the ending."""
     (tmp_path / "other").mkdir()
-    first, other = make(tmp_path, "a"), make(tmp_path / "other", "a")
-    unique = make(tmp_path, "b")
-    assert f"'a.mp4' is there twice (the second time as {other[0]})" in refusal(
-        [first, other]
-    )
-    assert f"'a.meta.json' is there twice (the second time as {other[1]})" in refusal(
-        [first, (unique[0], other[1])]
-    )
-    assert "'b.meta.json' is there twice" in refusal([(unique[1], unique[1])])
-    assert "'a.meta.json' is there twice" in refusal([first, (first[1], unique[1])])
+    pairs = []
+    for each in names:
+        video, _, metadata = each.partition(" ")
+        pair = tmp_path / video, tmp_path / (metadata or "a.meta.json")
+        pairs.append(pair)
+        for path in pair:
+            if path.name != "-":
+                path.touch()
+    assert reason in refusal(pairs)
 
 
 @pytest.mark.parametrize(
-    ("video", "metadata", "reason"),
+    "put",
     [
-        *(
-            (name, "a.meta.json", f"{name!r} is no name for a video")
-            for name in ("a.mp4\n", "a.mkv", "ð.mp4")
-        ),
-        *(
-            ("a.mp4", name, f"{name!r} is no name for metadata")
-            for name in ("a.meta.json\n", "a.json", "a b.meta.json", "manifest.json")
-        ),
-        ("b.meta.json", "a.meta.json", "'b.meta.json' is the name of metadata"),
-        ("manifest.json", "a.meta.json", "the archive's own list"),
-        ("Manifest.json", "a.meta.json", "the archive's own list"),
+        Path.mkdir,
+        os.mkfifo,
+        lambda path: path.symlink_to("a.mp4"),
+        lambda path: path.symlink_to("missing"),
     ],
 )
-def test_names_are_plain_and_say_what_they_are(
-    tmp_path: Path, video: str, metadata: str, reason: str
+@pytest.mark.parametrize("name", ["x.mp4", "x.meta.json"])
+def test_only_regular_files_go_in(
+    tmp_path: Path, put: Callable[[Path], None], name: str
 ) -> None:
-    """ASCII letters, digits and three signs; nothing after the ending."""
-    first, second = make(tmp_path, "x")
-    pair = first.rename(tmp_path / video), second.rename(tmp_path / metadata)
-    assert reason in refusal([pair])
-
-
-def test_only_regular_files_go_in(tmp_path: Path) -> None:
     """No directory, no link, whole or broken, and no pipe, on either place."""
     video, metadata = make(tmp_path, "a")
-    directory, link, broken, pipe = (
-        tmp_path / f"{kind}.mp4" for kind in ("directory", "link", "broken", "pipe")
-    )
-    directory.mkdir()
-    link.symlink_to(video)
-    broken.symlink_to(tmp_path / "missing")
-    os.mkfifo(pipe)
-    for path in (directory, link, broken, pipe):
-        assert refusal([(path, metadata)]).startswith(f"{path} is a link, a directory")
-    (tmp_path / "link.meta.json").symlink_to(metadata)
-    assert "link.meta.json is a link" in refusal([(video, tmp_path / "link.meta.json")])
-
-
-def test_checks_come_in_gyms_order(tmp_path: Path) -> None:
-    """Pair by pair, and within a pair presence, then doubles, then names."""
-    good, bad = make(tmp_path, "a"), make(tmp_path, "b c")
-    missing = (tmp_path / "x.mp4", tmp_path / "x.meta.json")
-    assert refusal([missing]).startswith(f"There is no video {missing[0]}.")
-    assert "no name for a video" in refusal([bad, missing])
-    assert "There is no video" in refusal([missing, bad])
-    assert "There is no metadata" in refusal([(bad[0], missing[1])])
-    assert "twice" in refusal([good, (good[0], bad[1])])
-    assert "no name for a video" in refusal([bad])
+    put(tmp_path / name)
+    pair = (tmp_path / name, metadata) if "mp4" in name else (video, tmp_path / name)
+    assert refusal([pair]).startswith(f"{tmp_path / name} is a link, a directory")

@@ -412,7 +412,7 @@ def test_it_ends_with_its_parent(tmp_path: Path) -> None:
     log = write_log(tmp_path, model={"mjb": "none"})
     code = (
         "import os, time\nif os.fork() == 0:\n    time.sleep(60)\n    os._exit(0)\n"
-        "print(background._process.child.pid, flush=True)\ntime.sleep(60)\n"
+        "print(background._child.pid, flush=True)\ntime.sleep(60)\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM + code, str(tmp_path)],

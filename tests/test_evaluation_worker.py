@@ -22,7 +22,7 @@ from gymnasium.envs.registration import registry
 import mjrec
 from conftest import Corridor
 from mjrec.environments.episode_seeds import episode_seeds
-from mjrec.environments.options import EnvironmentOptions
+from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.evaluation.chunk_results import read_chunk
 from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.episode_results import EpisodeResult

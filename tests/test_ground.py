@@ -17,75 +17,51 @@ import mjrec
 from mjrec import ExistingRecordings, InvalidArgument, InvalidFrame, UnknownName
 from mjrec.atomic_files import replacing, write_text
 from mjrec.formats.monitor_directory import infix_of
-from mjrec.frames import check_frame, check_size, pad_to_even
+from mjrec.frames import check_frame, check_size, grid_frame, grid_shape
 from mjrec.json_text import dumps, float_from_json, loads
 
-
-def test_infinity_is_valid_json_that_reads_as_infinity() -> None:
-    """A strict parser accepts it, and strings that say so stay strings."""
-    text = dumps([math.inf, -math.inf, "Infinity", {"-Infinity": 1}])
-    assert json.loads(text, parse_constant=pytest.fail) == [
-        math.inf,
-        -math.inf,
-        "Infinity",
-        {"-Infinity": 1},
-    ]
-
-
-def test_nan_is_null() -> None:
-    """And null is NaN again."""
-    assert dumps([math.nan, np.float32("nan")]) == "[null, null]"
-    assert math.isnan(float_from_json(None))
-    assert loads("[NaN]") != [1.0]  # gym's own token, accepted
+LOOP: list[Any] = []
+LOOP.append(LOOP)
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
     [
         (np.float32(0.5), "0.5"),
-        (np.int8(3), "3"),
         (np.uint64(2**63), str(2**63)),
         (np.bool_(True), "true"),
         (np.arange(3), "[0, 1, 2]"),
         ((1, 2), "[1, 2]"),
-        ({1: 2}, '{"1": 2}'),
+        ({1: 2, None: np.int64(3)}, '{"1": 2, "null": 3}'),
         (0.1, "0.1"),
+        ([math.nan, np.float32("nan")], "[null, null]"),
+        # What JSON reads as infinity; strings that say so stay strings.
+        ([math.inf, -math.inf, "Infinity"], '[1e999, -1e999, "Infinity"]'),
+        # What is noted for people never stops a run.
+        ({"a": Path("x")}, '{"a": {"repr": "PosixPath(\'x\')"}}'),
+        (LOOP, '[{"repr": "[[...]]"}]'),
     ],
 )
-def test_numpy_is_written_as_numbers(value: Any, text: str) -> None:
-    """Scalars of every kind, arrays and tuples."""
+def test_json_is_what_every_reader_accepts(value: Any, text: str) -> None:
+    """NumPy's numbers, NaN and infinity, and what JSON does not know."""
     assert dumps(value) == text
+    json.loads(text, parse_constant=pytest.fail)
 
 
-def test_unknown_objects_are_written_as_what_they_look_like() -> None:
-    """What is noted for people never stops a run."""
-    assert loads(dumps({"a": Path("x")})) == {"a": {"repr": repr(Path("x"))}}
+def test_nan_comes_back() -> None:
+    """Also from gym's own token."""
+    assert math.isnan(float_from_json(None))
+    assert repr(loads("[NaN, -Infinity, 1e999]")) == "[nan, -inf, inf]"
 
 
-def test_file_appears_whole(tmp_path: Path) -> None:
-    """The name is there only when the block has ended."""
+def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+    """A failure leaves the old one, and no temporary one."""
     path = tmp_path / "a.txt"
     with replacing(path) as temporary:
         temporary.write_text("half")
         assert not path.exists()
         assert re.fullmatch(r"\.a\.txt\.[0-9a-f]{8}\.part", temporary.name)
         assert temporary.parent == tmp_path
-    assert path.read_text() == "half"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_unfinished_file_of_a_hidden_one_is_known_as_a_monitors(tmp_path: Path) -> None:
-    """Or nobody would remove what a killed process has left of it."""
-    note = tmp_path / ".openaigym.video.0.7.video000015.mp4.note.part"
-    with replacing(note) as temporary:
-        assert infix_of(temporary.name) == "0.7"
-        temporary.touch()
-    assert note.exists()
-
-
-def test_failure_leaves_the_old_file(tmp_path: Path) -> None:
-    """And no temporary one."""
-    path = tmp_path / "a.txt"
     write_text(path, "old")
 
     def fail() -> None:
@@ -99,26 +75,20 @@ def test_failure_leaves_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_odd_sides_are_padded_by_their_edge() -> None:
-    """Nothing is rescaled: every pixel stays where it was."""
-    frame = np.random.default_rng(0).integers(0, 255, (3, 5, 3)).astype(np.uint8)
-    padded = pad_to_even(frame)
-    assert padded.shape == (4, 6, 3)
-    assert (padded[:3, :5] == frame).all()
-    assert (padded[3, :5] == frame[2]).all()
-    assert (padded[:3, 5] == frame[:, 4]).all()
-    assert pad_to_even(padded) is padded
+def test_unfinished_file_of_a_hidden_one_is_known_as_a_monitors(tmp_path: Path) -> None:
+    """Or nobody would remove what a killed process has left of it."""
+    note = tmp_path / ".openaigym.video.0.7.video000015.mp4.note.part"
+    with replacing(note) as temporary:
+        assert infix_of(temporary.name) == "0.7"
+        temporary.touch()
+    assert note.exists()
 
 
 @pytest.mark.parametrize(
     "bad",
     [
-        None,
-        [[[0, 0, 0]]],
-        np.zeros((2, 2, 3)),
-        np.zeros((2, 2), np.uint8),
-        np.zeros((2, 2, 4), np.uint8),
-        np.zeros((0, 2, 3), np.uint8),
+        *(None, [[[0, 0, 0]]], np.zeros((2, 2, 3)), np.zeros((2, 2), np.uint8)),
+        *(np.zeros((2, 2, 4), np.uint8), np.zeros((0, 2, 3), np.uint8)),
     ],
 )
 def test_what_is_no_frame_is_said(bad: Any) -> None:
@@ -134,6 +104,23 @@ def test_impossible_sizes_are_an_error(size: tuple[Any, Any]) -> None:
         check_size(*size)
 
 
+def plain(value: int, *, height: int = 2, width: int = 3) -> Any:
+    return np.full((height, width, 3), value, np.uint8)
+
+
+def test_a_grid_is_as_square_as_can_be() -> None:
+    """Every frame is in its place, row by row; nothing is scaled to fit."""
+    for count in range(1, 40):
+        rows, columns = grid_shape(count)
+        assert rows * columns >= count > (rows - 1) * columns
+        assert rows <= columns <= rows + 1
+    grid = grid_frame([plain(value) for value in (10, 20, 30)])
+    assert grid[::2, ::3, 0].tolist() == [[10, 20], [30, 0]]
+    assert (grid == grid[::2, ::3].repeat(2, axis=0).repeat(3, axis=1)).all()
+    with pytest.raises(InvalidArgument, match="3x2, 4x5"):
+        grid_frame([plain(1), plain(2, height=5, width=4)])
+
+
 def test_unknown_name_lists_what_there_is() -> None:
     """A few names are all listed; of many, those that look alike."""
     assert "There are: side, top." in str(UnknownName("camera", "sid", ["side", "top"]))
@@ -141,6 +128,9 @@ def test_unknown_name_lists_what_there_is() -> None:
     assert "Names like it: Env-v3" in str(UnknownName("environment", "env-v3", many))
     assert "none with a like name" in str(UnknownName("environment", "zzz", many))
     assert "There are none." in str(UnknownName("camera", "a", []))
+    existing = str(ExistingRecordings(Path("d"), [f"file{n}" for n in range(8)]))
+    assert "file4 and 3 more" in existing
+    assert "file5" not in existing
 
 
 ERRORS = [
@@ -163,17 +153,3 @@ def test_errors_come_home_from_other_processes(error: mjrec.Error) -> None:
     assert type(again) is type(error)
     assert str(again) == str(error)
     assert vars(again) == vars(error)
-
-
-def test_value_that_holds_itself_is_written() -> None:
-    """As what Python shows of it."""
-    loop: list[Any] = []
-    loop.append(loop)
-    assert loads(dumps(loop)) == [{"repr": "[[...]]"}]
-
-
-def test_existing_recordings_lists_five_at_most() -> None:
-    """And says how many more there are."""
-    error = ExistingRecordings(Path("d"), [f"file{n}" for n in range(8)])
-    assert "file4 and 3 more" in str(error)
-    assert "file5" not in str(error)

@@ -49,7 +49,6 @@ CONFINED = {
     "h5py": {"formats", "evidence.packing.identity_traces"},
     "tyro": {"commands"},
     "scipy": {"evaluation"},
-    "matplotlib": {"reporting"},
     "rich": {"commands", "monitors"},
     "ray": {"engines.ray"},
     "submitit": {"engines.slurm_arrays", "engines.slurm_cluster"},

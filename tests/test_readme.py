@@ -33,8 +33,15 @@ def shell_lines() -> list[str]:
 
 
 def run(*command: str, cwd: Path) -> str:
+    """Run a command that finds `mjrec` where this Python has it."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     done = subprocess.run(
-        command, cwd=cwd, capture_output=True, text=True, check=False, timeout=280
+        command,
+        cwd=cwd,
+        env={**os.environ, "PATH": path},
+        capture_output=True,
+        text=True,
+        timeout=280,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -165,7 +172,7 @@ def test_example_runs(example: Path, tmp_path: Path) -> None:
 def test_command_line_example_runs(tmp_path: Path) -> None:
     """It keeps as many videos as it says, and lists its episodes."""
     script = ROOT / "examples" / "command_line" / "evaluate.sh"
-    out = run_shell(str(script), str(tmp_path / "out"), cwd=tmp_path)
+    out = run(str(script), str(tmp_path / "out"), cwd=tmp_path)
     assert len(list((tmp_path / "out").glob("*.mp4"))) == 2
     assert out.count("truncated") == 6
     assert "command_line/" in (ROOT / "examples" / "README.md").read_text()
@@ -179,7 +186,7 @@ def test_workflow_records_and_uploads(tmp_path: Path) -> None:
     [job] = workflow["jobs"].values()
     commands = [step["run"] for step in job["steps"] if "run" in step]
     for command in [text for text in commands if text.startswith("mjrec")]:
-        run_shell("sh", "-ec", command, cwd=tmp_path)
+        run("sh", "-ec", command, cwd=tmp_path)
     [upload] = [s for s in job["steps"] if "upload-artifact" in s.get("uses", "")]
     uploaded = tmp_path / upload["with"]["path"]
     assert len(list(uploaded.rglob("*.mp4"))) == 1
@@ -191,19 +198,3 @@ def test_workflow_records_and_uploads(tmp_path: Path) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     for extra in re.findall(r"mjrec\[([^]]+)\]", extras)[0].split(","):
         assert extra in project["optional-dependencies"]
-
-
-def run_shell(*command: str, cwd: Path) -> str:
-    """Run a command that finds `mjrec` where this Python has it."""
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    done = subprocess.run(
-        command,
-        cwd=cwd,
-        env={**os.environ, "PATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=280,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout

@@ -33,6 +33,7 @@ import mjrec
 from mjrec.commands import main
 from mjrec.formats.locks import Lock, is_locked, try_lock
 from mjrec.formats.monitor_directory import (
+    Infix,
     lock_name,
     states_name,
     video_lock_name,
@@ -167,12 +168,12 @@ def test_a_live_video_is_whole_up_to_the_kill(cut: Path) -> None:
     }
     texts = [path.read_text().splitlines() for path in sorted(cut.glob("*.framehash"))]
     assert texts[2] == texts[1][: 9 + 8]
+    check_manifest(cut)
     assert_in_order(cut)
 
 
-def test_the_manifest_lists_what_was_recovered(cut: Path) -> None:
-    """With all that is known of the run, its provenance too."""
-    assert mjrec.recover(cut).failures == ()
+def check_manifest(cut: Path) -> None:
+    """All that is known of the run is there, its provenance too."""
     assert stats_of(cut)["episode_lengths"] == [12, 12]
     ends = [entry["end_time"] for entry in journal_of(cut)]
     assert stats_of(cut)["timestamps"] == ends
@@ -367,29 +368,6 @@ def test_a_closed_monitors_logs_become_trajectories(
     assert_in_order(tmp_path)
 
 
-@pytest.mark.thorough
-def test_a_renderer_that_was_killed_leaves_its_video_pending(tmp_path: Path) -> None:
-    """Recovering removes what it had begun, and rendering does it anew."""
-    kill("env = cheetah()\nrun(env)\nenv.close()\ndie()", tmp_path)
-    command = [sys.executable, "-m", "mjrec", "render", str(tmp_path), "--workers=1"]
-    manifest = manifest_of(tmp_path)
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as renderer:
-        while not list(tmp_path.glob(".*.mp4.*.part")):
-            assert renderer.poll() is None
-        renderer.kill()
-    # An encoder that was being started holds its locks for a moment more.
-    wait_until(
-        lambda: (
-            not mjrec.recover(tmp_path).failures and not list(tmp_path.glob(".*.part"))
-        )
-    )
-    assert manifest_of(tmp_path) == manifest
-    assert len(manifest["mjrec"]["pending"]) == 1
-    assert main(["render", str(tmp_path)]) == 0
-    assert len(frames_in(tmp_path, 0)) == 13
-    assert manifest_of(tmp_path)["mjrec"]["pending"] == []
-
-
 # --- journal and logs ----------------------------------------------------------------
 
 
@@ -413,27 +391,21 @@ def test_a_complete_episode_that_the_journal_lacks_is_added(tmp_path: Path) -> N
     """The machine failed before the line was on the disk; its trajectory has it all."""
     ending = {"complete": True, "terminated": True, "truncated": False, "length": 4}
     facts = {**ending, "reward": 2.5, "start_time": 10.0, "end_time": 12.0}
-    for number in (0, 1):
-        write_log(tmp_path, number, ended=False, **facts)
-    journal = write_journal(tmp_path, str(INFIX), entry(0, length=4))
+    # Of this the journal has the line, and the log not the last words.
+    write_log(tmp_path, 0, steps=4, ended=False)
+    write_log(tmp_path, 1, ended=False, **facts)
+    journal = write_journal(tmp_path, str(INFIX), entry(0, length=4, reward=2.5))
     with journal.open("ab") as file:
         file.write(b'{"episode_id": 1, "length": 4, "rew')
     assert mjrec.recover(tmp_path).failures == ()
     assert [e.episode_id for e in mjrec.iter_episodes(tmp_path)] == [0, 1]
     assert stats_of(tmp_path)["episode_lengths"] == [4, 4]
+    first = mjrec.load_trajectory(min(tmp_path.glob("*.h5"))).facts
+    assert (first["complete"], first["terminated"], first["reward"]) == (
+        *(True, True, 2.5),
+    )
+    assert "reason" not in first
     assert_in_order(tmp_path)
-
-
-def test_a_log_whose_episode_is_in_the_journal_is_complete(tmp_path: Path) -> None:
-    """All its rows are there, and its process was killed before the last words."""
-    write_log(tmp_path, 0, steps=4, ended=False)
-    write_journal(tmp_path, str(INFIX), entry(0, length=4, reward=2.5))
-    mjrec.recover(tmp_path)
-    [path] = tmp_path.glob("*.h5")
-    facts = mjrec.load_trajectory(path).facts
-    ending = (facts["complete"], facts["terminated"], facts["reward"])
-    assert ending == (True, True, 2.5)
-    assert "reason" not in facts
 
 
 def test_an_unreadable_list_stays_and_is_reported(tmp_path: Path) -> None:
@@ -501,27 +473,21 @@ def test_unfinished_files_of_a_dead_renderer_are_removed(tmp_path: Path) -> None
     renderer = try_lock(tmp_path / video_lock_name(INFIX, 1), "")
     assert renderer is not None
     drawn = Lock(side, "")
+    # This may be an open monitor's.
+    model = tmp_path / ".openaigym.model.0123456789abcdef.zip.0123abcd.part"
+    model.touch()
+    monitor = Lock(tmp_path / lock_name(Infix(1, "7")), "")
     recovery = mjrec.recover(tmp_path, timeout=0)
     assert sorted(file.name for file in recovery.files) == [p.name for p in dead]
     assert not any(part.exists() for part in dead)
-    assert all(part.exists() for part in [*living, side])
+    assert all(part.exists() for part in [*living, side, model])
     renderer.release()
     drawn.let_go()
-    mjrec.recover(tmp_path)
-    assert not any(part.exists() for part in [*living, side])
-    assert_in_order(tmp_path)
-
-
-def test_unfinished_models_stay_while_a_monitor_records(tmp_path: Path) -> None:
-    """They may be its own."""
-    part = tmp_path / ".openaigym.model.0123456789abcdef.zip.0123abcd.part"
-    part.touch()
-    lock = Lock(tmp_path / lock_name(INFIX), "")
-    assert not mjrec.recover(tmp_path)
     # As after a kill; it had recorded nothing.
-    lock.let_go()
-    assert mjrec.recover(tmp_path)
-    assert not list(tmp_path.iterdir())
+    monitor.let_go()
+    mjrec.recover(tmp_path)
+    assert not any(part.exists() for part in [*living, side, model])
+    assert_in_order(tmp_path)
 
 
 def test_two_recoveries_at_once_do_the_work_once(cut: Path) -> None:
@@ -537,8 +503,13 @@ def test_two_recoveries_at_once_do_the_work_once(cut: Path) -> None:
     assert_in_order(cut)
 
 
-def test_a_directory_that_cannot_be_written_to_is_one_error(cut: Path) -> None:
-    """Nothing is half done."""
+def test_what_cannot_be_recovered_is_one_error(cut: Path) -> None:
+    """No directory, one that cannot be written to, no timeout; nothing is half done."""
+    with pytest.raises(mjrec.InvalidArgument, match="no directory"):
+        mjrec.recover(cut / "missing")
+    for wrong in (-1, float("nan"), "5", True):
+        with pytest.raises(mjrec.InvalidArgument, match="timeout"):
+            mjrec.recover(cut, timeout=wrong)  # type: ignore[arg-type]  # as said
     before = sorted(cut.iterdir())
     # For root, whom no permission stops, a directory stands where the lock belongs.
     blocker = cut / ".openaigym.recover.lock"
@@ -547,15 +518,6 @@ def test_a_directory_that_cannot_be_written_to_is_one_error(cut: Path) -> None:
         mjrec.recover(cut)
     blocker.rmdir()
     assert sorted(cut.iterdir()) == before
-
-
-def test_arguments_are_checked(tmp_path: Path) -> None:
-    """There must be a directory, and a timeout that is a number."""
-    with pytest.raises(mjrec.InvalidArgument, match="no directory"):
-        mjrec.recover(tmp_path / "missing")
-    for wrong in (-1, float("nan"), "5", True):
-        with pytest.raises(mjrec.InvalidArgument, match="timeout"):
-            mjrec.recover(tmp_path, timeout=wrong)  # type: ignore[arg-type]  # as said
 
 
 def test_gyms_own_directories_are_left_alone(tmp_path: Path) -> None:

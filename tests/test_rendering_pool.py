@@ -36,7 +36,7 @@ from mjrec.formats.locks import try_lock
 from mjrec.formats.monitor_directory import render_lock_name
 from mjrec.gl import Probe, choice
 from mjrec.rendering import pool as pool_module
-from mjrec.rendering.pool import SharedPool, WorkerPool
+from mjrec.rendering.pool import WorkerPool
 from mjrec.rendering.views import View
 
 
@@ -303,7 +303,7 @@ def test_a_worker_ends_with_its_input_in_mid_drawing(
     frames = one.frames(ride.path, [0] * 1000, View(height=1000, width=1000))
     child = one._workers[0].child
     assert child is not None
-    child.orders.close()
+    child._orders.close()
     wait_for_end(child.pid)
     del frames
 
@@ -490,8 +490,8 @@ HOLDER = """
 import pathlib, sys
 from mjrec.rendering import pool
 pool.usable_cpus = lambda: 2
-shared = pool.SharedPool(pathlib.Path(sys.argv[1]), workers=None)
-print(shared.at_work().limit, flush=True)
+shared = pool.WorkerPool(None, directory=pathlib.Path(sys.argv[1]))
+print(shared._free(), flush=True)
 sys.stdin.read()
 """
 
@@ -514,10 +514,12 @@ def test_the_cpus_of_another_process_are_waited_for(tmp_path: Path) -> None:
         assert holder.stdout.readline() == b"2\n"
         threading.Timer(0.3, holder.kill).start()
         began = time.monotonic()
-        shared = SharedPool(tmp_path, workers=None)
-        shared.at_work()
+        shared = WorkerPool(None, directory=tmp_path)
+        with pytest.raises(UnreadableFile):
+            shared.frames(tmp_path / "lost.h5", [0])
     assert time.monotonic() - began >= 0.3
-    assert shared.at_work().limit == 2
+    assert len(pids(shared)) == 1
+    shared.close()
 
 
 @pytest.mark.usefixtures("two_cpus")
@@ -525,16 +527,16 @@ def test_workers_stay_while_cpus_come_and_go(tmp_path: Path) -> None:
     """Others take one between two videos; nobody starts the workers anew."""
     ride = record(tmp_path)
     before = children()
-    shared = SharedPool(tmp_path, workers=None)
-    list(shared.at_work().frames(ride.path, range(4)))
+    shared = WorkerPool(None, directory=tmp_path)
+    list(shared.frames(ride.path, range(4)))
     both = children() - before
     assert len(both) == 2
     shared.rest()
     other = try_lock(tmp_path / render_lock_name(0), "1\n")
     assert other is not None
-    alone = list(shared.at_work().frames(ride.path, range(4)))
+    alone = list(shared.frames(ride.path, range(4)))
     other.release()
-    together = list(shared.at_work().frames(ride.path, range(4)))
+    together = list(shared.frames(ride.path, range(4)))
     assert children() - before == both
     assert np.array_equal(alone, together)
     shared.close()

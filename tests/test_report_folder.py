@@ -6,7 +6,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
-import json
 import re
 import shutil
 from pathlib import Path
@@ -18,10 +17,10 @@ from PIL import Image
 
 import mjrec
 from mjrec.errors import DirectoryNotWritable, InvalidArgument
-from mjrec.reporting.media_files import ReportProgress
-from mjrec.reporting.posters import poster_of
+from mjrec.reporting.gathering import gather
+from mjrec.reporting.media import ReportProgress, posters_of
 from mjrec.reporting.report_folder import write_report
-from report_recordings import GYM, entry, record, write_evaluation, write_journal
+from report_recordings import GYM, entry, record, write_journal
 
 
 @pytest.fixture
@@ -45,10 +44,18 @@ def sha256(path: Path) -> str:
 def test_a_report_is_a_page_with_copies_beside_it(
     recordings: Path, tmp_path: Path
 ) -> None:
-    """It names them, and outlives the recordings; their names are made here."""
+    """It names them, and outlives the recordings; each step is told."""
     hashes = [sha256(path) for path in sorted(recordings.glob("*.mp4"))]
-    page = write_report(recordings, tmp_path / "report")
+    told: list[ReportProgress] = []
+    page = write_report(
+        recordings, tmp_path / "report", title="Mine", on_progress=told.append
+    )
     assert page == tmp_path / "report" / "index.html"
+    assert told == [
+        ReportProgress(what, done, 2)
+        for what in ("posters", "videos")
+        for done in (1, 2)
+    ]
     shutil.rmtree(recordings)
     assert names(page.parent) == [
         "index.html",
@@ -61,31 +68,34 @@ def test_a_report_is_a_page_with_copies_beside_it(
     assert [sha256(path) for path in copies] == hashes
     assert all(path.stat().st_nlink == 1 for path in copies)
     text = page.read_text()
-    for name in names(page.parent)[1:]:
-        assert name in text
-    assert all(each in text for each in hashes)
+    for words in (*names(page.parent)[1:], *hashes, "<title>Mine</title>"):
+        assert words in text
 
 
-def test_posters_show_the_middle(tmp_path: Path) -> None:
+def test_posters_show_the_middle(recordings: Path) -> None:
     """At most 640 pixels wide, with the colours of the video."""
-    video = tmp_path / "video.mp4"
-    with mjrec.VideoWriter(video, fps=10) as writer:
-        for colour in ((255, 0, 0), (20, 160, 90), (0, 0, 255)):
-            writer.write(np.full((400, 800, 3), colour, np.uint8))
-    poster = poster_of(video)
-    assert poster.seconds == pytest.approx(0.3)
-    assert poster.jpeg is not None
-    with Image.open(io.BytesIO(poster.jpeg)) as image:
-        assert image.format == "JPEG"
-        assert image.size == (640, 320)
-        np.testing.assert_allclose(np.asarray(image)[100, 100], (20, 160, 90), atol=4)
+    first, second = sorted(recordings.glob("*.mp4"))
+    for video, size in ((first, (400, 800)), (second, (48, 64))):
+        with mjrec.VideoWriter(video, fps=10) as writer:
+            for colour in ((255, 0, 0), (20, 160, 90), (0, 0, 255)):
+                writer.write(np.full((*size, 3), colour, np.uint8))
+    contents = gather(recordings)
+    sizes = []
+    for poster in posters_of(contents, lambda progress: None):
+        assert poster is not None
+        with Image.open(io.BytesIO(poster)) as image:
+            assert image.format == "JPEG"
+            sizes.append(image.size)
+            pixel = np.asarray(image)[20, 20]
+            np.testing.assert_allclose(pixel, (20, 160, 90), atol=4)
+    assert sizes == [(640, 320), (64, 48)]
 
 
-def test_a_video_that_cannot_be_decoded_has_no_poster(
+def test_a_video_that_is_none_is_named_and_the_rest_is_there(
     recordings: Path, tmp_path: Path
 ) -> None:
-    """It is copied, with a note that it was changed, and the rest is there."""
-    first, _ = sorted(recordings.glob("*.mp4"))
+    """One that was cut off is copied; a page, which a browser would open, is not."""
+    first, second = sorted(recordings.glob("*.mp4"))
     first.write_bytes(first.read_bytes()[:200])
     page = write_report(recordings, tmp_path / "report")
     assert "posters/0000-unknown-corridor.jpg" not in names(page.parent)
@@ -94,19 +104,12 @@ def test_a_video_that_cannot_be_decoded_has_no_poster(
     assert "There is no picture of a video" in text
     assert "not the file that its metadata describe" in text
     assert sha256(first) in text
-
-
-def test_what_is_called_a_video_and_is_none_is_left_out(
-    recordings: Path, tmp_path: Path
-) -> None:
-    """A page, say, which a browser would open."""
-    first, _ = sorted(recordings.glob("*.mp4"))
-    first.write_text("<html><script>alert(1)</script></html>")
+    second.write_text("<html><script>alert(1)</script></html>")
     page = write_report(recordings, tmp_path / "report")
     assert [n for n in names(page.parent) if n.startswith("videos")] == [
-        "videos/0001-unknown-corridor.mp4"
+        "videos/0000-unknown-corridor.mp4"
     ]
-    assert "is left out" in page.read_text()
+    assert f"The video {second} is left out" in page.read_text()
 
 
 def test_hostile_names_are_text_on_the_page_and_no_names_of_files(
@@ -127,41 +130,17 @@ def test_hostile_names_are_text_on_the_page_and_no_names_of_files(
     assert "<script>alert" not in page.read_text()
 
 
-def test_text_recordings_of_gym_are_copied(tmp_path: Path) -> None:
-    """All of its directories in one report."""
-    page = write_report(GYM / "0.9.6", tmp_path / "report")
-    copied = [name for name in names(page.parent) if name.startswith("videos")]
-    assert len(copied) == 2
-    assert all(name.endswith(".json") for name in copied)
-
-
-def test_an_evaluation_without_videos(tmp_path: Path) -> None:
-    """Its page is the only file."""
-    write_evaluation(tmp_path / "run", ["a/x", "b/y"])
-    page = write_report(tmp_path / "run", tmp_path / "report", title="Of two tasks")
-    assert names(page.parent) == ["index.html"]
-    text = page.read_text()
-    assert "<title>Of two tasks</title>" in text
-    assert "PolicyError: it gave " in text
-    assert "<b>NaN" not in text
-
-
-def test_nothing_but_damaged_files(tmp_path: Path) -> None:
-    """There is a page all the same, which names them."""
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "openaigym.manifest.1.b.manifest.json").write_text("{")
-    page = write_report(tmp_path / "run", tmp_path / "report")
-    assert "openaigym.manifest.1.b.manifest.json" in page.read_text()
-
-
 def test_a_report_replaces_a_report(recordings: Path, tmp_path: Path) -> None:
     """And an empty folder; nothing of the older one, or of the making, is left."""
     (tmp_path / "report").mkdir()
     write_report(recordings, tmp_path / "report")
     run = tmp_path / "run"
-    write_journal(run, "0.a", "X-v0", [entry(0)])
-    write_report(run, tmp_path / "report")
+    run.mkdir()
+    # Nothing but a damaged file: there is a page all the same, which names it.
+    (run / "openaigym.manifest.1.b.manifest.json").write_text("{")
+    page = write_report(run, tmp_path / "report")
     assert names(tmp_path / "report") == ["index.html"]
+    assert "openaigym.manifest.1.b.manifest.json" in page.read_text()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report", "run"]
 
 
@@ -207,34 +186,16 @@ def test_a_failed_report_leaves_what_was_there(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recordings", "report"]
 
 
-def test_progress_is_told(recordings: Path, tmp_path: Path) -> None:
-    """Of each poster, then of each video."""
-    told: list[ReportProgress] = []
-    write_report(recordings, tmp_path / "report", on_progress=told.append)
-    assert told == [
-        ReportProgress("posters", 1, 2),
-        ReportProgress("posters", 2, 2),
-        ReportProgress("videos", 1, 2),
-        ReportProgress("videos", 2, 2),
-    ]
-
-
 def test_a_single_file_has_everything_in_it(recordings: Path, tmp_path: Path) -> None:
-    """Pictures and videos too, byte for byte."""
-    page = write_report(recordings, tmp_path / "one.html", single_file=True)
-    assert page == tmp_path / "one.html"
-    text = page.read_text()
-    for path in recordings.glob("*.mp4"):
-        assert base64.b64encode(path.read_bytes()).decode() in text
-    assert text.count("data:video/mp4;base64,") == 2
-    assert len(re.findall("<img[^>]* src=.data:image/jpeg;base64,", text)) == 2
-    assert write_report(recordings, page, single_file=True) == page
-
-
-def test_a_single_file_may_be_in_a_folder(recordings: Path, tmp_path: Path) -> None:
-    """As any report."""
-    page = write_report(recordings, tmp_path / "report", single_file=True)
-    assert names(page.parent) == ["index.html"]
+    """Byte for byte; it is replaced as a folder is, and may be in one."""
+    for target in (tmp_path / "one.html", tmp_path / "one.html", tmp_path / "folder"):
+        page = write_report(recordings, target, single_file=True)
+        text = page.read_text()
+        for path in recordings.glob("*.mp4"):
+            assert base64.b64encode(path.read_bytes()).decode() in text
+        assert text.count("data:video/mp4;base64,") == 2
+        assert len(re.findall("<img[^>]* src=.data:image/jpeg;base64,", text)) == 2
+    assert names(tmp_path / "folder") == ["index.html"]
 
 
 def test_a_single_file_is_no_larger_than_allowed(
@@ -284,13 +245,3 @@ def test_where_nothing_can_be_written(recordings: Path, tmp_path: Path) -> None:
         write_report(recordings, tmp_path / "file" / "report")
     with pytest.raises(InvalidArgument, match="is a file"):
         write_report(recordings, tmp_path / "file")
-
-
-def test_the_page_says_what_was_verified(recordings: Path, tmp_path: Path) -> None:
-    """Where there is a verdict."""
-    counts = {"pass": 31, "fail": 0, "not checkable": 2}
-    said = {"path": "run", "level": "pixels", "passed": True, "counts": counts}
-    path = tmp_path / "said.json"
-    path.write_text(json.dumps(said))
-    page = write_report(recordings, tmp_path / "report", verifications=[path])
-    assert "said.json" in page.read_text()

@@ -4,69 +4,34 @@
 from __future__ import annotations
 
 import json
-import shutil
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from result_files import ENV_INFO, write_journal, write_saved
+from result_files import ENV_INFO, entry, write_journal, write_saved
 
 import mjrec
 from mjrec.errors import UnreadableFile
 
-
-def killed(directory: Path, code: str, options: str) -> Path:
-    """Record in a process that kills itself after `code`, which has `env`, `play`."""
-    script = (
-        "import os, sys\n"
-        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        "import mjrec\n"
-        "from conftest import Corridor, run_episodes as play\n"
-        f"env = mjrec.Monitor(Corridor(), {str(directory)!r}, {options})\n"
-        f"{code}\n"
-        "os.kill(os.getpid(), 9)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], check=False, capture_output=True, text=True
-    )
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    return directory
-
-
-@pytest.fixture(scope="module")
-def killed_early(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A monitor died in its fourth episode, without manifest."""
-    return killed(
-        tmp_path_factory.mktemp("early"),
-        "play(env, 2, seed=5); env.set_monitor_mode('evaluation'); play(env, 1)\n"
-        "env.reset(); env.step(0)",
-        "video_callable=False",
-    )
-
-
-@pytest.fixture(scope="module")
-def killed_late(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A monitor died after its fifth episode; its manifest has four."""
-    return killed(
-        tmp_path_factory.mktemp("late"),
-        "play(env, 5)",
-        "write_upon_reset=True, video_callable=[0, 4].__contains__",
-    )
+ENTRIES = [entry(number, chosen=number in (0, 4)) for number in range(5)]
 
 
 @pytest.fixture
-def early(killed_early: Path, tmp_path: Path) -> Path:
-    """A copy of `killed_early`."""
-    return Path(shutil.copytree(killed_early, tmp_path / "early"))
-
-
-@pytest.fixture
-def late(killed_late: Path, tmp_path: Path) -> Path:
-    """A copy of `killed_late`."""
-    return Path(shutil.copytree(killed_late, tmp_path / "late"))
+def late(tmp_path: Path) -> Path:
+    """A monitor died after its fifth episode; its manifest has four, and one video."""
+    videos = [
+        tuple(
+            f"openaigym.video.0.7.video00000{n}.{end}" for end in ("mp4", "meta.json")
+        )
+        for n in (0, 4)
+    ]
+    for mp4, metadata in videos:
+        (tmp_path / mp4).touch()
+        (tmp_path / metadata).write_text("{}")
+    details = {"next_episode_id": 4}
+    write_saved(tmp_path, "0.7", *range(4), videos=videos[:1], details=details)
+    write_journal(tmp_path, "0.7", *ENTRIES, run={"env_info": ENV_INFO})
+    return tmp_path
 
 
 def load(directory: Path) -> dict[str, Any]:
@@ -86,39 +51,39 @@ def video(directory: Path, number: int) -> Path:
     return path
 
 
-def test_a_journal_is_enough(early: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_journal_is_enough(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The episode in flight does not count."""
-    results = load(early)
-    assert not list(early.glob("*.json"))
-    assert results["manifests"] == [str(only(early, "*.jsonl"))]
+    journal = write_journal(
+        *(tmp_path, "0.7", entry(0), entry(1), entry(2, type="e", seed=None)),
+        run={"env_info": ENV_INFO},
+    )
+    with journal.open("ab") as file:
+        file.write(b'{"episode_id": 3, "len')
+    results = load(tmp_path)
+    assert results["manifests"] == [str(journal)]
     assert results["env_info"] == ENV_INFO
     assert results["data_sources"] == [0, 0, 0]
-    assert results["episode_lengths"] == [3, 3, 3]
-    assert results["episode_rewards"] == [1.5, 1.5, 1.5]
+    assert results["episode_lengths"] == [10, 11, 12]
+    assert results["episode_rewards"] == [0, 1, 2]
     assert results["episode_types"] == ["t", "t", "e"]
-    assert results["timestamps"] == sorted(results["timestamps"])
-    (start,) = results["initial_reset_timestamps"]
-    assert start == results["initial_reset_timestamp"] < results["timestamps"][0]
+    assert results["timestamps"] == [100, 101, 102]
+    assert results["initial_reset_timestamps"] == [99.5]
+    assert results["initial_reset_timestamp"] == 99.5
     assert results["videos"] == []
-    assert [e.seed for e in mjrec.iter_episodes(early)] == [5, 5, None]
-    assert not caplog.records
+    assert [e.seed for e in mjrec.iter_episodes(tmp_path)] == [0, 1, None]
+    assert {record.levelname for record in caplog.records} == {"WARNING"}
 
 
 def test_an_older_manifest_does_not_hide_the_last_episodes(late: Path) -> None:
     """The journal has one more; finished videos are found, broken ones are not."""
     manifest = only(late, "*.manifest.json")
-    saved = json.loads(only(late, "*.stats.json").read_text())
     results = load(late)
-    assert len(saved["timestamps"]) == 4
-    assert len(results["timestamps"]) == 5
-    assert results["timestamps"][:4] == saved["timestamps"]
+    assert results["timestamps"] == [100, 101, 102, 103, 104]
     assert results["manifests"] == [str(manifest)]
-    assert results["initial_reset_timestamp"] == saved["initial_reset_timestamp"]
+    assert results["initial_reset_timestamp"] == 98
     assert [e.episode_id for e in mjrec.iter_episodes(late)] == [0, 1, 2, 3, 4]
     videos = results["videos"]
     assert [Path(path).name[-10:] for path, _ in videos] == ["000000.mp4", "000004.mp4"]
-    listed = json.loads(manifest.read_text())["videos"]
-    assert [name for name, _ in listed] == [Path(videos[0][0]).name]
     manifest.unlink()
     assert load(late)["videos"] == videos
     Path(videos[0][1]).write_text('{"broken": true}')
@@ -136,7 +101,7 @@ def test_open_and_resumed_monitors_are_merged_with_the_dead(
         opened = load(late)
     closed = load(late)
     for results in (opened, closed):
-        assert results["episode_lengths"] == [3] * 5 + [2] * 2
+        assert results["episode_lengths"] == [10, 11, 12, 13, 14, 2, 2]
         assert len(results["manifests"]) == 2
         by_source = [results["data_sources"].count(source) for source in (0, 1)]
         assert sorted(by_source) == [2, 5]
@@ -157,7 +122,7 @@ def test_the_source_with_more_episodes_wins(
     assert load(tmp_path)["initial_reset_timestamps"] == [98.0]
 
 
-@pytest.mark.parametrize("lock", ["dead", "link", "", "[1]", "\0" * 9])
+@pytest.mark.parametrize("lock", ["dead", "link", "", "[1]"])
 def test_without_a_manifest_journal_and_lock_say_what_was_recorded(
     tmp_path: Path, lock: str, caplog: pytest.LogCaptureFixture
 ) -> None:

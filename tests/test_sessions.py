@@ -4,19 +4,22 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from recordings import manifest_of, videos_in
 
+import mjrec
 from mjrec import sessions
 from mjrec.commands import main
-from mjrec.environments.options import EnvironmentOptions
+from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.errors import GLError
 from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session
@@ -77,22 +80,16 @@ def test_what_is_not_drawn_here_looks_for_no_gl(
     assert len(list(tmp_path.glob("*.trajectory.*"))) == 1
 
 
+@pytest.mark.parametrize("render", [None, "live"])
 @pytest.mark.usefixtures("no_gl")
-def test_without_gl_the_way_out_is_named(tmp_path: Path) -> None:
+def test_without_gl_the_way_out_is_named(tmp_path: Path, render: str | None) -> None:
     """Where the pictures could be drawn elsewhere; nothing is written."""
+    options = {"render": render} if render else {}
     with pytest.raises(GLError, match="Nothing renders here") as raised:
-        list(record_session(session(tmp_path / "out")))
-    assert "--workers 0" in str(raised.value)
-    assert f"mjrec render {tmp_path / 'out'}" in str(raised.value)
+        list(record_session(session(tmp_path / "out", **options)))
+    assert ("--workers 0" in str(raised.value)) == (render is None)
+    assert (f"mjrec render {tmp_path / 'out'}" in str(raised.value)) == (not render)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.usefixtures("no_gl")
-def test_without_gl_live_is_what_it_is(tmp_path: Path) -> None:
-    """Somebody asked for it."""
-    with pytest.raises(GLError, match="Nothing renders here") as raised:
-        list(record_session(session(tmp_path / "out", render="live")))
-    assert "--workers 0" not in str(raised.value)
 
 
 def test_an_iterator_that_is_left_waits_for_nothing(tmp_path: Path) -> None:
@@ -120,6 +117,27 @@ def test_record_says_which_videos_are_pending(
     assert main([*command, str(tmp_path / "b"), "--json"]) == 0
     [episode] = json.loads(capsys.readouterr().out)["episodes"]
     assert episode["pending"] is True
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("pygame") is not None, reason="pygame is installed"
+)
+@pytest.mark.parametrize("options", [{}, {"keep": "best:1"}])
+def test_what_cannot_be_drawn_is_recorded_without_videos(
+    options: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """CartPole needs pygame: one line says so, unless pictures were asked for."""
+    asked = replace(
+        session(tmp_path, name="CartPole", episodes=2, **options),
+        made=EnvironmentOptions(max_steps=2),
+    )
+    assert [each.video for each in record_session(asked)] == [None, None]
+    assert mjrec.load_results(tmp_path)["episode_lengths"] == [2, 2]
+    [line] = caplog.messages
+    assert "No videos, only statistics. Drawing CartPole-v1 needs pygame" in line
+    live = replace(asked, monitor=RecorderOptions(render="live", force=True))
+    with pytest.raises(mjrec.MissingDependency, match="pygame"):
+        list(record_session(live))
 
 
 @pytest.mark.thorough

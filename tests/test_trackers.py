@@ -41,6 +41,8 @@ def test_import_loads_no_service(tmp_path: Path) -> None:
     assert answer.stdout.split() == ["[]"], answer.stderr
     with pytest.raises(AttributeError, match="no attribute 'Neptune'"):
         _ = mjrec.trackers.Neptune
+    with pytest.raises(InvalidArgument, match="got a run and project, tags"):
+        mjrec.trackers.WandbTracker(object(), project="p", tags=["a"])
 
 
 @pytest.mark.parametrize(
@@ -63,9 +65,3 @@ def test_missing_package_is_named_with_the_way_out(
         in (answer.stderr)
     )
     assert list(tmp_path.iterdir()) == []
-
-
-def test_run_and_how_to_make_one_exclude_each_other() -> None:
-    """Nobody can tell which is meant."""
-    with pytest.raises(InvalidArgument, match="got a run and project, tags"):
-        mjrec.trackers.WandbTracker(object(), project="p", tags=["a"])

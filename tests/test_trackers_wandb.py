@@ -59,9 +59,11 @@ def test_scalars_have_the_steps_of_the_run_as_their_axis(
     tracker.episode(run, episode(0, success=True))
     tracker.episode(run, episode(1))
     tracker.episode(run, episode(2, type="e"))
+    tracker.end(run)
+    # Its own run ends with the last monitor.
     tracker.episode(second, episode(3))
-    for one in (run, second):
-        tracker.end(one)
+    tracker.end(second)
+    assert wandb.run is None
     assert logged(tmp_path, "training/return") == [0.0, 1.5]
     assert logged(tmp_path, "training/length") == [10, 10]
     assert logged(tmp_path, "training/success") == [1]
@@ -94,20 +96,6 @@ def test_video_is_the_file_itself_and_may_come_late(
     assert axes(log_of(tmp_path))["training/video"] == "training/video_total_steps"
     [row] = [row for row in history(log_of(tmp_path)) if "training/video" in row]
     assert row["training/video_total_steps"] == 10
-
-
-def test_own_run_ends_with_the_last_monitor(finished: Finished, tmp_path: Path) -> None:
-    """Not with the first of two."""
-    tracker, run = WandbTracker(**offline(tmp_path)), finished.run
-    second = dataclasses.replace(run, infix="1.4711")
-    tracker.begin(run)
-    tracker.begin(second)
-    tracker.end(run)
-    tracker.episode(second, episode(1))
-    assert wandb.run is None or not wandb.run._is_finished
-    tracker.end(second)
-    assert wandb.run is None
-    assert logged(tmp_path, "training/return") == [1.5]
 
 
 @pytest.mark.parametrize("how", ["given", "active", "beside"])

@@ -13,13 +13,14 @@ second instead of 1600). So a process of its own, `python -m` this module, reads
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import importlib.metadata
-import json
 import logging
 import os
 import platform
+import re
 import subprocess
 import sys
 import threading
@@ -28,7 +29,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from .child_python import environment_of_child, python_command, take_standard_output
+from .child_python import Child, Parent
 from .machine import cpu_flags, cpu_model, machine_fingerprint, usable_cpus
 
 logger = logging.getLogger(__name__)
@@ -46,6 +47,7 @@ _PREFIXES = (
 )
 # What an installer adds to the files of a wheel, or changes.
 _OF_INSTALLATION = ("INSTALLER", "REQUESTED", "RECORD", "direct_url.json")
+_NAME_OR_VERSION = re.compile(r"^(Name|Version): *(.*?) *$", re.MULTILINE)
 _SECONDS_FOR_PACKAGES = 60.0
 _SECONDS_FOR_GIT = 5.0
 # Leaving is quick.
@@ -187,34 +189,38 @@ def installed_packages() -> dict[str, Any]:
     places = [entry for entry in sys.path if isinstance(entry, str)]
     # One that is part of another program has no Python to start.
     if sys.executable and not getattr(sys, "frozen", False):
-        try:
-            finished = subprocess.run(
-                python_command(__name__),
-                input=json.dumps(places).encode(),
-                env=environment_of_child(os.environ),
-                capture_output=True,
-                timeout=_SECONDS_FOR_PACKAGES,
-                check=True,
-            )
-            return dict(json.loads(finished.stdout))
-        except (OSError, RuntimeError, subprocess.SubprocessError, ValueError) as error:
-            logger.debug("Packages are looked for in this process: %s", error)
+        with (
+            contextlib.suppress(OSError),
+            Child(__name__, environ=os.environ) as child,
+        ):
+            child.send(places=places)
+            for said in child.messages(_SECONDS_FOR_PACKAGES):
+                if said is not None:
+                    return said
+            logger.debug("Packages are looked for here: it %s", child.last_words())
     return _packages_in(places)
 
 
 def _packages_in(places: Sequence[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for distribution in importlib.metadata.distributions(path=list(places)):
-        # Parsed at each access.
-        metadata = distribution.metadata
-        name = metadata["Name"]
+        name, version = _name_and_version(distribution)
         # The first on the path is the one that is imported.
         if name and name not in found:
             found[name] = {
-                "version": metadata["Version"],
+                "version": version,
                 "record_sha256": _record_sha256(distribution),
             }
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
+
+
+def _name_and_version(
+    distribution: importlib.metadata.Distribution,
+) -> tuple[str | None, str | None]:
+    """Return what a package says first: parsing all that it says takes milliseconds."""
+    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO")
+    said = dict(_NAME_OR_VERSION.findall((text or "").partition("\n\n")[0]))
+    return said.get("Name"), said.get("Version")
 
 
 def _record_sha256(distribution: importlib.metadata.Distribution) -> str | None:
@@ -241,10 +247,8 @@ def _is_of_installation(line: str) -> bool:
 
 
 def _main() -> None:
-    descriptor = take_standard_output()
-    packages = _packages_in(json.load(sys.stdin))
-    with os.fdopen(descriptor, "w") as output:
-        json.dump(packages, output)
+    parent = Parent()
+    parent.send(**_packages_in(parent.receive()["places"]))
 
 
 if __name__ == "__main__":
@@ -263,7 +267,8 @@ def versions() -> Mapping[str, str]:
     found = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
-            found[package] = importlib.metadata.version(package)
+            distribution = importlib.metadata.distribution(package)
+            found[package] = str(_name_and_version(distribution)[1])
         except importlib.metadata.PackageNotFoundError:
             continue
     return MappingProxyType(found)

@@ -2,33 +2,25 @@
 """A process with limits, in which a module of ours reads what strangers have written.
 
 Whatever a hostile file does to HDF5's, MuJoCo's, OpenGL's or ffmpeg's code, it does it
-there. Both sides speak JSON, a line each. The parent sends one request and keeps the
-pipe open, whose end is the order to end; the child says what it finds, and starts by
-calling `enter`.
+there. The parent sends one request; the child starts by calling `enter`, and says what
+it finds.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
+import json
 import logging
 import os
 import resource
-import select
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from . import json_text
-from .child_python import (
-    Child,
-    said_in,
-    say_stacks_when_asked,
-    take_standard_output,
-)
+from .child_python import Child, Parent
 from .errors import Error
 
 logger = logging.getLogger(__name__)
@@ -53,8 +45,6 @@ _TRUST_VARIABLE = "MJREC_TRUST_MODELS"
 _INSIDE_VARIABLE = "MJREC_SANDBOX"
 
 _NOTHING: Mapping[str, str] = {}
-_STANDARD_INPUT = 0
-_LONGEST_LINE = 1 << 24
 
 
 class Sandbox(Child):
@@ -71,6 +61,8 @@ class Sandbox(Child):
     Raises:
         Error: it cannot be started.
     """
+
+    most_bytes = 1 << 24
 
     def __init__(
         self,
@@ -90,27 +82,14 @@ class Sandbox(Child):
             raise Error(
                 f"No process with limits could be started: {sys.executable!r}: {error}."
             ) from error
-        line = json_text.dumps({"request": request, "limits": limits}).encode()
-        with contextlib.suppress(BrokenPipeError):
-            self.orders.write(line + b"\n")
+        self.send(request=_plain(request), limits=dict(limits))
 
     def said(self, patience_s: float) -> Iterator[Mapping[str, Any] | None]:
         """Yield what it says until it ends; None once it was silent for so long."""
-        rest = b""
-        while len(rest) <= _LONGEST_LINE:
-            ready, _, _ = select.select([self.answers], [], [], patience_s)
-            if not ready:
+        for message in self.messages(patience_s):
+            if message is None:
                 logger.warning("A process with limits hangs: %s", self.stacks())
-                yield None
-                return
-            data = os.read(self.answers.fileno(), 1 << 16)
-            *lines, rest = (rest + data).split(b"\n")
-            yield from map(said_in, lines)
-            if not data:
-                return
-
-    def __enter__(self) -> Self:
-        return self
+            yield message
 
     def __exit__(self, *error: object) -> None:
         # Those with a session of their own (who draw, ffmpeg) end with the pipes to it.
@@ -130,28 +109,17 @@ def enter() -> tuple[Any, Callable[..., None]]:
     Returns:
         The request; and what says its keyword arguments to the parent.
     """
-    answers = take_standard_output()
-    say_stacks_when_asked()
-    told = json_text.loads(sys.stdin.buffer.readline())
+    parent = Parent()
+    told = parent.receive()
     for name, wanted in told["limits"].items():
         kind = getattr(resource, name)
         _, most = resource.getrlimit(kind)
         allowed = wanted if most == resource.RLIM_INFINITY else min(wanted, most)
         resource.setrlimit(kind, (allowed, allowed))
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    return told["request"], functools.partial(_say, answers)
+    # With those of its group.
+    parent.listen(lambda: os.killpg(0, signal.SIGKILL))
+    return told["request"], lambda **said: parent.send(**_plain(said))
 
 
-def _say(answers: int, **said: Any) -> None:
-    line = json_text.dumps(said).encode() + b"\n"
-    while line:
-        line = line[os.write(answers, line) :]
-
-
-def _end_with_parent() -> None:
-    """End this process and those of its group when the parent is gone."""
-    # Not through `sys.stdin`, whose lock the interpreter would want at its end.
-    with contextlib.suppress(OSError):
-        while os.read(_STANDARD_INPUT, 1 << 16):
-            pass
-    os.killpg(0, signal.SIGKILL)
+def _plain(said: Mapping[str, Any]) -> Any:
+    return json.loads(json_text.dumps(said))

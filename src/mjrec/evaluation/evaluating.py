@@ -50,7 +50,6 @@ from .results_files import PLAN_NAME, RESULT_NAMES, ChosenEpisode, write_results
 from .statistics import Bootstrap
 from .summaries import (
     default_score_range,
-    split_by_scale,
     summarize_across,
     summarize_results,
 )
@@ -475,13 +474,12 @@ def _evaluation_of(
         ]
         for of in tasks
     }
-    scores, left_out = split_by_scale(returns, scales)
     return Evaluation(
         directory=directory,
         plan=plan,
         results=[result for of in tasks for result in of.results],
         summaries=summaries,
-        across=summarize_across(scores, left_out=left_out, bootstrap=bootstrap),
+        across=summarize_across(returns, scales, bootstrap=bootstrap),
         bootstrap=bootstrap,
         selection={
             of.task.name: [

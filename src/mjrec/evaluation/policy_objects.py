@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..atomic_files import file_sha256
-from ..environments.working_directory import working_directory_importable
+from ..environments.names import working_directory_importable
 from ..errors import PolicyError
 
 

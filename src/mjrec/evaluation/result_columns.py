@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +83,12 @@ class ResultColumns:
         if infix is None:
             return None
         return video_prefix(infix, int(self.episode_id[index]))
+
+    def video(self, index: int, directory: Path) -> Path | None:
+        """Return where a video is, or will be, in an evaluation's directory."""
+        name = self.videos.get(index)
+        folder = self.folders[self.monitor[index]]
+        return None if name is None else directory / folder / name
 
     def __iter__(self) -> Iterator[EpisodeResult]:
         """Yield each episode as a result; its warnings are not in the columns."""

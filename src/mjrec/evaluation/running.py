@@ -23,12 +23,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from ..engines.jobs import TRIES
-from ..environments.episode_seeds import EpisodeSeeds, episode_seeds
-from ..environments.from_name import NamedEnvironment, environment_from_name
-from ..environments.global_generators import seed_global_generators
-from ..environments.options import EnvironmentOptions
+from ..environments.episode_seeds import (
+    EpisodeSeeds,
+    episode_seeds,
+    seed_global_generators,
+)
+from ..environments.from_name import environment_from_name
+from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
+from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
-from ..environments.working_directory import working_directory_importable
 from ..errors import Error, InvalidArgument, PolicyError
 from ..monitors import Monitor
 from ..monitors.base import rendering_choice
@@ -376,7 +379,8 @@ def _play(acting: Acting, env: Any, seeds: EpisodeSeeds, begin: _Begin) -> None:
         policy.reset(seeds)
         observation, done = begin(named, env, seeds), False
         while not done:
-            observation, done = named.step(env, policy(observation))
+            observation, _, *ends = named.step(env, policy(observation))
+            done = any(ends)
 
 
 @contextlib.contextmanager

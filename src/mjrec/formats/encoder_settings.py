@@ -22,6 +22,7 @@ from .ffmpeg import (
     run_ffmpeg,
     video_encoders,
 )
+from .program_facts import remembered
 
 _DEFAULT_CODEC = "libx264"
 _WORST_CRF = 51.0
@@ -38,6 +39,7 @@ MUXERS = {
     ".avi": "avi",
 }
 _STANDARD_OUTPUT = "pipe:1"
+_TRIAL_SIDE = 64
 
 # Pixel formats that hold rgb24 without loss.
 _RGB_FORMATS = ("rgb24", "bgr24", "gbrp", "bgr0", "rgb0")
@@ -132,7 +134,7 @@ def encoder_settings(
             "encoder_arguments must be a sequence of strings, got "
             f"{encoder_arguments!r}."
         )
-    help_text = _encoder_help(ffmpeg_executable(), codec)
+    help_text = _encoder_help(codec)
     quality = _quality_arguments(codec, crf, help_text)
     pixel_format = _pixel_format(codec, help_text)
     yuv = pixel_format == "yuv420p"
@@ -151,21 +153,50 @@ def encoder_settings(
     return EncoderSettings(codec, pixel_format, muxer, encoding)
 
 
-@functools.lru_cache
-def try_encoding(executable: str, settings: EncoderSettings, fps: Fraction) -> None:
-    """Encode one small grey frame, so that what cannot work fails before any work.
+def check_encoding(settings: EncoderSettings, fps: Fraction) -> None:
+    """Try an encoding, so that what cannot work fails before any work.
 
-    Once for each combination; `executable` is a key of the cache.
+    Once for each ffmpeg, where its success depends on nothing else.
 
     Raises:
         EncoderError: it cannot work.
     """
-    side = 64
+    arguments = _trial_arguments(settings, fps)
+    if settings.codec != _DEFAULT_CODEC:
+        # Others may need a device.
+        _tried(ffmpeg_executable(), settings, fps)
+        return
+
+    def answer() -> str:
+        try_encoding(settings, fps)
+        return "it works"
+
+    remembered(ffmpeg_executable(), " ".join(arguments), answer)
+
+
+@functools.lru_cache
+def _tried(executable: str, settings: EncoderSettings, fps: Fraction) -> None:
+    del executable
+    try_encoding(settings, fps)
+
+
+def try_encoding(settings: EncoderSettings, fps: Fraction) -> None:
+    """Encode one small grey frame.
+
+    Raises:
+        EncoderError: it cannot work.
+    """
     run_ffmpeg(
-        settings.arguments(height=side, width=side, fps=fps, output=_STANDARD_OUTPUT),
-        standard_input=bytes([128]) * (side * side * 3),
+        _trial_arguments(settings, fps),
+        standard_input=bytes([128]) * (_TRIAL_SIDE * _TRIAL_SIDE * 3),
         what=f"ffmpeg cannot encode {fps} frames per second with {settings.codec} "
         f"into a {settings.muxer} file: choose another codec, rate or kind of file.",
+    )
+
+
+def _trial_arguments(settings: EncoderSettings, fps: Fraction) -> list[str]:
+    return settings.arguments(
+        height=_TRIAL_SIDE, width=_TRIAL_SIDE, fps=fps, output=_STANDARD_OUTPUT
     )
 
 
@@ -214,11 +245,15 @@ def _pixel_format(codec: str, help_text: str) -> str:
     )
 
 
-@functools.lru_cache
-def _encoder_help(executable: str, codec: str) -> str:
-    """Return what ffmpeg says about an encoder; `executable` is a key of the cache."""
-    shown = run_ffmpeg(["-hide_banner", "-h", f"encoder={codec}"])
-    text = shown.decode("utf-8", errors="replace")
+def _encoder_help(codec: str) -> str:
+    """Return what ffmpeg says about an encoder."""
+    executable = ffmpeg_executable()
+    arguments = ["-hide_banner", "-h", f"encoder={codec}"]
+    text = remembered(
+        executable,
+        " ".join(arguments),
+        lambda: run_ffmpeg(arguments).decode("utf-8", errors="replace"),
+    )
     # Of a codec's name it shows all encoders that there are for it.
     if f"Encoder {codec} [" not in text:
         raise UnknownName(

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import functools
 import os
 import re
 import select
@@ -29,6 +28,7 @@ from ..atomic_files import file_sha256
 from ..errors import EncoderError, Error, InvalidArgument, MissingDependency
 from ..frames import Frame
 from ..patience import Patience
+from .program_facts import remembered
 
 _ENVIRONMENT_VARIABLE = "IMAGEIO_FFMPEG_EXE"
 _END_OF_STDERR = 2000
@@ -63,12 +63,15 @@ def ffmpeg_executable() -> str:
 
 def ffmpeg_version() -> str:
     """Return the first line of `ffmpeg -version`."""
-    return _version(*_identity()).partition("\n")[0].strip()
+    return _version().partition("\n")[0].strip()
 
 
 def ffmpeg_sha256() -> str:
-    """Return the sha256 of the ffmpeg binary, in hexadecimal; read once a process."""
-    return _sha256(*_identity())
+    """Return the sha256 of the ffmpeg binary, in hexadecimal."""
+    executable = ffmpeg_executable()
+    return remembered(
+        executable, "sha256", lambda: file_sha256(Path(executable).resolve())
+    )
 
 
 def video_encoders() -> list[str]:
@@ -84,7 +87,7 @@ def every_frame_arguments() -> tuple[str, ...]:
     Left alone, ffmpeg fills gaps with copies and drops what comes too early, to make
     the rate even; in decoding, that hides what a file lacks or doubles.
     """
-    version = re.search(r"^libavutil +(\d+)\. *(\d+)", _version(*_identity()), re.M)
+    version = re.search(r"^libavutil +(\d+)\. *(\d+)", _version(), re.M)
     is_old = version and tuple(map(int, version.groups())) < _LIBAVUTIL_OF_FPS_MODE
     return "-vsync" if is_old else "-fps_mode", "passthrough"
 
@@ -353,21 +356,12 @@ def _close_pipes_after_fork() -> None:
 os.register_at_fork(after_in_child=_close_pipes_after_fork)
 
 
-def _identity() -> tuple[str, int, int]:
-    """Return what changes when the binary changes, as a key for the caches below."""
-    executable = ffmpeg_executable()
-    status = Path(executable).stat()
-    return executable, status.st_size, status.st_mtime_ns
-
-
-@functools.lru_cache
-def _version(executable: str, size: int, modified: int) -> str:
-    return run_ffmpeg(["-version"]).decode(errors="replace")
-
-
-@functools.lru_cache
-def _sha256(executable: str, size: int, modified: int) -> str:
-    return file_sha256(Path(executable))
+def _version() -> str:
+    return remembered(
+        ffmpeg_executable(),
+        "version",
+        lambda: run_ffmpeg(["-version"]).decode(errors="replace"),
+    )
 
 
 def _not_started(executable: str, error: OSError) -> Error:

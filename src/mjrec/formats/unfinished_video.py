@@ -22,18 +22,15 @@ from .ffmpeg import ffmpeg_sha256, ffmpeg_version
 from .frame_hashes import cut_frame_hashes, frame_hash_path
 from .json_fields import (
     field,
-    integer,
     mapping,
     optional,
+    positive,
     rate,
     read_object,
     text,
     unreadable,
 )
 from .video_file import count_frames
-
-_LARGEST_COUNT = 1 << 40
-_LONGEST_NOTE = 1 << 24
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,13 +113,11 @@ def read_note(path: Path) -> UnfinishedVideo:
         UnreadableFile: it is missing or damaged, or belongs to another video.
     """
     with unreadable(path):
-        if path.is_file() and path.stat().st_size > _LONGEST_NOTE:
-            raise ValueError("it is too long for a note")
         values = read_object(path)
         metadata = field(values, "metadata", mapping)
         facts = field(values, "facts", mapping)
         for key in ("padded_height", "padded_width", "stride", "frames_per_step"):
-            field(facts, key, _count)
+            field(facts, key, positive)
         field(facts, "fps", rate)
         field(facts, "timestep", optional(rate))
         field(facts, "pixel_format", text)
@@ -154,9 +149,3 @@ def _hidden(final: Path, name: str) -> Path:
     if not re.fullmatch(rf"\.{re.escape(final.name)}\.[0-9a-f]{{8}}\.part", name):
         raise ValueError(f"{name!r:.200} is no temporary name of {final.name!r:.200}")
     return final.with_name(name)
-
-
-def _count(value: Any) -> int:
-    if not 1 <= integer(value) <= _LARGEST_COUNT:
-        raise ValueError(f"{value!r:.80} is no number from 1 to {_LARGEST_COUNT}")
-    return int(value)

@@ -32,7 +32,7 @@ from ..errors import (
 from ..frames import Frame, check_frame, check_size
 from ..rates import to_rate
 from ..schedules import capped_cubic_video_schedule
-from .encoder_settings import MUXERS, encoder_settings, try_encoding
+from .encoder_settings import MUXERS, check_encoding, encoder_settings
 from .ffmpeg import ffmpeg_executable, ffmpeg_version
 from .frame_hashes import frame_hash_path
 from .video_file import Encoding, VideoFile
@@ -116,7 +116,7 @@ class VideoWriter:
         self.temporary = temporary_path(self.path)
         hashes = temporary_path(frame_hash_path(self.path))
         self.temporary_hashes = hashes if frame_hashes else None
-        try_encoding(ffmpeg_executable(), self._settings, self.fps)
+        check_encoding(self._settings, self.fps)
         self._process_id = os.getpid()
         self.closed = False
 

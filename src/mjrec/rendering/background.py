@@ -1,37 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering beside a simulation: the half that lives in the simulation's process.
+"""Finishing recordings beside a simulation, in a process of its own.
 
-The other half is a process of its own, `background_process`, and this one does next to
-nothing: it starts that process, writes it names of recordings, and listens when it is
-told to wait. No thread, no simulator and no OpenGL comes into this process.
+`Background` lives in the simulation's process and does next to nothing there: no
+thread, no simulator and no OpenGL comes into it. It starts the process that does the
+work, `python -m mjrec.rendering.background DIRECTORY --workers N|auto [--strict]`, and
+sends it::
+
+    {"expected": true}              a video will have to be rendered
+    {"recording": "<name>"}         an ended trajectory, or the first part of a clip
+    {"waited_for": true}            nothing more comes for now
+
+The process sends::
+
+    {"progress": {"videos_done": 0, "videos": 2, "frames_done": 40, "frames": 2002}}
+    {"done": "<recording>", "failures": {"<video or trajectory>": "..."}}
+    {"log": ["mjrec.x", 30, "..."]}
+
+It ends at once, leaving the rest as it is, when the simulation's process does.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import logging
 import os
-import select
+import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..child_python import Child, LineWriter, said_in
+from ..child_python import Child, Parent, log_message, wait_for_news
 from ..errors import Error
 from ..formats.monitor_directory import infix_of
 from ..patience import Patience, patience_s
-from .jobs import Progress
+from .jobs import Progress, VideoJob, key_of
 from .pool import check_workers
 
-logger = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from .finish import Finisher
 
-# Lines that are no names of recordings: nothing comes for now, or a video will.
-ALL_SAID = "that was all"
-EXPECTED = "a video is expected"
+# Not `__name__`, which is `__main__` in the process.
+logger = logging.getLogger("mjrec.rendering.background")
 
-_MODULE = "mjrec.rendering.background_process"
-_READ_SIZE = 1 << 16
+_MODULE = "mjrec.rendering.background"
+_NICE = 10
+_SECONDS_BETWEEN_REPORTS = 0.2
+_SECONDS_BETWEEN_LOOKS = 0.05
+_SECONDS_TO_LEAVE = 2.0
 # What the process waits for itself, it gives up after one patience.
 _PATIENCES = 3
 
@@ -72,7 +89,8 @@ class Background:
         self._arguments = [str(self._directory), "--workers", count]
         self._arguments += ["--strict"] * strict
         self._process_id = os.getpid()
-        self._process: _Process | None = None
+        self._child: Child | None = None
+        self._is_waited_for = False
         self._progress = Progress()
         self._is_stopped = self._waits_later = False
         # How processes have died, the second of which was the last.
@@ -87,8 +105,8 @@ class Background:
 
     def expect(self) -> None:
         """Start all processes: a video will have to be rendered. Idempotent."""
-        if self._process is None and not self._was_forked():
-            self._say(EXPECTED)
+        if self._child is None and not self._was_forked():
+            self._send(expected=True)
 
     def submit(self, recording: Path) -> None:
         """Take over an ended trajectory, or a clip. Never waits, raises no failure.
@@ -105,7 +123,7 @@ class Background:
             )
         name = Path(recording).name
         self.waiting[name] = None
-        self._say(name)
+        self._send(recording=name)
 
     def wait(self, on_progress: Callable[[Progress], object] = lambda _: None) -> None:
         """Return when all that was taken over is done, or the process has died.
@@ -118,14 +136,19 @@ class Background:
         """
         if self._was_forked() or self._is_stopped or self._waits_later:
             return
-        patience = Patience(_PATIENCES * patience_s())
-        while self.waiting and (process := self._process) is not None:
-            if not process.knows_all:
-                self._say(ALL_SAID)
+        patience, cpu_seconds = Patience(_PATIENCES * patience_s()), 0.0
+        while self.waiting and (child := self._child) is not None:
+            if not self._is_waited_for:
+                self._send(waited_for=True)
+                self._is_waited_for = True
             on_progress(self._progress)
-            process.wait_for_news(patience.begin_slice())
+            has_news = wait_for_news([child], patience.begin_slice())
             patience.end_slice()
-            if self._listen() or process.has_worked():
+            # What it waits for itself, it looks at every second. Blocked for good, by
+            # a disk that does not answer for example, it uses no CPU.
+            before, cpu_seconds = cpu_seconds, child.cpu_seconds()
+            self._listen()
+            if has_news or cpu_seconds > before:
                 patience.renew()
             elif patience.is_over:
                 logger.error(
@@ -133,9 +156,9 @@ class Background:
                     "life for %g seconds, and is ended. What its threads were at:\n%s",
                     self._directory,
                     patience.seconds,
-                    process.child.stacks(),
+                    child.stacks(),
                 )
-                process.child.kill()
+                child.kill()
                 self._replace(f"it hung for {patience.seconds:g} seconds and was ended")
                 patience.renew()
         on_progress(self._progress)
@@ -162,54 +185,54 @@ class Background:
     def stop(self) -> None:
         """Stop at once; what is not done stays pending. Idempotent."""
         self._is_stopped = True
-        process, self._process = self._process, None
-        if process is not None and not self._was_forked():
+        child, self._child = self._child, None
+        if child is not None and not self._was_forked():
             # What it has told of failures belongs into the manifest.
-            for message in process.messages():
-                self._take(message)
-            process.child.end()
+            with contextlib.suppress(EOFError):
+                self._take_from(child)
+            child.end()
 
     def _was_forked(self) -> bool:
         return os.getpid() != self._process_id
 
-    def _say(self, line: str) -> None:
-        """Say a line to the process, which is started if need be."""
+    def _send(self, **message: Any) -> None:
+        """Send the process something; it is started if need be."""
         if self._is_stopped or len(self._deaths) > 1:
             return
         try:
-            self._process = self._process or _Process(self._arguments)
+            if self._child is None:
+                self._child = Child(_MODULE, *self._arguments, environ=_environ())
         except OSError as error:
             self._replace(f"it could not be started: {error}")
             return
-        self._process.say(line)
+        self._is_waited_for = False
+        self._child.send(**message)
         self._listen()
 
-    def _listen(self) -> bool:
-        """Take what was said; return whether it was anything."""
-        process = self._process
-        if process is None:
-            return False
-        messages = process.messages()
-        for message in messages:
-            self._take(message)
-        if process.has_ended:
-            self._replace(f"it {process.child.last_words()}")
-        return bool(messages)
+    def _listen(self) -> None:
+        """Take what was sent."""
+        if (child := self._child) is not None:
+            try:
+                self._take_from(child)
+            except EOFError:
+                self._replace(f"it {child.last_words()}")
 
-    def _take(self, message: Mapping[str, Any]) -> None:
-        if "progress" in message:
-            self._progress = Progress(**message["progress"])
-        elif "log" in message:
-            logger.log(*message["log"])
-        elif "done" in message:
-            self.waiting.pop(message["done"], None)
-            self.failures.update(message["failures"])
+    def _take_from(self, child: Child) -> None:
+        while (message := child.receive()) is not None:
+            assert isinstance(message, dict)
+            if log_message(message):
+                continue
+            if "progress" in message:
+                self._progress = Progress(**message["progress"])
+            else:
+                self.waiting.pop(message["done"], None)
+                self.failures.update(message["failures"])
 
     def _replace(self, how: str) -> None:
         """Let another process do what one that has died left; it is the last."""
-        if self._process is not None:
-            self._process.child.end()
-            self._process = None
+        if self._child is not None:
+            self._child.end()
+            self._child = None
         self._deaths.append(how)
         is_last = len(self._deaths) > 1
         logger.warning(
@@ -219,7 +242,7 @@ class Background:
             how,
         )
         for name in list(self.waiting):
-            self._say(name)
+            self._send(recording=name)
 
 
 class Share:
@@ -246,54 +269,126 @@ class Share:
         """Do nothing: other monitors go on."""
 
 
-class _Process:
-    """The process, from outside.
+class _Stopped(BaseException):
+    """Raised in the main thread of the process, wherever it is: clean up and leave."""
 
-    Attributes:
-        child: the process.
-        knows_all: it knows that nothing more comes for now.
-        has_ended: nothing more comes from it.
+
+def main() -> None:
+    """Finish the recordings that the simulation's process names, until it ends."""
+    # Not at the top: the simulation's process needs none of it.
+    from .finish import Finisher
+
+    parser = argparse.ArgumentParser()
+    parser.add_argument("directory", type=Path)
+    parser.add_argument("--workers", required=True)
+    parser.add_argument("--strict", action="store_true")
+    arguments = parser.parse_args()
+    directory = arguments.directory
+    workers = None if arguments.workers == "auto" else int(arguments.workers)
+    os.setpriority(os.PRIO_PROCESS, 0, max(_NICE, os.getpriority(os.PRIO_PROCESS, 0)))
+    parent = Parent()
+    parent.send_warnings()
+    with contextlib.suppress(_Stopped, EOFError):
+        signal.signal(signal.SIGTERM, _stop)
+        first = parent.receive()
+        with contextlib.closing(
+            Finisher(directory, workers=workers, forks=True)
+        ) as finisher:
+            if "expected" in first:
+                # Before there is a second thread, which a fork would not have.
+                finisher.start_workers()
+            parent.listen(_leave)
+            _Work(finisher, directory, parent, strict=arguments.strict).do(first)
+
+
+def _stop(signum: int, frame: object) -> None:
+    del frame
+    # One is enough, and cleaning up must not be disturbed.
+    signal.signal(signum, signal.SIG_IGN)
+    raise _Stopped
+
+
+def _leave() -> None:
+    # To the main thread, wherever it waits. Should it not come out of that, it is of no
+    # use any more.
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(_SECONDS_TO_LEAVE)
+
+
+class _Work:
+    """What the process does.
+
+    Args:
+        finisher: does it.
+        directory: the monitor directory.
+        parent: the simulation's process.
+        strict: as of `Background`.
     """
 
-    def __init__(self, arguments: list[str]) -> None:
-        self.child = Child(_MODULE, *arguments, environ=os.environ)
-        self.knows_all = self.has_ended = False
-        self._cpu_seconds = 0.0
-        self._lines = LineWriter(self.child.orders.fileno())
-        self._unread = b""
-        os.set_blocking(self.child.answers.fileno(), False)
+    def __init__(
+        self, finisher: Finisher, directory: Path, parent: Parent, *, strict: bool
+    ) -> None:
+        self._finisher = finisher
+        self._directory = directory
+        self._parent = parent
+        self._strict = strict
+        self._is_waited_for = False
+        self._last_report = 0.0
+        finisher.on_progress = self._look_up
 
-    def say(self, line: str) -> None:
-        """Send a line, now or, where the pipe is full, with a later one."""
-        self.knows_all = line == ALL_SAID
-        self._lines.write(f"{line}\n".encode())
+    def do(self, first: Mapping[str, Any]) -> None:
+        """Do what the parent sends, and send the results, to the process's end."""
+        finisher = self._finisher
+        self._take_in(first)
+        while True:
+            self._take_in_all()
+            if not finisher:
+                finisher.rest()
+                self._take_in(self._parent.receive())
+            elif finisher.is_ready() or self._is_waited_for:
+                job, result = finisher.do_next()
+                self._parent.send(progress=vars(finisher.progress))
+                failures = {**result.failures, **result.blank}
+                self._parent.send(done=job.recording, failures=failures)
+            else:
+                # The simulation is still writing the model.
+                time.sleep(_SECONDS_BETWEEN_LOOKS)
 
-    def messages(self) -> list[dict[str, Any]]:
-        """Return what it has said since; never waits."""
-        while (block := self.child.answers.read(_READ_SIZE)) is not None:
-            self._unread += block
-            if not block:
-                self.has_ended = True
-                break
-        *lines, self._unread = self._unread.split(b"\n")
-        return [said_in(line) for line in lines]
+    def _take_in_all(self) -> None:
+        while self._parent.has_said_something:
+            self._take_in(self._parent.receive())
 
-    def has_worked(self) -> bool:
-        """Tell whether it has used its CPU since the last call.
+    def _take_in(self, message: Mapping[str, Any]) -> None:
+        self._is_waited_for = "waited_for" in message
+        if "expected" in message:
+            self._finisher.start_workers()
+        elif "recording" in message:
+            name = message["recording"]
+            job = VideoJob(
+                directory=self._directory, recording=name, strict=self._strict
+            )
+            if key_of(name) is None or not self._finisher.add(job):
+                self._parent.send(done=name, failures={})
 
-        What it waits for itself, it looks at every second. Blocked for good, by a disk
-        that does not answer for example, it uses none.
-        """
-        before = self._cpu_seconds
-        with contextlib.suppress(OSError):
-            # The kernel's number for the CPU clock of another process.
-            self._cpu_seconds = time.clock_gettime((~self.child.pid << 3) | 2)
-        return self._cpu_seconds > before
+    def _look_up(self, progress: Progress) -> None:
+        """Listen and report, in the midst of work."""
+        now = time.monotonic()
+        if now - self._last_report >= _SECONDS_BETWEEN_REPORTS:
+            self._last_report = now
+            self._take_in_all()
+            # Nobody reads it before, and a pipe holds only so much.
+            if self._is_waited_for:
+                self._parent.send(progress=vars(progress))
 
-    def wait_for_news(self, seconds: float) -> None:
-        """Wait until it says something or ends, or so many seconds have passed."""
-        poll = select.poll()
-        poll.register(self.child.answers, select.POLLIN)
-        if self._lines.is_behind:
-            poll.register(self.child.orders, select.POLLOUT)
-        poll.poll(seconds * 1000)
+
+def _environ() -> dict[str, str]:
+    """Return the environment variables of the process."""
+    environ = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    # Beside a simulation a single worker, too, has one CPU to itself and no more: the
+    # threads of Mesa's rasteriser would get in the way of the steps.
+    environ.setdefault("LP_NUM_THREADS", "1")
+    return environ
+
+
+if __name__ == "__main__":
+    main()

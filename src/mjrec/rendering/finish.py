@@ -26,7 +26,7 @@ from ..formats.spans import drop_recording, list_paths, remove_if_done
 from ..formats.trajectory_file import finish_trajectory
 from ..results.manifest_writing import update_manifests
 from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
-from .pool import SharedPool
+from .pool import WorkerPool
 from .recorded_facts import further_video_paths, video_facts
 from .recordings import (
     Plan,
@@ -143,6 +143,7 @@ class Finisher:
         directory: whose CPUs are shared.
         workers: how many processes draw; None is one for each free CPU.
         on_progress: see below.
+        forks: as of `WorkerPool`.
 
     Attributes:
         progress: how far it is.
@@ -155,10 +156,11 @@ class Finisher:
         *,
         workers: int | None,
         on_progress: _OnProgress = lambda _: None,
+        forks: bool = False,
     ) -> None:
         self.progress = Progress(frames=0)
         self.on_progress = on_progress
-        self._pool = SharedPool(directory, workers=workers)
+        self._pool = WorkerPool(workers, directory=directory, forks=forks)
         # None where a job cannot be planned: its turn says why.
         self._waiting: dict[str, tuple[VideoJob, Plan | None]] = {}
         self._gl_failure: GLError | None = None
@@ -271,7 +273,7 @@ class Finisher:
             return render_video(
                 plan.parts,
                 job.variant,
-                workers=self._pool.at_work(),
+                workers=self._pool,
                 out=job.video,
                 strict=job.strict,
                 on_frame=lambda: self._count(frames_done=1),

@@ -10,24 +10,19 @@ machine with two CPUs so have two workers at work, not sixteen.
 from __future__ import annotations
 
 import collections
-import contextlib
-import fcntl
 import itertools
-import json
 import logging
 import os
-import selectors
-import struct
 import sys
+import threading
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from ..child_python import Child, unpacked
+from ..child_python import Child, log_message, unpacked, wait_for_news
 from ..errors import (
     ClosedError,
     DirectoryNotWritable,
@@ -52,16 +47,9 @@ from .views import PlainCamera, View, plain_camera
 
 logger = logging.getLogger(__name__)
 
-# What a worker sends begins with its kind and length.
-HEADER = struct.Struct("=cQ")
-FRAME, TEXT = b"F", b"T"
-# The argument of a worker that is to look first at a frame of its own.
-TRY = "--try"
-
+_MODULE = "mjrec.rendering.worker"
 _MOST_BUFFERED = 2
 _SECONDS_BETWEEN_TRIES = 0.1
-# What users may have without privileges: one frame of 480x480, and more.
-_PIPE_BYTES = 1 << 20
 
 
 class WorkerPool:
@@ -92,30 +80,42 @@ class WorkerPool:
                 ...
 
     Args:
-        count: how many processes; more than one use one CPU each.
+        workers: how many processes; more than one use one CPU each. None is one for
+            each CPU of the directory that is free when a job begins.
+        directory: whose CPUs are shared.
         trust_models: whether they load compiled models that a stranger wrote; they do
             in any case where `MJREC_TRUST_MODELS` says so here.
+        forks: whether `start` forks this process, which then imports once for all, and
+            sets its environment variables. It has a single thread until then, and
+            never uses OpenGL.
 
     Raises:
-        InvalidArgument: `count` is not a whole number of at least 1.
+        InvalidArgument: `workers` is not a whole number of at least 1.
         UnknownName: `MUJOCO_GL` names no backend that there is.
 
     Attributes:
-        limit: how many of them draw the next job, up to `count`. The others stay.
         gl_facts: who draws, as `gl_context.current_gl_facts`; empty before the first
             frame.
     """
 
-    def __init__(self, count: int, *, trust_models: bool = False) -> None:
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise InvalidArgument(
-                f"workers must be a whole number of at least 1, got {count!r}."
-            )
+    def __init__(
+        self,
+        workers: int | None,
+        *,
+        directory: Path | None = None,
+        trust_models: bool = False,
+        forks: bool = False,
+    ) -> None:
+        self._fixed = check_workers(workers)
+        count = self._fixed or usable_cpus()
         self._environ = _environment(os.environ, alone=count == 1)
         if trust_models:
             self._environ = {**self._environ, TRUST_VARIABLE: ALL_MODELS}
+        self._directory = directory
+        # The CPUs of the directory that this process holds.
+        self._held: dict[int, Lock] = {}
         self._workers = [_Worker() for _ in range(count)]
-        self.limit = count
+        self._forks = forks
         self.gl_facts: dict[str, Any] = {}
         self._has_drawn = False
         # Whether the backend is the user's, or has drawn what it should.
@@ -128,15 +128,23 @@ class WorkerPool:
         self._process_id = os.getpid()
 
     def start(self) -> None:
-        """Start the workers now, so that the first frame comes sooner.
+        """Start the workers now, so that the first frame comes sooner. Idempotent.
 
         Raises:
+            DirectoryNotWritable: there can be no lock in the directory.
             GLError: no backend works here.
             Error: one cannot be started.
         """
         self._check_usable()
-        for worker in self._workers[: self.limit]:
+        for worker in self._workers[: self._free()]:
             self._start(worker)
+        self.rest()
+
+    def rest(self) -> None:
+        """Give the CPUs back: there is nothing to draw. The workers stay."""
+        while self._held:
+            _, lock = self._held.popitem()
+            lock.release()
 
     def frames(
         self,
@@ -148,7 +156,8 @@ class WorkerPool:
     ) -> Iterator[Frame]:
         """Return the frames of a trajectory, in the order of `indices`.
 
-        The first is drawn before this returns. Each is a new array.
+        The first is drawn before this returns, for which a CPU has to be free. Each is
+        a new array.
 
         Args:
             trajectory: its file.
@@ -186,7 +195,9 @@ class WorkerPool:
         for worker in self._workers:
             worker.leave()
         self._drawing, self._indices = dict(drawing), indices
-        drawn = self._drawn(self._call, self._workers[: self.limit])
+        while not (limit := self._free()):
+            time.sleep(_SECONDS_BETWEEN_TRIES)
+        drawn = self._drawn(self._call, self._workers[:limit])
         first = list(itertools.islice(drawn, 1))
         return itertools.chain(first, drawn)
 
@@ -195,16 +206,12 @@ class WorkerPool:
         self._closed = True
         for worker in self._workers:
             worker.end()
+        self.rest()
 
-    def __enter__(self) -> WorkerPool:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc_value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _check_usable(self, call: int | None = None) -> None:
@@ -218,14 +225,54 @@ class WorkerPool:
                 "in the process that uses it."
             )
 
+    def _free(self) -> int:
+        """Take the CPUs that are free; return how many workers may draw."""
+        if self._fixed is not None or self._directory is None:
+            return len(self._workers)
+        for number in range(len(self._workers)):
+            if number not in self._held:
+                path = self._directory / render_lock_name(number)
+                try:
+                    lock = try_lock(path, f"{os.getpid()}\n")
+                except OSError as error:
+                    raise DirectoryNotWritable(
+                        self._directory, error.strerror
+                    ) from error
+                if lock is not None:
+                    self._held[number] = lock
+        return len(self._held)
+
     def _start(self, worker: _Worker) -> None:
         if worker.child is not None:
             return
         if "MUJOCO_GL" not in self._environ:
             self._environ = environment_for(BACKENDS[0], self._environ)
+        try:
+            # No directory of others is kept from being removed or unmounted.
+            worker.child = Child(
+                _MODULE, environ=self._environ, cwd="/", fork=self._main_of_fork()
+            )
+        except OSError as error:
+            raise Error(
+                f"No process that draws could be started: {sys.executable!r}: {error}."
+            ) from error
         # One that tries it is enough: the first frame of all is the first worker's.
-        tries = worker is self._workers[0] and not self._is_tried
-        worker.start(self._environ, *[TRY] * tries)
+        if worker is self._workers[0] and not self._is_tried:
+            worker.child.send(tries=True)
+
+    def _main_of_fork(self) -> Callable[[], object] | None:
+        if not self._forks or threading.active_count() > 1:
+            return None
+        # Read when mujoco is imported.
+        os.environ.update(self._environ)
+        try:
+            # Not at the top: other processes that have a pool draw nothing.
+            from .worker import main
+        except Exception:
+            # A process of its own says why; or another backend works.
+            self._forks = False
+            return None
+        return main
 
     def _try_backends(self) -> None:
         """Let all workers begin anew with the first backend that works.
@@ -237,7 +284,7 @@ class WorkerPool:
             worker.end()
             worker.give_back()
         self._environ = environment_for(backend_for_children(), self._environ)
-        self._is_tried = True
+        self._is_tried, self._forks = True, False
         for worker in self._workers:
             if worker.owes:
                 self._order(worker)
@@ -247,11 +294,8 @@ class WorkerPool:
         self._start(worker)
         assert worker.child is not None
         indices = [int(self._indices[position]) for position in worker.owes]
-        order = json.dumps({"drawing": self._drawing, "indices": indices})
         worker.patience.renew()
-        # One that has died is noticed when it is listened to.
-        with contextlib.suppress(OSError):
-            worker.child.orders.write(order.encode() + b"\n")
+        worker.child.send(drawing=self._drawing, indices=indices)
 
     def _drawn(self, call: int, workers: Sequence[_Worker]) -> Iterator[Frame]:
         count = len(self._indices)
@@ -294,19 +338,18 @@ class WorkerPool:
 
     def _listen(self, workers: Sequence[_Worker], seconds: float) -> list[_Worker]:
         """Take in what the workers send, waiting so long for it; return who sent."""
-        with selectors.PollSelector() as selector:
-            for worker in workers:
-                if worker.child is not None and worker.may_send:
-                    selector.register(
-                        worker.child.answers, selectors.EVENT_READ, worker
-                    )
-            heard = [key.data for key, _ in selector.select(seconds)]
+        by_child = {
+            worker.child: worker
+            for worker in workers
+            if worker.child is not None and worker.may_send
+        }
+        heard = [by_child[child] for child in wait_for_news(by_child, seconds)]
         for worker in heard:
             if worker.child is None:
                 # With the backend of another one.
                 continue
             try:
-                self._take_in(worker)
+                self._take_in(worker, worker.child)
             except EOFError:
                 self._lose(worker, "died", f"it {worker.child.last_words()}")
             except BaseException:
@@ -315,23 +358,19 @@ class WorkerPool:
                 raise
         return heard
 
-    def _take_in(self, worker: _Worker) -> None:
-        assert worker.child is not None
+    def _take_in(self, worker: _Worker, child: Child) -> None:
         while worker.may_send:
-            worker.child.forget_words()
-            message = next(worker.messages)
-            if message is None:
+            child.forget_words()
+            said = child.receive()
+            if said is None:
                 return
-            kind, content = message
-            if kind == FRAME:
+            if isinstance(said, bytearray):
                 self._has_drawn = True
-                frame = np.frombuffer(content, np.uint8).reshape(worker.shape)
+                frame = np.frombuffer(said, np.uint8).reshape(worker.shape)
                 worker.arrived.append(frame)
                 worker.owes = worker.owes[1:]
+            elif log_message(said):
                 continue
-            said = json.loads(content)
-            if "log" in said:
-                logger.log(said["log"][0], "%s", said["log"][1])
             elif "untried" in said:
                 logger.info("Workers cannot draw with %s: %s", BACKENDS[0], said)
                 self._try_backends()
@@ -385,7 +424,6 @@ class _Worker:
 
     Attributes:
         child: the process; None where there is none now.
-        messages: what it sends.
         shape: of its frames.
         arrived: the frames that it has sent and that were not taken.
         owes: the positions of those that are to come.
@@ -396,7 +434,6 @@ class _Worker:
     def __init__(self) -> None:
         self.child: Child | None = None
         self.patience = Patience()
-        self.messages: Iterator[tuple[bytes, bytearray] | None] = iter(())
         self.shape = (0, 0, 3)
         self.arrived: collections.deque[Frame] = collections.deque()
         self.owes = range(0)
@@ -408,23 +445,6 @@ class _Worker:
         """Whether there is something to come, and room for it."""
         is_full = len(self.arrived) >= _MOST_BUFFERED
         return bool(self.owes) and self.error is None and not is_full
-
-    def start(self, environ: Mapping[str, str], *arguments: str) -> None:
-        try:
-            # No directory of others is kept from being removed or unmounted.
-            self.child = Child(
-                "mjrec.rendering.worker", *arguments, environ=environ, cwd="/"
-            )
-        except OSError as error:
-            raise Error(
-                f"No process that draws could be started: {sys.executable!r}: {error}."
-            ) from error
-        pipe = self.child.answers.fileno()
-        os.set_blocking(pipe, False)
-        # The system may grant no more than it has.
-        with contextlib.suppress(OSError):
-            fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-        self.messages = _messages(pipe)
 
     def give_back(self) -> None:
         """Owe again what has arrived and was not taken, and forget what went wrong."""
@@ -448,32 +468,19 @@ class _Worker:
             child.end()
 
 
-def _messages(pipe: int) -> Iterator[tuple[bytes, bytearray] | None]:
-    """Yield kind and content of what comes through a pipe, None where it has to wait.
+def check_workers(workers: int | None) -> int | None:
+    """Return `workers` if it is a number of processes, or None.
 
     Raises:
-        EOFError: the pipe has ended.
+        InvalidArgument: it is something else.
     """
-    while True:
-        header = yield from _received(pipe, HEADER.size)
-        kind, size = HEADER.unpack(header)
-        content = yield from _received(pipe, size)
-        yield kind, content
-
-
-def _received(pipe: int, size: int) -> Generator[None, None, bytearray]:
-    content = bytearray(size)
-    missing = memoryview(content)
-    while missing:
-        try:
-            count = os.readv(pipe, [missing])
-        except BlockingIOError:
-            yield None
-            continue
-        if not count:
-            raise EOFError
-        missing = missing[count:]
-    return content
+    whole = isinstance(workers, int) and not isinstance(workers, bool)
+    if workers is not None and not (whole and workers >= 1):
+        raise InvalidArgument(
+            "workers must be a positive whole number, or None for one on each CPU that "
+            f"can be used, got {workers!r}."
+        )
+    return workers
 
 
 def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
@@ -495,102 +502,3 @@ def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:
         # Mesa's rasteriser would start as many threads as there are CPUs, in each.
         changed.setdefault("LP_NUM_THREADS", "1")
     return changed
-
-
-class SharedPool:
-    """A pool of workers, of which as many draw as CPUs of the directory are free.
-
-    The workers stay from video to video; only how many of them draw changes.
-
-    Args:
-        directory: the monitor directory.
-        workers: how many, whatever is free; None is one for each free CPU.
-
-    Raises:
-        InvalidArgument: `workers` is no number of processes.
-    """
-
-    def __init__(
-        self,
-        directory: Path,
-        *,
-        workers: int | None,
-    ) -> None:
-        self._fixed = check_workers(workers)
-        self._count = self._fixed or usable_cpus()
-        self._directory = directory
-        # The CPUs that this process holds.
-        self._held: dict[int, Lock] = {}
-        self._pool: WorkerPool | None = None
-
-    def start(self) -> None:
-        """Start the workers: soon there is something to draw. Idempotent.
-
-        Raises:
-            DirectoryNotWritable, Error, GLError: as `at_work`, or `WorkerPool.start`.
-        """
-        if self._pool is None and (limit := self._free()):
-            self._made(limit).start()
-            self.rest()
-
-    def at_work(self) -> WorkerPool:
-        """Return the workers, to be used until the next call of any method.
-
-        Waits for a free CPU, unless a number of workers was asked for.
-
-        Raises:
-            DirectoryNotWritable: there can be no lock in the directory.
-        """
-        while not (limit := self._free()):
-            time.sleep(_SECONDS_BETWEEN_TRIES)
-        return self._made(limit)
-
-    def rest(self) -> None:
-        """Give the CPUs back: there is nothing to draw. The workers stay."""
-        while self._held:
-            _, lock = self._held.popitem()
-            lock.release()
-
-    def close(self) -> None:
-        """End the workers at once and give the CPUs back. Idempotent."""
-        if self._pool is not None:
-            self._pool.close()
-            self._pool = None
-        self.rest()
-
-    def _made(self, limit: int) -> WorkerPool:
-        self._pool = self._pool or WorkerPool(self._count)
-        self._pool.limit = limit
-        return self._pool
-
-    def _free(self) -> int:
-        """Take the CPUs that are free; return how many workers may draw."""
-        if self._fixed is not None:
-            return self._fixed
-        for number in range(self._count):
-            if number not in self._held:
-                path = self._directory / render_lock_name(number)
-                try:
-                    lock = try_lock(path, f"{os.getpid()}\n")
-                except OSError as error:
-                    raise DirectoryNotWritable(
-                        self._directory, error.strerror
-                    ) from error
-                if lock is not None:
-                    self._held[number] = lock
-        return len(self._held)
-
-
-def check_workers(workers: int | None) -> int | None:
-    """Return `workers` if it is a number of processes, or None.
-
-    Raises:
-        InvalidArgument: it is something else.
-    """
-    whole = isinstance(workers, int) and not isinstance(workers, bool)
-    if workers is not None and not (whole and workers >= 1):
-        raise InvalidArgument(
-            "workers must be a positive whole number, or None for one on each CPU that "
-            f"can be used, got {workers!r}."
-        )
-    return workers

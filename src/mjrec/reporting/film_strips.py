@@ -13,7 +13,6 @@ import itertools
 import math
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
@@ -36,9 +35,10 @@ from ..rendering.recorded_facts import (
     warn_of_other_frames,
 )
 from ..rendering.views import View
-from .video_stream import VideoStream, read_stream, stream_frames, video_kind
+from .video_stream import frames_at, read_stream, video_kind
 
 _TRAJECTORY: Final = ".h5"
+_SIZE: Final = ("height", "width")
 _MOST_IN_A_ROW: Final = 8
 _DOTS_PER_INCH: Final = 300
 # Pixels of a whole strip; Pillow calls twice as many an attack.
@@ -95,24 +95,23 @@ def film_strip(
     if columns is not None:
         _check_count("columns", columns)
     check_annotation()
-    source: contextlib.AbstractContextManager[_Shots]
-    if path.suffix == _TRAJECTORY:
-        view = View(
-            camera=camera,
-            height=height,
-            width=width,
-            quality=quality,
-        )
-        source = _of_trajectory(path, frames, view)
-    elif any(option is not None for option in (camera, height, width, quality)):
-        raise InvalidArgument(
-            f"{path} is shown as it is. Another camera, size or quality can be drawn "
-            "from its trajectory: name that file (openaigym.trajectory.*.h5)."
-        )
-    else:
-        source = _of_video(path, frames)
-    with source as shots:
-        return _laid_out(shots, columns or _usual_columns(frames))
+    if path.suffix != _TRAJECTORY:
+        if any(option is not None for option in (camera, height, width, quality)):
+            raise InvalidArgument(
+                f"{path} is shown as it is. Another camera, size or quality can be "
+                "drawn from its trajectory: name that file "
+                "(openaigym.trajectory.*.h5)."
+            )
+        return _laid_out(*_of_video(path, frames), columns or _usual_columns(frames))
+    with open_for_rendering(path) as reader:
+        check_has_frames(reader)
+        warn_of_other_frames(path.name, reader.facts)
+        indices = _spread(reader.frame_count, frames, path)
+        times = [caption.time for caption in captions(reader, indices)]
+    view = View(camera=camera, height=height, width=width, quality=quality)
+    with contextlib.closing(WorkerPool(1)) as workers:
+        pictures = workers.frames(path, indices, view)
+        return _laid_out(pictures, times, columns or _usual_columns(frames))
 
 
 def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
@@ -138,81 +137,29 @@ def write_film_strip(path: str | os.PathLike[str], strip: Frame) -> None:
         ) from error
 
 
-@dataclass(frozen=True)
-class _Shots:
-    """Pictures and their times.
-
-    Attributes:
-        pictures: `(height, width, 3) uint8` each, all of one size; one after the other,
-            each drawn when it is asked for.
-        times: in seconds; None where it is not known.
-    """
-
-    pictures: Iterator[Frame]
-    times: Sequence[float | None]
-
-
-@contextlib.contextmanager
-def _of_trajectory(path: Path, count: int, view: View) -> Iterator[_Shots]:
-    with open_for_rendering(path) as reader:
-        check_has_frames(reader)
-        warn_of_other_frames(path.name, reader.facts)
-        indices = _spread(reader.frame_count, count, path)
-        times = [caption.time for caption in captions(reader, indices)]
-    workers = WorkerPool(1)
-    try:
-        yield _Shots(workers.frames(path, indices, view), times)
-    finally:
-        workers.close()
-
-
-@contextlib.contextmanager
-def _of_video(path: Path, count: int) -> Iterator[_Shots]:
+def _of_video(path: Path, count: int) -> tuple[Iterator[Frame], Sequence[float]]:
+    """Return pictures of a video, decoded when they are asked for, and their times."""
     if video_kind(path) is None:
         raise UnreadableFile(
-            path,
-            "it is neither a video (mp4, avi, mkv) nor a trajectory (.h5)",
+            path, "it is neither a video (mp4, avi, mkv) nor a trajectory (.h5)"
         )
     stream = read_stream(path)
     indices = _spread(len(stream), count, path)
-    facts = _Facts.beside(path, stream)
-    with contextlib.closing(stream_frames(stream, indices)) as decoded:
-        pictures = map(facts.cropped, decoded)
-        yield _Shots(pictures, [facts.times[index] for index in indices])
-
-
-@dataclass(frozen=True)
-class _Facts:
-    """What a video's metadata says, or where there are none, its file.
-
-    Attributes:
-        times: of all of its pictures, in seconds.
-        height: of the pictures before a row was added to make them even.
-        width: likewise.
-    """
-
-    times: Sequence[float]
-    height: int
-    width: int
-
-    @classmethod
-    def beside(cls, path: Path, stream: VideoStream) -> _Facts:
-        own = cls([float(t) for t in stream.times], stream.height, stream.width)
-        try:
-            said = read_object(metadata_path(path))
-            height, width = (field(said, key, integer) for key in ("height", "width"))
-            times = _simulated_times(said)
-        except (OSError, ValueError):
-            return own
-        fits = 0 <= stream.height - height <= 1 and 0 <= stream.width - width <= 1
-        if not fits:
-            return own
-        if len(times) != len(stream):
-            times = own.times
-        return cls(times, height, width)
-
-    def cropped(self, frame: Frame) -> Frame:
-        return frame[: self.height, : self.width]
+    times: Sequence[float] = stream.times.tolist()
+    height, width = stream.height, stream.width
+    try:
+        said = read_object(metadata_path(path))
+        # Of the pictures before a row was added to make them even.
+        own_height, own_width = (field(said, key, integer) for key in _SIZE)
+        simulated = _simulated_times(said)
+    except (OSError, ValueError):
+        pass
+    else:
+        if 0 <= height - own_height <= 1 and 0 <= width - own_width <= 1:
+            height, width = own_height, own_width
+            times = simulated if len(simulated) == len(stream) else times
+    pictures = (frame[:height, :width] for frame in frames_at(stream, indices))
+    return pictures, [times[index] for index in indices]
 
 
 def _simulated_times(said: Any) -> Sequence[float]:
@@ -260,17 +207,19 @@ def _check_count(name: str, count: object) -> None:
         )
 
 
-def _laid_out(shots: _Shots, columns: int) -> Frame:
+def _laid_out(
+    pictures: Iterator[Frame], times: Sequence[float | None], columns: int
+) -> Frame:
     """Return pictures in rows on white paper, the time of each under it."""
-    count = len(shots.times)
-    first = next(shots.pictures)
+    count = len(times)
+    first = next(pictures)
     height, width = first.shape[:2]
     columns = min(columns, count)
     rows = math.ceil(count / columns)
     gap = max(2, round(_GAP * min(height, width)))
     letters = round(_LETTERS * min(height, width))
     letters = max(_SMALLEST_LETTERS, min(_LARGEST_LETTERS, letters))
-    labels = _labels(shots.times)
+    labels = _labels(times)
     written = [_written(label, letters, most_width=width) for label in labels]
     line = max(label.shape[0] for label in written)
     cell_height = height + (gap // 2 + line if line else 0)
@@ -281,7 +230,7 @@ def _laid_out(shots: _Shots, columns: int) -> Frame:
             "smaller pictures (frames, size)."
         )
     paper = np.full(shape, _PAPER, np.uint8)
-    for number, picture in enumerate(itertools.chain([first], shots.pictures)):
+    for number, picture in enumerate(itertools.chain([first], pictures)):
         row, column = divmod(number, columns)
         top, left = gap + row * (cell_height + gap), gap + column * (width + gap)
         paper[top : top + height, left : left + width] = picture

@@ -8,55 +8,71 @@ among the problems, and the rest is shown.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import importlib.metadata
 import logging
 import os
-import platform
 import shlex
 import threading
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
-from ..errors import UnreadableFile
-from ..evaluation.results_files import ReadResults, read_results, read_summaries
-from ..evaluation.statistics import Bootstrap
-from ..evaluation.summaries import AcrossTasks, TaskSummary
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InvalidArgument, UnreadableFile
+from ..evaluation.results_files import ReadResults, is_evaluation, read_results
+from ..formats.json_fields import (
+    boolean,
+    integer,
+    mapping,
+    one_of,
+    read_object,
+    text,
+    unreadable,
+)
+from ..formats.json_fields import field as json_field
 from ..formats.monitor_directory import monitor_directories_in
-from ..results.episodes import episodes_of
+from ..results.episodes import Episode, episodes_of
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
-from .contents import EpisodeColumns, ReportContents, ReportTask, ReportVideo, Verdict
-from .episode_columns import (
-    EpisodeRows,
-    columns_of_results,
+from .contents import ReportContents, ReportTask, ReportVideo, Verdict
+from .episode_rows import (
     episodes_with_roles,
-    summary_of_columns,
-    what_disagrees,
+    in_time,
+    rows_of_monitor,
+    rows_of_results,
+    summary_of_rows,
 )
-from .found_recordings import FoundRecordings, find_recordings
 from .provenance import (
-    MonitorOrigin,
-    origin_of,
-    provenance_of_evaluation,
-    provenance_of_monitors,
+    Provenance,
+    machine_of,
+    pairs_of_monitor,
+    pairs_of_results,
+    recorded_when,
 )
-from .recorded_videos import RecordedVideo, recorded_videos, report_video
-from .verdicts import VERIFICATION_NAME, read_verdict
+from .recorded_videos import recorded_videos
 
-_UNKNOWN_ENVIRONMENT = "unknown environment"
-_LONGEST_NAME = 1000
+Directories = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
+
+_UNKNOWN_ENVIRONMENT: Final = "unknown environment"
+_LONGEST_NAME: Final = 1000
+_NO_MONITOR: Final = -2
+
+# Where a verdict is looked for, in each directory with recordings.
+_VERIFICATION_NAME: Final = "verification.json"
+_VERDICTS: Final = ("pass", "fail", "not checkable")
+_LEVELS: Final = ("files", "stats", "physics", "pixels")
 
 
 def gather(
-    directories: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    directories: Directories,
     *,
     title: str | None = None,
     verifications: Iterable[str | os.PathLike[str]] = (),
 ) -> ReportContents:
-    """Return all of a report, with the recorded videos' own paths and no posters.
+    """Return all of a report, whose videos have no files in it yet.
 
     Args:
         directories: of evaluations, of monitors, or folders with such directories in
@@ -69,423 +85,346 @@ def gather(
         InvalidArgument: a directory has no recordings, or is not there.
         UnreadableFile: one of `verifications`.
     """
-    given = [read_verdict(Path(path)) for path in verifications]
-    found = find_recordings(directories)
-    gathering = _Gathering()
-    with gathering.noting_warnings():
-        for recordings in found:
-            gathering.add(recordings)
-    return gathering.contents(title, found, given)
+    given = [_read_verdict(Path(path)) for path in verifications]
+    found = _find_recordings(directories)
+    contents = ReportContents()
+    with _noting_warnings(contents.problems):
+        for directory in found:
+            if is_evaluation(directory):
+                _add_evaluation(contents, directory)
+            else:
+                _add_monitors(contents, directory, [directory])
+            _add_verdict(contents, directory)
+    contents.verdicts += given
+    contents.problems[:] = dict.fromkeys(contents.problems)
+    contents.title = title or _title(contents.tasks, found)
+    names = Counter(task.name for task in contents.tasks)
+    for task in contents.tasks:
+        if names[task.name] > 1:
+            task.name = f"{task.name} ({task.source})"
+    return contents
+
+
+# --- Directories ------------------------------------------------------------------
+
+
+def _find_recordings(directories: Directories) -> list[Path]:
+    """Return the directories that have recordings, each once, in their order."""
+    if isinstance(directories, str | os.PathLike):
+        directories = [directories]
+    found: dict[str, Path] = {}
+    for directory in map(Path, directories):
+        for each in _recordings_in(directory):
+            found.setdefault(os.path.realpath(each), each)
+    if not found:
+        raise InvalidArgument(
+            "A report needs at least one directory with recordings: that of `mjrec "
+            "evaluate` or `mjrec record`, or one that a Monitor wrote into."
+        )
+    return [*found.values()]
+
+
+def _recordings_in(directory: Path) -> list[Path]:
+    """Return a directory that has recordings, or those directly in it that have."""
+    if not directory.is_dir():
+        what = "is a file" if directory.exists() else "is not there"
+        raise InvalidArgument(
+            f"{directory} {what}. Name the directory that `mjrec evaluate` or `mjrec "
+            "record` wrote into (--out), or that a Monitor did."
+        )
+    try:
+        if _has_recordings(directory):
+            return [directory]
+        # A link may lead anywhere, also to what is in the folder itself.
+        below = [
+            each
+            for each in sorted(directory.iterdir())
+            if each.is_dir() and not each.is_symlink() and _has_recordings(each)
+        ]
+    except OSError as error:
+        raise InvalidArgument(
+            f"{directory} cannot be looked into: {error.strerror}. Name one that this "
+            "user may read."
+        ) from error
+    if not below:
+        raise InvalidArgument(
+            f"{directory} holds no recordings, and neither do the folders directly in "
+            f"it. `mjrec record ENV --out {shlex.quote(str(directory))}` makes some; "
+            "`mjrec evaluate` makes some of many episodes."
+        )
+    return below
+
+
+def _has_recordings(directory: Path) -> bool:
+    return is_evaluation(directory) or any(map(_has_episodes, monitors_of(directory)))
+
+
+def _has_episodes(files: MonitorFiles) -> bool:
+    return bool(files.manifest or files.stats or files.journal or files.videos)
+
+
+# --- Monitors ---------------------------------------------------------------------
 
 
 @dataclass
-class _Task:
-    """A task, and its videos before they have a place among all of them."""
+class _Recorded:
+    """What monitors recorded of one environment, of whose files little is kept."""
 
-    task: ReportTask
-    videos: Sequence[tuple[RecordedVideo, int | None]]
+    provenance: Provenance = field(default_factory=Provenance)
+    videos: list[ReportVideo] = field(default_factory=list)
+    runs: list[str] = field(default_factory=list)
+    rows: list[NDArray[np.void]] = field(default_factory=list)
 
 
-class _Monitors:
-    """Monitors that recorded the same, of whose files little is kept.
+def _add_monitors(
+    contents: ReportContents, directory: Path, places: Iterable[Path]
+) -> None:
+    """Add what monitors recorded: a task for each environment.
 
     Args:
-        problems: is added to where something cannot be read.
-        reads_episodes: whether their episodes are wanted.
+        contents: to add to.
+        directory: that the page names.
+        places: where the monitors' files are.
     """
-
-    def __init__(self, problems: list[str], *, reads_episodes: bool) -> None:
-        self.origins: list[MonitorOrigin] = []
-        self.videos: list[RecordedVideo] = []
-        self._rows = EpisodeRows() if reads_episodes else None
-        self._problems = problems
-
-    def add(self, monitor: MonitorResults) -> None:
-        """Add what is shown of a monitor."""
-        self.origins.append(origin_of(monitor))
-        videos = recorded_videos(monitor, self._problems)
-        self.videos += videos
-        if self._rows is not None:
-            numbers = (video.episode_id for video in videos)
-            self._rows.begin(monitor.files.infix, {n for n in numbers if n is not None})
-            self._read_episodes(monitor, self._rows)
-
-    def recorded(self) -> _Recorded:
-        """Return the episodes, and which of them the videos show."""
-        assert self._rows is not None
-        columns, places = self._rows.columns()
-        placed = [
-            (video, places.get((video.infix, video.episode_id or 0)))
-            if video.episode_id is not None
-            else (video, None)
-            for video in self.videos
-        ]
-        return _Recorded(columns, placed, self._rows.run_count)
-
-    def _read_episodes(self, monitor: MonitorResults, rows: EpisodeRows) -> None:
-        before = len(rows)
-        try:
-            for episode in episodes_of(monitor):
-                rows.add(episode)
-        except UnreadableFile as error:
-            read = len(rows) - before
-            kept = f" {read} episodes before that are shown." if read else ""
-            self._problems.append(f"{error}{kept}")
-
-
-@dataclass(frozen=True)
-class _Recorded:
-    """The episodes of monitors, their videos, and how many monitors have episodes."""
-
-    columns: EpisodeColumns
-    placed: Sequence[tuple[RecordedVideo, int | None]]
-    runs: int
-
-
-class _Gathering:
-    """What has been gathered so far."""
-
-    def __init__(self) -> None:
-        self._tasks: list[_Task] = []
-        self._across: dict[str, AcrossTasks] = {}
-        self._bootstraps: dict[str, Bootstrap] = {}
-        self._problems: list[str] = []
-        self._verdicts: list[Verdict] = []
-
-    @contextlib.contextmanager
-    def noting_warnings(self) -> Iterator[None]:
-        """Note what the readers of files warn of: what they leave out."""
-        handler = _NotingHandler(self._problems)
-        logger = logging.getLogger(__package__.partition(".")[0])
-        logger.addHandler(handler)
-        try:
-            yield
-        finally:
-            logger.removeHandler(handler)
-
-    def add(self, recordings: FoundRecordings) -> None:
-        """Add a directory."""
-        directory = recordings.directory
-        if recordings.is_evaluation:
-            self._add_evaluation(directory)
-        else:
-            self._add_monitors(directory)
-        self._add_verdict(directory)
-
-    def contents(
-        self,
-        title: str | None,
-        found: Sequence[FoundRecordings],
-        verdicts: Sequence[Verdict],
-    ) -> ReportContents:
-        """Return all of it."""
-        names = Counter(each.task.name for each in self._tasks)
-        tasks = [
-            dataclasses.replace(task, name=f"{task.name} ({task.source})")
-            if names[task.name] > 1
-            else task
-            for task in (each.task for each in self._tasks)
-        ]
-        placed, videos = self._placed(tasks)
-        bootstrap = self._bootstrap()
-        return ReportContents(
-            title=title or _title(tasks, found),
-            tasks=placed,
-            videos=videos,
-            across=self._across,
-            bootstrap=bootstrap,
-            problems=tuple(dict.fromkeys(self._problems)),
-            verdicts=(*self._verdicts, *verdicts),
-            made_with={
-                "mjrec": importlib.metadata.version("mjrec"),
-                "Python": platform.python_version(),
-            },
-        )
-
-    def _placed(
-        self, tasks: Sequence[ReportTask]
-    ) -> tuple[list[ReportTask], list[ReportVideo]]:
-        """Return the tasks, whose episodes know their videos, and all videos."""
-        placed: list[ReportTask] = []
-        videos: list[ReportVideo] = []
-        for number, (task, each) in enumerate(zip(tasks, self._tasks, strict=True)):
-            roles = episodes_with_roles(task.episodes)
-            of_episodes: dict[int, list[int]] = {}
-            for video, index in _in_order(each.videos):
-                if index is not None:
-                    of_episodes.setdefault(index, []).append(len(videos))
-                told = () if index is None else roles.get(index, ())
-                videos.append(report_video(video, task=number, index=index, roles=told))
-            episodes = dataclasses.replace(task.episodes, videos=of_episodes)
-            placed.append(dataclasses.replace(task, episodes=episodes))
-        return placed, videos
-
-    def _bootstrap(self) -> Bootstrap:
-        known = [*self._bootstraps.values()]
-        if any(bootstrap != known[0] for bootstrap in known[1:]):
-            listed = "; ".join(
-                f"{name}: {b.resamples} resamples with seed {b.seed}, {b.confidence:g}"
-                for name, b in self._bootstraps.items()
-            )
-            self._problems.append(
-                f"The evaluations' intervals were not made alike: {listed}."
-            )
-        return known[0] if known else Bootstrap()
-
-    def _add_verdict(self, directory: Path) -> None:
-        path = directory / VERIFICATION_NAME
-        if not os.path.lexists(path):
-            return
-        try:
-            self._verdicts.append(read_verdict(path))
-        except UnreadableFile as error:
-            self._problems.append(str(error))
-
-    # Evaluations.
-
-    def _add_evaluation(self, directory: Path) -> None:
-        try:
-            # Without times nothing tells which episode a video shows.
-            results = read_results(directory, needs_timing=True)
-        except UnreadableFile as error:
-            self._add_evaluation_without_tables(directory, error)
-            return
-        self._add_figures(results)
-        source = str(directory)
-        for summary in results.summaries:
-            task = summary.task
-            columns = columns_of_results(results.columns[task])
-            self._note_disagreement(source, summary, columns)
-            folder = results.folder(task)
-            monitors = self._monitors_of(folder, reads_episodes=False)
-            placed = _placed_in_results(results, task, monitors.videos)
-            self._note_missing(results, task, folder, placed)
-            self._tasks.append(
-                _Task(
-                    ReportTask(
-                        name=task[:_LONGEST_NAME],
-                        source=source,
-                        is_evaluation=True,
-                        summary=summary,
-                        episodes=columns,
-                        provenance=provenance_of_evaluation(
-                            results, task, monitors.origins, monitors.videos, columns
-                        ),
-                    ),
-                    placed,
-                )
-            )
-
-    def _add_evaluation_without_tables(
-        self, directory: Path, why: UnreadableFile
-    ) -> None:
-        """Add the figures that there are, and the episodes that monitors recorded."""
-        try:
-            results = read_summaries(directory)
-        except UnreadableFile:
-            self._problems.append(f"{why} What its monitors recorded is shown instead.")
-            self._add_below(directory)
-            return
-        self._problems.append(
-            f"{why} The summaries are those of results.json; the list of episodes is "
-            "what the monitors recorded, and episodes that failed are not in it."
-        )
-        self._add_figures(results)
-        for summary in results.summaries:
-            folder = results.folder(summary.task)
-            monitors = self._monitors_of(folder, reads_episodes=True)
-            recorded = monitors.recorded()
-            self._tasks.append(
-                _Task(
-                    ReportTask(
-                        name=summary.task[:_LONGEST_NAME],
-                        source=str(folder),
-                        is_evaluation=False,
-                        summary=summary,
-                        episodes=recorded.columns,
-                        provenance=provenance_of_evaluation(
-                            results,
-                            summary.task,
-                            monitors.origins,
-                            monitors.videos,
-                            recorded.columns,
-                        ),
-                    ),
-                    recorded.placed,
-                )
-            )
-
-    def _add_figures(self, results: ReadResults) -> None:
-        """Add what is said of all tasks."""
-        source = str(results.directory)
-        self._bootstraps[source] = results.bootstrap
-        if results.across is not None:
-            self._across[source] = results.across
-
-    def _add_below(self, directory: Path) -> None:
-        """Add the monitor directories of an evaluation without results."""
-        for folder in monitor_directories_in(directory):
-            self._add_monitors(folder)
-
-    def _note_disagreement(
-        self, source: str, summary: TaskSummary, columns: EpisodeColumns
-    ) -> None:
-        differing = what_disagrees(summary, columns)
-        if differing:
-            self._problems.append(
-                f"{summary.task} in {source}: results.json and results.csv disagree "
-                f"about {', '.join(differing)}. One of them was changed after "
-                "they were written."
-            )
-
-    def _note_missing(
-        self,
-        results: ReadResults,
-        task: str,
-        folder: Path,
-        placed: Sequence[tuple[RecordedVideo, int | None]],
-    ) -> None:
-        expected = results.columns[task].videos.keys()
-        missing = len(expected - {index for _, index in placed})
-        if missing:
-            named = shlex.quote(str(folder))
-            self._problems.append(
-                f"{missing} of {len(expected)} videos of {task} are not there. Where "
-                f"they are pending, `mjrec render {named}` makes them."
-            )
-
-    # Monitor directories.
-
-    def _add_monitors(self, directory: Path) -> None:
-        groups: dict[str, _Monitors] = {}
-        for monitor in self._monitors(directory):
-            name = self._environment(monitor)
-            if name not in groups:
-                groups[name] = _Monitors(self._problems, reads_episodes=True)
-            groups[name].add(monitor)
-        before = len(self._tasks)
-        for name, group in groups.items():
-            self._add_group(directory, name, group)
-        names = [each.task.name for each in self._tasks[before:]]
-        if len(names) > 1:
-            self._problems.append(
-                f"{directory} holds recordings of {len(names)} environments, "
-                f"{', '.join(names)}: each is shown by itself."
-            )
-
-    def _add_group(self, directory: Path, name: str, group: _Monitors) -> None:
-        recorded = group.recorded()
-        columns = recorded.columns
-        if (
-            name == _UNKNOWN_ENVIRONMENT
-            and not len(columns.run)
-            and not recorded.placed
-        ):
-            # Files that nothing can be read from.
-            return
-        bootstrap = next(iter(self._bootstraps.values()), Bootstrap())
-        self._tasks.append(
-            _Task(
-                ReportTask(
-                    name=name,
-                    source=str(directory),
-                    is_evaluation=False,
-                    summary=summary_of_columns(
-                        name, columns, runs=recorded.runs, bootstrap=bootstrap
-                    ),
-                    episodes=columns,
-                    provenance=provenance_of_monitors(
-                        name, group.origins, group.videos, columns
-                    ),
-                ),
-                recorded.placed,
-            )
-        )
-
-    def _monitors_of(self, folder: Path, *, reads_episodes: bool) -> _Monitors:
-        """Return the monitors of a task."""
-        monitors = _Monitors(self._problems, reads_episodes=reads_episodes)
-        for chunk in monitor_directories_in(folder) if folder.is_dir() else ():
-            for monitor in self._monitors(chunk):
-                monitors.add(monitor)
-        return monitors
-
-    def _monitors(self, directory: Path) -> Iterator[MonitorResults]:
-        """Yield the monitors of a directory; whoever asks keeps none of them.
-
-        A manifest says much of the machine, of which a page shows little.
-        """
-        try:
-            found = monitors_of(directory)
-        except OSError as error:
-            self._problems.append(
-                f"{directory} cannot be looked into: {error.strerror}."
-            )
-            return
-        yield from map(MonitorResults, filter(_has_something, found))
-
-    def _environment(self, monitor: MonitorResults) -> str:
+    by_name: dict[str, _Recorded] = {}
+    for place, monitor in _monitors(contents, places):
         name = (monitor.env_info or {}).get("env_id")
-        is_name = isinstance(name, str) and name
-        return str(name)[:_LONGEST_NAME] if is_name else _UNKNOWN_ENVIRONMENT
+        known = name[:_LONGEST_NAME] if isinstance(name, str) else ""
+        recorded = by_name.setdefault(known or _UNKNOWN_ENVIRONMENT, _Recorded())
+        _add_monitor(contents, recorded, monitor, place)
+    # Files that nothing can be read from are of no environment.
+    unknown = by_name.get(_UNKNOWN_ENVIRONMENT)
+    if unknown and not unknown.videos and not any(map(len, unknown.rows)):
+        del by_name[_UNKNOWN_ENVIRONMENT]
+    for name, recorded in by_name.items():
+        rows, now_at = in_time(np.concatenate(recorded.rows))
+        for video in recorded.videos:
+            if video.index is not None:
+                video.index = int(now_at[video.index])
+        recorded.provenance.add([("Environment", name)])
+        recorded.provenance.add([("Recorded", recorded_when(rows))])
+        contents.tasks.append(
+            ReportTask(
+                name=name,
+                source=str(directory),
+                is_evaluation=False,
+                summary=summary_of_rows(name, rows, bootstrap=contents.bootstrap),
+                episodes=rows,
+                runs=recorded.runs,
+                videos=_in_order(recorded.videos, rows),
+                provenance=recorded.provenance.pairs(),
+            )
+        )
+    if len(by_name) > 1:
+        contents.problems.append(
+            f"{directory} holds recordings of {len(by_name)} environments, "
+            f"{', '.join(by_name)}: each is shown by itself."
+        )
 
 
-class _NotingHandler(logging.Handler):
-    """Puts warnings of this thread into a list."""
+def _monitors(
+    contents: ReportContents, places: Iterable[Path]
+) -> Iterator[tuple[Path, MonitorResults]]:
+    """Yield the monitors of directories; the caller keeps none of them.
 
-    def __init__(self, problems: list[str]) -> None:
-        super().__init__(logging.WARNING)
-        self._problems = problems
-        self._thread = threading.get_ident()
+    A manifest says much of the machine, of which a page shows little.
+    """
+    for place in places:
+        try:
+            found = monitors_of(place)
+        except OSError as error:
+            problem = f"{place} cannot be looked into: {error.strerror}."
+            contents.problems.append(problem)
+            continue
+        for files in found:
+            # There may be no more of it than its lock.
+            if _has_episodes(files) or files.trajectories:
+                yield place, MonitorResults(files)
 
-    def emit(self, record: logging.LogRecord) -> None:
-        if record.thread == self._thread:
-            self._problems.append(record.getMessage())
 
-
-def _has_something(files: MonitorFiles) -> bool:
-    """Tell whether there is more of a monitor than its lock."""
-    return bool(
-        files.manifest
-        or files.stats
-        or files.journal
-        or files.videos
-        or files.trajectories
+def _add_monitor(
+    contents: ReportContents, recorded: _Recorded, monitor: MonitorResults, place: Path
+) -> None:
+    videos = recorded_videos(monitor, place, contents.problems)
+    wanted = {video.episode_id for video in videos}
+    before = sum(map(len, recorded.rows))
+    rows, found = rows_of_monitor(
+        _readable_episodes(contents, monitor), run=len(recorded.runs), wanted=wanted
     )
+    for video in videos:
+        if video.episode_id in found:
+            video.index = before + found[video.episode_id]
+    recorded.runs.append(monitor.files.infix)
+    recorded.rows.append(rows)
+    recorded.videos += videos
+    recorded.provenance.add(pairs_of_monitor(monitor))
+    recorded.provenance.add(_renderers(videos))
 
 
-def _placed_in_results(
-    results: ReadResults, task: str, videos: Iterable[RecordedVideo]
-) -> list[tuple[RecordedVideo, int | None]]:
-    """Return videos with the indices of the episodes that they show."""
-    columns = results.columns[task]
-    shown = list(videos)
-    number = {infix: index for index, infix in enumerate(columns.monitors)}
-    keys = [(number.get(video.infix), video.episode_id) for video in shown]
-    wanted = set(keys)
-    index: dict[tuple[int | None, int | None], int] = {}
-    recorded = zip(columns.monitor, columns.episode_id, strict=True)
-    for row, key in enumerate(recorded if wanted else ()):
-        if key in wanted:
-            index.setdefault(key, row)
-    # Others are of a batch that was begun, killed and done again.
-    return [
-        (video, index[key])
-        for video, key in zip(shown, keys, strict=True)
-        if None not in key and key in index
-    ]
+def _readable_episodes(
+    contents: ReportContents, monitor: MonitorResults
+) -> Iterator[Episode]:
+    read = 0
+    try:
+        for episode in episodes_of(monitor):
+            yield episode
+            read += 1
+    except UnreadableFile as error:
+        kept = f" {read} episodes before that are shown." if read else ""
+        contents.problems.append(f"{error}{kept}")
+
+
+def _renderers(videos: Iterable[ReportVideo]) -> list[tuple[str, str]]:
+    return [("OpenGL of the videos", video.renderer or "") for video in videos]
 
 
 def _in_order(
-    videos: Iterable[tuple[RecordedVideo, int | None]],
-) -> list[tuple[RecordedVideo, int | None]]:
-    """Return videos in the order of their episodes; sorting keeps that of views."""
-    return sorted(videos, key=lambda each: (each[1] is None, each[1] or 0))
+    videos: Iterable[ReportVideo], rows: NDArray[np.void]
+) -> list[ReportVideo]:
+    """Return videos in the order of their episodes, with the roles of these."""
+    roles = episodes_with_roles(rows)
+    # Sorting keeps the order of views.
+    ordered = sorted(videos, key=lambda video: (video.index is None, video.index or 0))
+    for video in ordered:
+        if video.index is not None:
+            video.roles = roles.get(video.index, ())
+    return ordered
 
 
-def _title(tasks: Sequence[ReportTask], found: Sequence[FoundRecordings]) -> str:
-    what = "Evaluation" if all(each.is_evaluation for each in found) else "Recordings"
-    names = list(dict.fromkeys(task.summary.task for task in tasks))
-    if len(names) == 1:
+# --- Evaluations ------------------------------------------------------------------
+
+
+def _add_evaluation(contents: ReportContents, directory: Path) -> None:
+    try:
+        # Without times nothing tells which episode a video shows.
+        results = read_results(directory, needs_timing=True)
+    except UnreadableFile as error:
+        problem = f"{error} What its monitors recorded is shown instead."
+        contents.problems.append(problem)
+        for folder in sorted(directory.iterdir()):
+            if folder.is_dir() and not folder.is_symlink():
+                _add_monitors(contents, folder, _places_of_task(folder))
+        return
+    if not any(task.is_evaluation for task in contents.tasks):
+        contents.bootstrap = results.bootstrap
+    elif results.bootstrap != contents.bootstrap:
+        how = results.bootstrap
+        contents.problems.append(
+            f"The intervals of {directory} were made in another way: {how.resamples} "
+            f"resamples with seed {how.seed}, {how.confidence:g}."
+        )
+    if results.across is not None:
+        contents.across[str(directory)] = results.across
+    for summary in results.summaries:
+        task = summary.task
+        rows = rows_of_results(results.columns[task])
+        provenance = Provenance(pairs_of_results(results, task))
+        videos = _videos_of_task(contents, results, task, provenance)
+        provenance.add([("Recorded", recorded_when(rows))])
+        contents.tasks.append(
+            ReportTask(
+                name=task[:_LONGEST_NAME],
+                source=str(directory),
+                is_evaluation=True,
+                summary=summary,
+                episodes=rows,
+                failures=results.columns[task].failures,
+                videos=_in_order(videos, rows),
+                provenance=provenance.pairs(),
+            )
+        )
+
+
+def _places_of_task(folder: Path) -> list[Path]:
+    return [folder, *monitor_directories_in(folder)] if folder.is_dir() else []
+
+
+def _videos_of_task(
+    contents: ReportContents, results: ReadResults, task: str, provenance: Provenance
+) -> list[ReportVideo]:
+    """Return the videos of a task's episodes, with the places of these.
+
+    Others are of a batch that was begun, killed and done again.
+    """
+    columns, folder = results.columns[task], results.folder(task)
+    videos: list[ReportVideo] = []
+    for place, monitor in _monitors(contents, _places_of_task(folder)):
+        videos += recorded_videos(monitor, place, contents.problems)
+        provenance.add([machine_of(monitor)])
+    provenance.add(_renderers(videos))
+    number = {infix: index for index, infix in enumerate(columns.monitors)}
+    for video in videos:
+        of_monitor = columns.monitor == number.get(video.infix, _NO_MONITOR)
+        [rows] = np.nonzero(of_monitor & (columns.episode_id == video.episode_id))
+        video.index = int(rows[0]) if len(rows) else None
+    shown = [video for video in videos if video.index is not None]
+    missing = len(columns.videos.keys() - {video.index for video in shown})
+    if missing:
+        contents.problems.append(
+            f"{missing} of {len(columns.videos)} videos of {task} are not there. Where "
+            f"they are pending, `mjrec render {shlex.quote(str(folder))}` makes them."
+        )
+    return shown
+
+
+# --- Beside them ------------------------------------------------------------------
+
+
+def _add_verdict(contents: ReportContents, directory: Path) -> None:
+    path = directory / _VERIFICATION_NAME
+    if os.path.lexists(path):
+        try:
+            contents.verdicts.append(_read_verdict(path))
+        except UnreadableFile as error:
+            contents.problems.append(str(error))
+
+
+def _read_verdict(path: Path) -> Verdict:
+    """Return what a file says that `mjrec verify --json` has printed.
+
+    Raises:
+        UnreadableFile: it is missing, damaged, something else, or contradicts itself.
+    """
+    with unreadable(path):
+        said = read_object(path)
+        told = json_field(said, "counts", mapping)
+        counts = {name: json_field(told, name, integer) for name in _VERDICTS}
+        passed = json_field(said, "passed", boolean)
+        if passed != (counts["fail"] == 0):
+            raise ValueError(
+                f"it says passed is {str(passed).lower()}, and that {counts['fail']} "
+                "checks failed"
+            )
+        return Verdict(
+            source=f"{json_field(said, 'path', text)} ({path})",
+            passed=passed,
+            counts=counts,
+            level=json_field(said, "level", one_of(*_LEVELS)),
+        )
+
+
+def _title(tasks: Iterable[ReportTask], found: Iterable[Path]) -> str:
+    what = "Evaluation" if all(map(is_evaluation, found)) else "Recordings"
+    names = [task.name for task in tasks]
+    if len(set(names)) == 1:
         return f"{what}: {names[0]}"
-    return f"{what}: {len(tasks)} tasks" if names else what
+    return f"{what}: {len(names)} tasks" if names else what
+
+
+@contextlib.contextmanager
+def _noting_warnings(problems: list[str]) -> Iterator[None]:
+    """Note what the readers of files warn of in this thread: what they leave out."""
+    thread = threading.get_ident()
+
+    class Noting(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if record.thread == thread:
+                problems.append(record.getMessage())
+
+    handler = Noting(logging.WARNING)
+    logger = logging.getLogger(__package__.partition(".")[0])
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)

@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
 
 from ..errors import UnreadableFile
-from ..formats.json_fields import field, integer, number, rate, read_object, text
+from ..formats.json_fields import field, integer, number, rate, read_object
 from ..formats.monitor_directory import episode_of
 from ..formats.regular_files import regular_path
 from ..formats.video_metadata import finished_videos, is_broken, metadata_path
@@ -26,29 +25,9 @@ _LONGEST_TEXT: Final = 1000
 _MOST_PIXELS: Final = 1 << 15
 
 
-@dataclass(frozen=True)
-class RecordedVideo:
-    """A video that is there.
-
-    Attributes:
-        path: of it.
-        infix: of its monitor.
-        episode_id: the number of the one episode that it shows; None where it shows
-            several, or it is not known which.
-        metadata: what is said of it; empty where that cannot be read.
-        trajectory: from which it can be rendered again; None where it cannot.
-    """
-
-    path: Path
-    infix: str
-    episode_id: int | None
-    metadata: Mapping[str, Any]
-    trajectory: Path | None
-
-
 def recorded_videos(
-    results: MonitorResults, problems: list[str]
-) -> list[RecordedVideo]:
+    results: MonitorResults, directory: Path, problems: list[str]
+) -> list[ReportVideo]:
     """Return the videos of a monitor that are finished and there, each once.
 
     They are those that its manifest lists, and those that were finished after it was
@@ -56,60 +35,29 @@ def recorded_videos(
 
     Args:
         results: of the monitor.
+        directory: of its files.
         problems: is added to where one is listed and gone, or cannot be read.
     """
-    names = _listed(results) + _finished(results)
-    found: dict[str, RecordedVideo] = {}
-    for name in dict.fromkeys(names):
-        path = _directory(results) / name
+    found: list[ReportVideo] = []
+    for name in sorted({*_listed(results), *_finished(results)}, key=_order):
+        path = directory / name
         try:
             regular_path(path)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             problems.append(f"The video {path} is left out: {reason}.")
             continue
-        found[name] = _recorded(results, path, problems)
-    return [found[name] for name in sorted(found, key=_order)]
-
-
-def report_video(
-    video: RecordedVideo, *, task: int, index: int | None, roles: Sequence[str]
-) -> ReportVideo:
-    """Return a video as a report shows it; its file is still the recorded one.
-
-    Args:
-        video: the video.
-        task: index of its task.
-        index: of its episode; None where it is not known.
-        roles: of its episode.
-    """
-    said = video.metadata
-    return ReportVideo(
-        task=task,
-        index=index,
-        file=str(video.path),
-        poster=None,
-        name=video.path.name,
-        roles=tuple(roles),
-        height=_pixels(said, "height"),
-        width=_pixels(said, "width"),
-        seconds=_seconds(said),
-        camera=_camera(said.get("camera")),
-        sha256=_sha256(said.get("file_sha256")),
-        command=_command(video),
-        notes=tuple(_notes(said)),
-    )
-
-
-def _directory(results: MonitorResults) -> Path:
-    files = results.files
-    paths = (
-        *(files.manifest, files.stats, files.journal, files.lock),
-        *files.videos.values(),
-        *files.metadata.values(),
-        *files.trajectories.values(),
-    )
-    return next(path.parent for path in paths if path is not None)
+        said: Mapping[str, Any] = {}
+        try:
+            said = read_object(metadata_path(path))
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            problems.append(
+                f"The metadata of {path} cannot be read: {reason}. The video is shown "
+                "without them."
+            )
+        found.append(_video(path, said, results))
+    return found
 
 
 def _listed(results: MonitorResults) -> list[str]:
@@ -136,41 +84,44 @@ def _order(name: str) -> tuple[int, str, str]:
     return episode_of(name) or 0, view_of(name), name
 
 
-def _recorded(
-    results: MonitorResults, path: Path, problems: list[str]
-) -> RecordedVideo:
-    metadata: Mapping[str, Any] = {}
-    try:
-        metadata = read_object(metadata_path(path))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        problems.append(
-            f"The metadata of {path} cannot be read: {reason}. The video is shown "
-            "without them."
-        )
-    infix = results.files.infix
+def _video(path: Path, said: Mapping[str, Any], results: MonitorResults) -> ReportVideo:
     episode_id = episode_of(path.name)
-    if metadata.get("first_step") is not None or "sub_environments" in metadata:
-        return RecordedVideo(path, infix, None, metadata, None)
-    trajectory = None
-    if episode_id is not None and metadata.get("recording") == "deferred":
+    if said.get("first_step") is not None or "sub_environments" in said:
+        episode_id = None
+    drawn_with = (said.get("gl_renderer"), said.get("gl_version"))
+    texts = [text[:_LONGEST_TEXT] for text in drawn_with if isinstance(text, str)]
+    sha256 = said.get("file_sha256")
+    is_hash = isinstance(sha256, str) and _SHA256.fullmatch(sha256)
+    command = None
+    if episode_id is not None and said.get("recording") == "deferred":
         trajectory = results.files.trajectories.get(episode_id)
-    return RecordedVideo(path, infix, episode_id, metadata, trajectory)
+        command = None if trajectory is None else _command(path, said, trajectory)
+    return ReportVideo(
+        path=path,
+        infix=results.files.infix,
+        episode_id=episode_id,
+        height=_pixels(said, "height"),
+        width=_pixels(said, "width"),
+        seconds=_seconds(said),
+        camera=_camera(said.get("camera")),
+        renderer=", ".join(texts) or None,
+        sha256=sha256 if is_hash else None,
+        command=command,
+        notes=_notes(said),
+    )
 
 
-def _command(video: RecordedVideo) -> str | None:
+def _command(path: Path, said: Mapping[str, Any], trajectory: Path) -> str | None:
     """Return what a shell takes to render a video again, beside the recorded ones."""
-    if video.trajectory is None:
-        return None
-    camera = video.metadata.get("camera")
+    camera = said.get("camera")
     options = []
-    if view_of(video.path.name) and "tiled" not in video.metadata:
+    if view_of(path.name) and "tiled" not in said:
         # A further camera's; without its name the first one is rendered.
         is_name = isinstance(camera, str) and not _NUMBER.fullmatch(camera)
         if not is_name and (isinstance(camera, bool) or not isinstance(camera, int)):
             return None
         options = [f"--camera={camera}"]
-    target = str(video.trajectory)
+    target = str(trajectory)
     if target.startswith("-"):
         target = f"./{target}"
     return shlex.join(["mjrec", "render", target, *options, "--out", "again.mp4"])
@@ -179,8 +130,9 @@ def _command(video: RecordedVideo) -> str | None:
 def _notes(said: Mapping[str, Any]) -> list[str]:
     notes = []
     if said.get("complete") is False:
-        reason = _text(said, "reason", "it is not known why")
-        notes.append(f"Incomplete: the episode was not over ({reason}).")
+        reason = said.get("reason")
+        why = reason if isinstance(reason, str) else "it is not known why"
+        notes.append(f"Incomplete: the episode was not over ({why[:_LONGEST_TEXT]}).")
     if said.get("first_step") is not None:
         notes.append("Counted in steps: it may go on across episodes.")
     if "sub_environments" in said:
@@ -250,14 +202,3 @@ def _posed(camera: Mapping[str, Any]) -> str | None:
         except ValueError:
             continue
     return f"{kind} camera" + (f" ({', '.join(pose)})" if pose else "")
-
-
-def _sha256(value: Any) -> str | None:
-    return value if isinstance(value, str) and _SHA256.fullmatch(value) else None
-
-
-def _text(said: Mapping[str, Any], key: str, otherwise: str) -> str:
-    try:
-        return field(said, key, text)[:_LONGEST_TEXT]
-    except ValueError:
-        return otherwise

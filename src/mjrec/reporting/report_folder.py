@@ -27,15 +27,15 @@ from ..atomic_files import temporary_path, write_text
 from ..errors import DirectoryNotWritable, FileNotWritten, InvalidArgument
 from ..formats.regular_files import open_regular
 from .contents import ReportContents
-from .gathering import gather
-from .media_files import (
+from .gathering import Directories, gather
+from .media import (
     POSTERS,
     VIDEOS,
     OnProgress,
+    copy_videos,
     is_own_name,
-    with_copied_videos,
+    posters_of,
     with_embedded_videos,
-    with_posters,
 )
 from .page import page_of
 
@@ -48,7 +48,7 @@ _SHOWN: Final = 5
 
 
 def write_report(
-    directories: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    directories: Directories,
     path: str | os.PathLike[str] = "report",
     *,
     title: str | None = None,
@@ -83,7 +83,7 @@ def write_report(
         InvalidArgument: a directory has no recordings; `path` is something else than
             a report; or the page alone is larger than `max_single_file_bytes`.
         UnreadableFile: one of `verifications`.
-        MissingDependency: Jinja2 or matplotlib is not installed.
+        MissingDependency: Jinja2 is not installed.
         FileNotWritten, DirectoryNotWritable: the disk is full, or read-only.
     """
     target = Path(os.path.realpath(path))
@@ -96,7 +96,7 @@ def write_report(
     _check_target(target, is_page=is_page)
     tell = on_progress or (lambda progress: None)
     contents = gather(directories, title=title, verifications=verifications)
-    contents, posters = with_posters(contents, tell)
+    posters = posters_of(contents, tell)
     if single_file:
         page = _single_page(contents, posters, max_single_file_bytes)
         if is_page:
@@ -105,7 +105,7 @@ def write_report(
             return Path(path)
     with _replacing_folder(target) as folder:
         if not single_file:
-            contents = with_copied_videos(contents, posters, folder, tell)
+            copy_videos(contents, posters, folder, tell)
             page = page_of(contents)
         write_text(folder / PAGE_NAME, page)
     return Path(path) / PAGE_NAME
@@ -114,21 +114,20 @@ def write_report(
 def _single_page(
     contents: ReportContents, posters: Sequence[bytes | None], most_bytes: int
 ) -> str:
-    bare = with_embedded_videos(contents, [None] * len(posters), room=0)
-    size = len(page_of(bare).encode())
-    if size > most_bytes:
-        raise InvalidArgument(
-            f"The page has {size} bytes without any picture or video, and "
-            f"max_single_file_bytes allows {most_bytes}. Allow more, or write a folder."
-        )
-    room = most_bytes - size
+    room = most_bytes
     while True:
         page = page_of(with_embedded_videos(contents, posters, room=room))
-        used = len(page.encode()) - size
-        if size + used <= most_bytes:
+        size = len(page.encode())
+        if size <= most_bytes:
             return page
-        # A card with a video has more markup than the bare one.
-        room = min(room - 1, room * (most_bytes - size) // used)
+        if room <= 0:
+            raise InvalidArgument(
+                f"The page has {size} bytes without any picture or video, and "
+                f"max_single_file_bytes allows {most_bytes}. Allow more, or write a "
+                "folder."
+            )
+        # The page has text, too.
+        room -= size - most_bytes
 
 
 def _check_target(target: Path, *, is_page: bool) -> None:
@@ -188,7 +187,7 @@ def _replacing_folder(target: Path) -> Iterator[Path]:
     If the block raises, it is removed, and what was there stays as it was.
     """
     _make_parents(target)
-    folder = temporary_path(target)
+    folder, before = temporary_path(target), temporary_path(target)
     try:
         for name in ("", VIDEOS, POSTERS):
             (folder / name).mkdir()
@@ -199,25 +198,15 @@ def _replacing_folder(target: Path) -> Iterator[Path]:
         for name in (VIDEOS, POSTERS):
             if not any((folder / name).iterdir()):
                 (folder / name).rmdir()
-        _exchange(folder, target)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _exchange(folder: Path, target: Path) -> None:
-    """Give a finished folder its name; what had it is removed after that."""
-    before = temporary_path(target)
-    try:
         if target.exists():
             target.rename(before)
-        try:
-            folder.rename(target)
-        except BaseException:
-            if before.exists():
-                before.rename(target)
-            raise
+        folder.rename(target)
     except OSError as error:
         raise FileNotWritten(
             target, error.strerror, then="the same command writes it again"
         ) from error
-    shutil.rmtree(before, ignore_errors=True)
+    finally:
+        if before.exists() and not target.exists():
+            before.rename(target)
+        for left in (folder, before):
+            shutil.rmtree(left, ignore_errors=True)

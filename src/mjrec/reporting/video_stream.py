@@ -8,7 +8,7 @@ opens no other file for it.
 from __future__ import annotations
 
 import re
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -18,12 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UnreadableFile
-from ..formats.ffmpeg import (
-    FfmpegProcess,
-    as_file,
-    every_frame_arguments,
-    run_ffmpeg,
-)
+from ..formats.ffmpeg import as_file, every_frame_arguments, run_ffmpeg
 from ..formats.json_fields import unreadable
 from ..formats.regular_files import open_regular, regular_path
 from ..frames import Frame
@@ -34,11 +29,15 @@ _KINDS: Final = {".mp4": "mp4", ".avi": "avi", ".mkv": "matroska"}
 
 _HEADER: Final = re.compile(rb"#(?P<key>tb|dimensions) 0: (?P<a>\d+)[/x](?P<b>\d+)")
 # Stream, decoding time, presentation time, duration, size, checksum.
-_PACKET: Final = re.compile(rb"0, *-?\d+, *(?P<time>-?\d+), *(?P<duration>\d+), .*")
+_PACKET: Final = re.compile(
+    rb"0, *(?P<decoded>-?\d+), *(?P<time>-?\d+), *(?P<duration>\d+), .*"
+)
+# What stands where a file, such as an AVI, has no presentation times.
+_NO_TIME: Final = -(2**63)
 # A crafted file may claim any size.
 _MOST_PIXELS: Final = 16384 * 16384
-# ffmpeg reads sums of less than a hundred terms.
-_AT_ONCE: Final = 64
+# How many pictures are in memory.
+_AT_ONCE: Final = 16
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,9 @@ def read_stream(path: Path) -> VideoStream:
         packet = _PACKET.fullmatch(line)
         header = _HEADER.fullmatch(line)
         if packet is not None:
-            packets.append((int(packet["time"]), int(packet["duration"])))
+            time = int(packet["time"])
+            known = int(packet["decoded"]) if time == _NO_TIME else time
+            packets.append((known, int(packet["duration"])))
         elif header is not None:
             headers[header["key"]] = (int(header["a"]), int(header["b"]))
     if not packets or len(headers) < 2 or not headers[b"tb"][1]:
@@ -109,72 +110,43 @@ def read_stream(path: Path) -> VideoStream:
     return VideoStream(regular_path(path), height, width, times, seconds)
 
 
-def stream_frames(
-    stream: VideoStream, indices: Sequence[int]
-) -> Generator[Frame, None, None]:
+def frames_at(
+    stream: VideoStream, indices: Sequence[int], *, most_width: int | None = None
+) -> Iterator[Frame]:
     """Yield some pictures of a video, decoded, as `(height, width, 3) uint8`.
 
     Args:
         stream: of `read_stream`.
         indices: of the pictures, rising.
+        most_width: in pixels; wider ones are made smaller.
 
     Raises:
         EncoderError: it cannot be decoded so far.
         UnreadableFile: it has fewer pictures than it claims.
     """
+    width, scale = stream.width, ""
+    if most_width is not None and most_width < width:
+        width, scale = most_width, f"scale={most_width}:-2:flags=area,"
     for begin in range(0, len(indices), _AT_ONCE):
-        yield from _decoded(stream, indices[begin : begin + _AT_ONCE])
+        some = indices[begin : begin + _AT_ONCE]
+        wanted = "+".join(rf"eq(n\,{index})" for index in some)
+        data = run_ffmpeg(
+            [
+                *_reading(stream.path),
+                *("-vf", f"select={wanted},{scale}format=rgb24"),
+                *(*every_frame_arguments(), "-frames:v", str(len(some))),
+                *("-f", "rawvideo", "pipe:1"),
+            ],
+            what=f"The video {stream.path.name} cannot be decoded.",
+        )
+        if not data or len(data) % (len(some) * width * 3):
+            raise UnreadableFile(
+                stream.path, f"it has fewer than its {len(stream)} pictures"
+            )
+        yield from np.frombuffer(data, np.uint8).reshape(len(some), -1, width, 3)
 
 
-def _decoded(stream: VideoStream, indices: Sequence[int]) -> Iterator[Frame]:
-    wanted = "+".join(rf"eq(n\,{index})" for index in indices)
-    arguments = [
-        *_reading(stream.path),
-        *("-vf", f"select={wanted},format=rgb24", *every_frame_arguments()),
-        *("-frames:v", str(len(indices)), "-f", "rawvideo", "pipe:1"),
-    ]
-    what = f"The video {stream.path.name} cannot be decoded."
-    size = stream.height * stream.width * 3
-    with FfmpegProcess(arguments, what=what, writes=True) as process:
-        for _ in indices:
-            data = _read(process, size)
-            if len(data) < size:
-                process.wait()
-                raise UnreadableFile(
-                    stream.path, f"it has fewer than its {len(stream)} pictures"
-                )
-            frame = np.frombuffer(data, np.uint8)
-            yield frame.reshape(stream.height, stream.width, 3)
-
-
-def jpeg_at(stream: VideoStream, seconds: float, *, most_width: int) -> bytes:
-    """Return the picture that is shown at a time, as JPEG.
-
-    Args:
-        stream: of `read_stream`.
-        seconds: from the first picture on.
-        most_width: in pixels; a wider one is made smaller.
-
-    Raises:
-        EncoderError: it cannot be decoded.
-    """
-    # What JPEG means by its colours, whatever the video does.
-    scale = (
-        rf"scale=min({most_width}\,iw):-2:flags=area:out_color_matrix=bt601"
-        ":out_range=full,format=yuvj420p"
-    )
-    return run_ffmpeg(
-        [
-            *_reading(stream.path, "-ss", f"{seconds:.6f}"),
-            *("-frames:v", "1", "-vf", scale, "-c:v", "mjpeg", "-q:v", "3"),
-            *("-flags:v", "+bitexact", "-fflags", "+bitexact"),
-            *("-f", "image2pipe", "pipe:1"),
-        ],
-        what=f"The video {stream.path.name} cannot be decoded.",
-    )
-
-
-def _reading(path: Path, *options: str) -> list[str]:
+def _reading(path: Path) -> list[str]:
     """Return the arguments for reading a file."""
     kind = video_kind(path)
     if kind is None:
@@ -184,17 +156,6 @@ def _reading(path: Path, *options: str) -> list[str]:
     return [
         *("-hide_banner", "-loglevel", "error", "-nostdin"),
         *("-threads", "1", "-protocol_whitelist", "file,pipe"),
-        *("-max_pixels", str(_MOST_PIXELS), "-noautorotate", *options),
+        *("-max_pixels", str(_MOST_PIXELS), "-noautorotate"),
         *("-f", _KINDS[kind], "-i", source, "-map", "0:v:0"),
     ]
-
-
-def _read(process: FfmpegProcess, size: int) -> bytes:
-    """Return so many bytes; fewer at the end."""
-    data = bytearray()
-    while len(data) < size:
-        block = process.read(size - len(data))
-        if not block:
-            break
-        data += block
-    return bytes(data)

@@ -127,7 +127,9 @@ def place_viewer_camera(
     """
     mujoco.mjv_defaultCamera(camera)
     select_camera(camera, -1)
-    camera.lookat[:] = np.median(data.geom_xpos, axis=0)
+    # The median, without the numpy.ma that `np.median` imports.
+    places = np.sort(data.geom_xpos, axis=0)
+    camera.lookat[:] = (places[(len(places) - 1) // 2] + places[len(places) // 2]) / 2
     camera.distance = model.stat.extent
     for name, value in (config or {}).items():
         _assign(camera, name, value)

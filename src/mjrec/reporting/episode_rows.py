@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Episodes as rows of numbers: of monitors, as they are read, and of evaluations."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..evaluation.result_columns import ResultColumns
+from ..evaluation.statistics import Bootstrap
+from ..evaluation.summaries import TaskSummary, default_score_range, summarize_task
+from ..results.episodes import Episode
+from .contents import EPISODE, FAILED, TERMINATED, TRUNCATED
+
+ROLES: Final = ("best", "median", "worst")
+
+# The end of 1979. Gym 0.21 and 0.22 counted from some moment of their own.
+_EARLIEST: Final = 315_532_800.0
+
+
+def rows_of_monitor(
+    episodes: Iterable[Episode], *, run: int, wanted: Container[int | None]
+) -> tuple[NDArray[np.void], dict[int, int]]:
+    """Return the episodes of a monitor as they are read, and where some of them are.
+
+    Args:
+        episodes: read one after the other, and not kept.
+        run: the monitor, as a number.
+        wanted: the numbers of the episodes whose place is to be known.
+    """
+    places: dict[int, int] = {}
+
+    def row(index: int, episode: Episode) -> tuple[float | None, ...]:
+        number = episode.episode_id
+        # One whose number is not certain has none of these, and gets no video.
+        files = episode.video or episode.metadata or episode.trajectory
+        if files and number in wanted:
+            places[number] = index
+        outcome = TERMINATED * bool(episode.terminated)
+        outcome += TRUNCATED * bool(episode.truncated)
+        success = -1 if episode.success is None else episode.success
+        reward, length, end = episode.reward, episode.length, episode.end_time
+        return run, number, reward, length, end, outcome, success
+
+    rows = (row(index, episode) for index, episode in enumerate(episodes))
+    return np.fromiter(rows, EPISODE), places
+
+
+def in_time(rows: NDArray[np.void]) -> tuple[NDArray[np.void], NDArray[np.intp]]:
+    """Return episodes in the order of their ends, and where each has come.
+
+    Episodes that ended at the same time stay in their order; those without a time come
+    last.
+    """
+    order = np.argsort(rows["end_time"], kind="stable")
+    now_at = np.empty_like(order)
+    now_at[order] = np.arange(len(order))
+    rows = rows[order]
+    rows["end_time"][rows["end_time"] < _EARLIEST] = np.nan
+    return rows, now_at
+
+
+def rows_of_results(results: ResultColumns) -> NDArray[np.void]:
+    """Return the episodes of one task of an evaluation, in the order of its plan."""
+    rows = np.empty(len(results), EPISODE)
+    rows["run"] = results.seed
+    for name in ("episode", "total_reward", "length", "success"):
+        rows[name] = getattr(results, name)
+    rows["end_time"] = results.start_time + results.seconds
+    rows["outcome"] = TERMINATED * (results.terminated == 1)
+    rows["outcome"] += (TRUNCATED * (results.truncated == 1)).astype(np.uint8)
+    rows["outcome"][results.failed] = FAILED
+    return rows
+
+
+def summary_of_rows(
+    name: str, rows: NDArray[np.void], *, bootstrap: Bootstrap
+) -> TaskSummary:
+    """Return what is said of the episodes of monitors, none of which failed.
+
+    Args:
+        name: of the environment.
+        rows: the episodes.
+        bootstrap: how intervals are made.
+    """
+    success = rows["success"]
+    return summarize_task(
+        name,
+        total_rewards=rows["total_reward"],
+        runs=len(np.unique(rows["run"])),
+        lengths=rows["length"],
+        terminated=rows["outcome"] & TERMINATED,
+        truncated=rows["outcome"] & TRUNCATED,
+        success=np.where(success < 0, np.nan, success),
+        score_range=default_score_range(name),
+        bootstrap=bootstrap,
+    )
+
+
+def episodes_with_roles(rows: NDArray[np.void]) -> dict[int, tuple[str, ...]]:
+    """Return which episode is the best, the median, and the worst, by index.
+
+    Of equal returns the earlier one counts; the median of an even number is the lower
+    one; a return that is not a number is the worst. Failed episodes are none of them.
+    """
+    completed = np.flatnonzero(rows["outcome"] != FAILED)
+    if not len(completed):
+        return {}
+    returns = rows["total_reward"][completed]
+    is_number = ~np.isnan(returns)
+    values = np.where(is_number, returns, 0.0)
+    # What is no number comes first of all.
+    ordered = np.lexsort((values, is_number))
+    middle = ordered[(len(ordered) - 1) // 2]
+    roles: dict[int, tuple[str, ...]] = {}
+    for role, one in zip(ROLES, (ordered[-1], middle, ordered[0]), strict=True):
+        alike = (values == values[one]) & (is_number == is_number[one])
+        index = int(completed[np.argmax(alike)])
+        roles[index] = (*roles.get(index, ()), role)
+    return roles

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The videos of a report, copied beside its page or put into it.
+
+What is copied is a copy and no link: a report is as good without the recordings. Its
+files have names that this module makes, whatever the recorded ones are called.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import hashlib
+import re
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+from imageio.v3 import imwrite
+
+from ..errors import Error, UnreadableFile
+from ..formats.json_fields import unreadable
+from ..formats.regular_files import open_regular
+from ..machine import usable_cpus
+from .contents import ReportContents, ReportVideo
+from .video_stream import frames_at, read_stream, video_kind
+
+VIDEOS: Final = "videos"
+POSTERS: Final = "posters"
+
+_TEXT: Final = ".json"
+_MEDIA_TYPES: Final = {
+    ".mp4": "video/mp4",
+    ".avi": "video/x-msvideo",
+    ".mkv": "video/x-matroska",
+}
+_OWN_NAME: Final = re.compile(r"\d{4,18}-[a-z0-9-]{1,60}\.(mp4|avi|mkv|json|jpg)")
+_READ_SIZE: Final = 1 << 20
+_LONGEST_SLUG: Final = 60
+_POSTER_WIDTH: Final = 640
+_POSTER_QUALITY: Final = 85
+
+
+@dataclass(frozen=True)
+class ReportProgress:
+    """How far the making of a report is.
+
+    Attributes:
+        what: `"posters"` or `"videos"`.
+        done: how many.
+        total: of how many.
+    """
+
+    what: str
+    done: int
+    total: int
+
+
+OnProgress = Callable[[ReportProgress], object]
+
+
+def is_own_name(name: str) -> bool:
+    """Tell whether a report's video or poster may be called so."""
+    return _OWN_NAME.fullmatch(name) is not None
+
+
+def posters_of(contents: ReportContents, on_progress: OnProgress) -> list[bytes | None]:
+    """Return a JPEG of each video; None for text, and for what cannot be decoded.
+
+    Videos learn how long they play; what cannot be decoded is a problem.
+
+    Args:
+        contents: whose videos have their recorded files.
+        on_progress: is told of each poster.
+    """
+    moving = [video for video in contents.videos if video.path.suffix != _TEXT]
+    posters: dict[int, bytes | None] = {}
+    # Each is a short run of ffmpeg, on one CPU.
+    with ThreadPoolExecutor(usable_cpus()) as pool:
+        for video, made in zip(moving, pool.map(_poster, moving), strict=True):
+            posters[id(video)] = made if isinstance(made, bytes) else None
+            if isinstance(made, Error):
+                contents.problems.append(f"There is no picture of a video: {made}")
+            on_progress(ReportProgress(POSTERS, len(posters), len(moving)))
+    return [posters.get(id(video)) for video in contents.videos]
+
+
+def _poster(video: ReportVideo) -> bytes | Error:
+    """Return the picture in the middle of a video.
+
+    The first one is often a robot in its initial pose, alike in all videos of a task,
+    and the last one a fall; what happens is in between.
+    """
+    try:
+        stream = read_stream(video.path)
+        if video.seconds is None:
+            video.seconds = stream.seconds
+        middle = (len(stream) - 1) // 2
+        [frame] = frames_at(stream, [middle], most_width=_POSTER_WIDTH)
+    except Error as error:
+        return error
+    image: Any = imwrite("<bytes>", frame, extension=".jpg", quality=_POSTER_QUALITY)
+    return bytes(image)
+
+
+def copy_videos(
+    contents: ReportContents,
+    posters: Sequence[bytes | None],
+    folder: Path,
+    on_progress: OnProgress,
+) -> None:
+    """Copy videos and posters into a folder, and write their names into the contents.
+
+    Args:
+        contents: whose videos have their recorded files.
+        posters: of the videos.
+        folder: of the page.
+        on_progress: is told of each video.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    names = [task.name for task in contents.tasks for _ in task.videos]
+    total = len(names)
+    for index, (video, name) in enumerate(zip(contents.videos, names, strict=True)):
+        stem = f"{index:04d}-{_slug(name)}"
+        poster = posters[index]
+        try:
+            file = f"{VIDEOS}/{stem}{_ending(video.path)}"
+            _put(contents, video, file, _copy(video.path, folder / file))
+        except UnreadableFile as error:
+            _leave_out(contents, video, error)
+        if poster is not None:
+            video.poster = f"{POSTERS}/{stem}.jpg"
+            (folder / video.poster).write_bytes(poster)
+        on_progress(ReportProgress(VIDEOS, index + 1, total))
+
+
+def with_embedded_videos(
+    contents: ReportContents, posters: Sequence[bytes | None], *, room: int
+) -> ReportContents:
+    """Return contents whose videos stand in the page itself, as far as there is room.
+
+    All posters come first, then the videos in their order. What is left out is shown
+    by its poster, and says so.
+
+    Args:
+        contents: whose videos have their recorded files; they stay as they are.
+        posters: of the videos.
+        room: for how many characters, as they stand in the page.
+    """
+    contents = replace(
+        contents,
+        problems=[*contents.problems],
+        tasks=[
+            replace(task, videos=[replace(v, notes=[*v.notes]) for v in task.videos])
+            for task in contents.tasks
+        ],
+    )
+    for video, poster in zip(contents.videos, posters, strict=True):
+        if poster is not None and _length_of_url(len(poster)) <= room:
+            video.poster = _data_url("image/jpeg", poster)
+            room -= len(video.poster)
+    left_out = 0
+    for video in contents.videos:
+        try:
+            media_type = _MEDIA_TYPES.get(_ending(video.path))
+            with unreadable(video.path), open_regular(video.path) as file:
+                data = file.read(max(0, room)) if media_type else b""
+                is_whole = not file.read(1)
+        except UnreadableFile as error:
+            _leave_out(contents, video, error)
+            continue
+        if media_type and is_whole and _length_of_url(len(data)) <= room:
+            url = _data_url(media_type, data)
+            _put(contents, video, url, hashlib.sha256(data).hexdigest())
+            room -= len(url)
+        else:
+            left_out += 1
+            note = f"Not embedded, for its size. It is the file {video.path}."
+            video.notes.append(note)
+    if left_out:
+        contents.problems.append(
+            f"{left_out} of {len(contents.videos)} videos are not embedded, because "
+            "this one file would be too large: a report that is a folder has all of "
+            "them."
+        )
+    return contents
+
+
+def _put(contents: ReportContents, video: ReportVideo, file: str, sha256: str) -> None:
+    """Let a video have its file in the report, with the hash that this has."""
+    if video.sha256 not in (None, sha256):
+        note = (
+            "This is not the file that its metadata describe: they have the SHA-256 "
+            f"{video.sha256}."
+        )
+        video.notes.append(note)
+        contents.problems.append(f"The video {video.path.name} was changed. {note}")
+    video.file, video.sha256 = file, sha256
+
+
+def _copy(source: Path, target: Path) -> str:
+    """Copy a file, and return its sha256."""
+    digest = hashlib.sha256()
+    with contextlib.ExitStack() as stack:
+        with unreadable(source):
+            file = stack.enter_context(open_regular(source))
+        copy = stack.enter_context(target.open("xb"))
+        while block := _read(file, source):
+            digest.update(block)
+            copy.write(block)
+    return digest.hexdigest()
+
+
+def _read(file: BinaryIO, source: Path) -> bytes:
+    with unreadable(source):
+        return file.read(_READ_SIZE)
+
+
+def _leave_out(
+    contents: ReportContents, video: ReportVideo, error: UnreadableFile
+) -> None:
+    problem = f"The video {video.path} is left out: {error.reason}."
+    contents.problems.append(problem)
+    video.notes.append("The file of this video is not part of the report.")
+
+
+def _ending(path: Path) -> str:
+    """Return the ending of a copy, by what the file is.
+
+    Raises:
+        UnreadableFile: it is nothing that a report shows, or cannot be read.
+    """
+    kind = video_kind(path) or (_TEXT if path.suffix == _TEXT else None)
+    if kind is None:
+        raise UnreadableFile(path, "it is no video of a kind that is known here")
+    return kind
+
+
+def _slug(name: str) -> str:
+    slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_LONGEST_SLUG]
+    return slug.strip("-") or "video"
+
+
+def _length_of_url(size: int) -> int:
+    # Four characters for three bytes.
+    return 4 * (size // 3 + 1) + 100
+
+
+def _data_url(media_type: str, data: bytes) -> str:
+    return f"data:{media_type};base64,{base64.b64encode(data).decode()}"

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers, names and addresses as they stand on a page.
+
+Texts may be of strangers: they are cut where they are long, and what nobody sees
+(control characters, marks that turn the direction of writing) is spelled out.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterable
+from typing import Any, Final
+from urllib.parse import quote
+
+from ..evaluation.statistics import Interval
+
+# What stands where there is no number.
+NOTHING: Final = "\N{EN DASH}"
+
+# Spaces between figures, which are no stranger's trick, and the ends of lines.
+_SEEN: Final = "\n\N{NO-BREAK SPACE}\N{NARROW NO-BREAK SPACE}"
+_DATA: Final = re.compile(r"data:(video|image)/[a-z0-9.+-]+;base64,[A-Za-z0-9+/=]*")
+_SPECIAL: Final = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
+
+
+def decimals_for(values: Iterable[float | None]) -> int:
+    """Return how many decimals show what is to be seen of numbers of this size."""
+    known = [abs(v) for v in values if v is not None and math.isfinite(v)]
+    largest = max(known, default=0.0)
+    if largest == 0:
+        return 0
+    # Four figures of the largest, but never less than whole numbers.
+    return min(9, max(0, 3 - math.floor(math.log10(largest))))
+
+
+def number(value: float | None, decimals: int) -> str:
+    """Return a number, from 10 000 on with its thousands apart, or a dash."""
+    if value is None or math.isnan(value):
+        return NOTHING
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    if abs(value) >= 1e15:
+        return f"{value:.4g}"
+    # Four figures in a row are still seen at once.
+    group = "," if abs(value) >= 10_000 else ""
+    text = f"{value:z{group}.{decimals}f}"
+    return text.replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def interval_text(interval: Interval | None, decimals: int) -> str:
+    """Return where an interval begins and ends; nothing for none."""
+    if interval is None:
+        return ""
+    return f"{number(interval.low, decimals)} to {number(interval.high, decimals)}"
+
+
+def counted(count: int, noun: str) -> str:
+    """Return `1 task`, `2 tasks`."""
+    return f"{number(count, 0)} {noun}{'' if count == 1 else 's'}"
+
+
+def spelled_out(text: str, longest: int = 1000) -> str:
+    """Return a text with what nobody sees spelled out, and cut where it is long."""
+    if len(text) > longest:
+        text = text[:longest] + "…"
+    if text.isprintable():
+        return text
+    return "".join(
+        c if c.isprintable() or c in _SEEN else f"\\u{ord(c):04x}" for c in text
+    )
+
+
+def address(path: str) -> str:
+    """Return the address of a file beside the page, whatever its name looks like."""
+    if _DATA.fullmatch(path):
+        return path
+    # So that neither `javascript:x` nor `//host/x` is more than a file's name.
+    quoted = quote(path.removeprefix("./"), safe="/", errors="surrogateescape")
+    return f"./{quoted}"
+
+
+def page_json(value: Any) -> str:
+    """Return JSON that cannot end the element which it stands in."""
+    text = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
+    return text.translate(_SPECIAL)
