@@ -123,20 +123,17 @@ def write_evaluation(
             for r in results
             if r.task == task.name and r.total_reward is not None
         ]
-        folder = directory / task.folder / "seed-000"
-        write_journal(folder, infix, task.name, entries)
+        write_journal(directory / task.folder, infix, task.name, entries)
     if not finished:
         content = {"format_version": 1, "plan": to_json(plan)}
         (directory / "evaluation.json").write_text(dumps(content))
         return
-    shown, folders = videos or {}, {each.name: each.folder for each in plan.tasks}
+    shown = videos or {}
 
     def files(result: EpisodeResult) -> EpisodeFiles:
         first = result.unit == units[0] and result.task in shown
-        return EpisodeFiles(
-            folder=f"{folders[result.task]}/seed-000",
-            video=shown[result.task] if first else None,
-        )
+        folder = result.task.replace("/", "-")
+        return EpisodeFiles(folder, video=shown[result.task] if first else None)
 
     write_results(
         directory,

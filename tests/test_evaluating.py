@@ -134,8 +134,7 @@ def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
     assert worst.seed * 2 + worst.episode == returns.index(min(returns))
     assert evaluation.pending == {}
     assert {*evaluation.videos} == {
-        tmp_path / "e" / columns.folders[columns.monitor[index]] / name
-        for index, name in columns.videos.items()
+        tmp_path / "e" / str(columns.video_path(index)) for index in columns.videos
     }
     for path in evaluation.videos:
         said = json.loads(metadata_path(path).read_text())["selection"]

@@ -25,7 +25,7 @@ from recordings import (
 from waiting import wait_until
 
 import mjrec
-from mjrec import EncoderError, FileNotWritten, InvalidArgument, Monitor, RenderError
+from mjrec import EncoderError, FileNotWritten, Monitor, RenderError
 
 both_ways = pytest.mark.parametrize("on_error", ["raise", "warn"])
 
@@ -100,22 +100,6 @@ def faults_of(directory: Path) -> list[tuple[int | None, str]]:
     return [(fault["episode_id"], fault["what"]) for fault in found]
 
 
-@pytest.mark.parametrize("value", ["ignore", None, True])
-def test_on_error_is_one_of_two(value: Any, pendulum: Any) -> None:
-    """Nothing else, and the message says what there is."""
-    with pytest.raises(InvalidArgument, match='"raise", or "warn"'):
-        pendulum(on_error=value)
-
-
-def test_wrong_use_is_an_error_in_any_case(pendulum: Any, out: Path) -> None:
-    """A step before the first reset; a run without faults lists none."""
-    monitor = pendulum(render="off", on_error="warn")
-    with pytest.raises(mjrec.ResetNeeded):
-        monitor.step(0)
-    monitor.close()
-    assert faults_of(out) == []
-
-
 # --- live videos ---------------------------------------------------------------------
 
 
@@ -151,7 +135,7 @@ def test_a_dead_encoder(
     monitor = pendulum(render="live")
     run(monitor, 4)
     assert kill_ffmpeg() == 1
-    with pytest.raises(EncoderError):
+    with pytest.raises(EncoderError, match="exit status: -9"):
         go_on(monitor, 4)
     monitor.close()
     monitor = pendulum(render="live", on_error="warn", force=True)
@@ -161,8 +145,11 @@ def test_a_dead_encoder(
     run(monitor)
     monitor.close()
     assert faults_of(out) == [(0, "video")]
-    assert metadata_of(out, 0)["broken"] is True
+    metadata, details = metadata_of(out, 0), manifest_of(out)
+    assert metadata["broken"] is True
+    assert "-9" in metadata["broken_reason"]
     assert len(frames_in(out, 1)) == 9
+    assert (len(details["videos"]), len(details["mjrec"]["broken"])) == (1, 1)
     assert stats_of(out)["episode_lengths"] == [8, 8]
     said = [r.levelno for r in caplog.records if "Not recorded whole" in r.message]
     assert said == [logging.WARNING]

@@ -208,6 +208,7 @@ def test_a_line_that_does_not_fit_is_taken_back(path: Path) -> None:
         pytest.raises(OSError, match="space"),
     ):
         writer.append(NEXT)
+    assert len(path.read_bytes().splitlines()) == 1
     with path.open("ab") as file:
         file.write(b'{"episode_id": 4, "le')
     writer.append(NEXT)

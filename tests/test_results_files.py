@@ -114,8 +114,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert infinite == RESULTS[3]
     columns = read.columns["a,b-v0"]
     assert columns.videos == {0: VIDEO}
-    assert columns.trajectory_prefix(0) == "openaigym.trajectory.0.w.episode000000"
-    assert columns.trajectory_prefix(1) is None
+    assert columns.places == {("a,b-v0/seed-007", "0.w"): 0}
     assert columns.failed.tolist() == [False, False, True, False]
 
 

@@ -39,9 +39,9 @@ from ..json_text import dumps
 from .dataclass_json import from_json, to_json
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
-from .result_columns import ResultColumns
 from .result_tables import (
     EpisodeFiles,
+    ResultColumns,
     read_tables,
     write_results_table,
     write_timing_table,
