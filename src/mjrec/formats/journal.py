@@ -11,8 +11,9 @@ episode is a line::
      "success": null, "chosen": true, "recording": "deferred"}
 
 `chosen` is there where the schedule chose the episode, `recording` (`"live"` or
-`"deferred"`) where it has a video of its own. Every other line is an event, an object
-of one key: its kind, one of `EVENTS`. The first line is the `run`'s.
+`"deferred"`) where it has a video of its own, `evaluation` (seed, number and MuJoCo's
+warnings) where the episode is one of an evaluation. Every other line is an event, an
+object of one key: its kind, one of `EVENTS`. The first line is the `run`'s.
 
 Times are seconds since the epoch. Keys that this version does not know are ignored.
 
@@ -40,6 +41,7 @@ from .json_fields import (
     field,
     integer,
     json_object,
+    mapping,
     number,
     optional,
     text,
@@ -59,11 +61,11 @@ MOST_EPISODES = 10**15
 # In their order: what the run is; its machine, packages and code; an episode that is
 # no part of the statistics; a clip that is over; an action that does not fit into rows;
 # an episode whose video falls out while its trajectory stays; what could not be
-# recorded; which videos were kept; the end; and that another process has put the
-# directory in order.
+# recorded; which videos were kept; the end; that another process has put the directory
+# in order; and of an evaluation's episodes, that one begins, or has failed.
 EVENTS = (
     *("run", "surroundings", "cut", "clip", "action", "dropped"),
-    *("fault", "keep", "closed", "recovered"),
+    *("fault", "keep", "closed", "recovered", "begun", "failed"),
 )
 
 # The reason of an episode that ended with its process.
@@ -93,6 +95,7 @@ class JournalEntry:
         success: what the environment said of it; None where it said nothing.
         chosen: the schedule chose it.
         recording: `"live"` or `"deferred"`; None where it has no video of its own.
+        evaluation: `seed`, `episode` and `warnings` of an evaluation's episode.
     """
 
     episode_id: int
@@ -108,6 +111,7 @@ class JournalEntry:
     success: bool | None = None
     chosen: bool = False
     recording: str | None = None
+    evaluation: Mapping[str, Any] | None = None
 
 
 class JournalWriter:
@@ -143,7 +147,8 @@ class JournalWriter:
                 it was before. Or it was removed.
         """
         # Not `asdict`, which would copy the options deeply; they may not allow it.
-        left_out = [key for key in ("chosen", "recording") if not vars(entry)[key]]
+        optional_keys = ("chosen", "recording", "evaluation")
+        left_out = [key for key in optional_keys if not vars(entry)[key]]
         values = {k: v for k, v in vars(entry).items() if k not in left_out}
         line = dumps(values)
         if len(line) >= _LONGEST_LINE:
@@ -344,6 +349,7 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
         success=field(values, "success", optional(boolean), default=None),
         chosen=field(values, "chosen", boolean, default=False),
         recording=field(values, "recording", optional(text), default=None),
+        evaluation=field(values, "evaluation", optional(mapping), default=None),
     )
 
 

@@ -158,6 +158,17 @@ class EnvironmentMonitor(MonitorBase):
     """The part of one environment's monitor that does not depend on the framework."""
 
     _recorder: Recorder
+    # Closed with the monitor; empty where its user closes it.
+    _environments: list[Any]
+
+    @property
+    def recorder(self) -> Recorder:
+        """What writes the files."""
+        return self._recorder
+
+    def leave_environment_open(self) -> None:
+        """Let `close` end the recording only: the environment is used again."""
+        self._environments.clear()
 
     @property
     def infix(self) -> str:
@@ -271,11 +282,12 @@ class EnvironmentMonitor(MonitorBase):
         )
         self._recorders = [self._recorder]
         states = [each for each in (known.states, clip_states) if each is not None]
+        environments = self._environments = [env]
         self._guard_by(
             [
                 self._recorder.close,
                 *(each.close for each in states),
-                functools.partial(close_environment, env),
+                functools.partial(_close_each, close_environment, environments),
             ]
         )
 
@@ -335,6 +347,11 @@ def call_all(calls: Iterable[Callable[[], object]]) -> None:
             first = first or error
     if first is not None:
         raise first
+
+
+def _close_each(close: Callable[[Any], None], environments: Iterable[Any]) -> None:
+    for environment in environments:
+        close(environment)
 
 
 def _note_last_error(recorders: Sequence[Recorder]) -> None:

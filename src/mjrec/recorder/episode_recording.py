@@ -292,6 +292,10 @@ class EpisodeRecording:
             "kept": is_kept,
             "video": self._promise,
         }
+        if self._promise is None and run.subject.rendering.mode == DEFERRED:
+            # For those who choose later, among the episodes of several monitors.
+            path = run.directory / video_prefix(run.infix, self.episode_id)
+            facts["possible_video"] = run.promise(path, DEFERRED, second_name={})
         if run.selection:
             facts["candidate"] = self._is_candidate
         return Recording(

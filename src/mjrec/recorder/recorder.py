@@ -89,6 +89,8 @@ class Recorder:
         closed: nothing is recorded any more.
         fast: what the next step may be recorded with; None where it needs a closer
             look.
+        evaluation_facts: returns what the journal's line of an ended episode says of
+            the evaluation that it belongs to; None where it belongs to none.
     """
 
     def __init__(
@@ -118,6 +120,7 @@ class Recorder:
         self.closed = False
         # What the next step may be recorded with; None where it needs a closer look.
         self.fast: FastPath | None = None
+        self.evaluation_facts: Callable[[], Mapping[str, Any] | None] = lambda: None
 
         selection = self._choice.selection
         keep = None if selection is None else selection.facts()
@@ -305,6 +308,14 @@ class Recorder:
             except FileNotWritten as error:
                 if not self._journal.tolerates("statistics", error, of_episode=False):
                     raise
+
+    def note_event(self, kind: str, facts: Any) -> None:
+        """Write an event of an evaluation into the journal; see `formats.journal`.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        self._journal.note(kind, facts)
 
     def note_error(self, error: BaseException) -> None:
         """Note that the environment's step or reset has raised, or its user has.
@@ -558,7 +569,8 @@ class Recorder:
         failures = _Failures()
         with failures:
             if end.episode is not None:
-                facts = {**vars(end.episode), **choice}
+                of_evaluation = {"evaluation": self.evaluation_facts()}
+                facts = {**vars(end.episode), **choice, **of_evaluation}
                 del facts["total_steps"]
                 self._journal.add(JournalEntry(**facts))
             else:
