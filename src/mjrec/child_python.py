@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import IO, Any, Self, TypeAlias
 
 from .errors import KINDS, Error, rebuilt
+from .patience import Patience
 
 logger = logging.getLogger(__name__)
 
@@ -151,9 +152,9 @@ class Child:
 
     def messages(self, seconds: float) -> Iterator[dict[str, Any] | None]:
         """Yield its messages until it ends; None once it was silent for so long."""
-        last = time.monotonic()
-        while (rest := last + seconds - time.monotonic()) > 0:
-            if not wait_for_news([self], rest):
+        patience = Patience(seconds)
+        while not patience.is_over:
+            if not patience.wait(lambda slice_: wait_for_news([self], slice_)):
                 continue
             try:
                 while (message := self.receive()) is not None:
@@ -161,7 +162,6 @@ class Child:
                         yield message
             except EOFError:
                 return
-            last = time.monotonic()
         yield None
 
     def stacks(self) -> str:
@@ -180,13 +180,15 @@ class Child:
 
     def last_words(self) -> str:
         """Return what became of it, and the end of what it printed."""
-        said = self._words_from(max(0, self._size_of_words() - _MOST_WORDS_READ))
+        how = self.how_it_ended()
         # What Python says of a crash ends with the names of dozens of modules.
-        words = said.partition("\nExtension modules:")[0].strip()
-        return (
-            f"{self.how_it_ended()}. The end of what it said: "
-            f"{words[-_END_OF_WORDS:] or '(nothing)'}"
-        )
+        words = self.printed().partition("\nExtension modules:")[0].strip()
+        end = words[-_END_OF_WORDS:] or "(nothing)"
+        return f"{how}. The end of what it said: {end}"
+
+    def printed(self) -> str:
+        """Return the end of what it has printed."""
+        return self._words_from(max(0, self._size_of_words() - _MOST_WORDS_READ))
 
     def how_it_ended(self) -> str:
         """Return in words its exit status, for which it is waited some seconds."""
