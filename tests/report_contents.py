@@ -108,9 +108,11 @@ def contents(*tasks: ReportTask, **changes: Any) -> ReportContents:
             task("dm_control/walker-walk", _returns(900, 40), seeds=5),
             task("dm_control/cheetah-run", _returns(600, 100), seeds=5),
         )
-    scores = {t.name: t.episodes["total_reward"] / 1000 for t in tasks}
-    finite = all(np.isfinite(s).all() and len(s) for s in scores.values())
-    across = {"evaluation": summarize_across(scores, bootstrap=_FEW)} if finite else {}
+    returns = {t.name: t.episodes["total_reward"] for t in tasks}
+    scales = dict.fromkeys(returns, (0.0, 1000.0))
+    finite = all(np.isfinite(s).all() and len(s) for s in returns.values())
+    told = summarize_across(returns, scales, bootstrap=_FEW)
+    across = {"evaluation": told} if finite else {}
     made = ReportContents(
         title="An evaluation", tasks=list(tasks), across=across, bootstrap=_FEW
     )

@@ -19,8 +19,8 @@ from recordings import frames_in, metadata_of, videos_in
 from trajectories_by_hand import write_log
 
 from mjrec import Monitor, load_results
-from mjrec.commands import main
-from mjrec.formats.journal import JournalEntry, JournalWriter
+from mjrec.commands import COMMANDS, main
+from report_recordings import entry, write_evaluation, write_journal
 
 PENDULUM = """
 <mujoco>
@@ -268,7 +268,8 @@ def test_bad_input_is_one_clear_error(
     """It says what was asked and what there is, and leaves nothing behind."""
     status, _, err = mjrec("record", *arguments, "--out", tmp_path / "out")
     assert status == 1
-    assert err.startswith("mjrec: ")
+    # MuJoCo may warn of the model before that.
+    assert [line[:7] for line in err.splitlines()].count("mjrec: ") == 1
     for words in said:
         assert words in err
     assert not (tmp_path / "out").exists()
@@ -407,24 +408,8 @@ def test_list_json_is_a_line_for_each_episode(mjrec: Any, tmp_path: Path) -> Non
 
 def test_list_says_which_videos_are_pending(mjrec: Any, tmp_path: Path) -> None:
     """In place of the name that there is not yet."""
-    journal = JournalWriter(tmp_path / "openaigym.episodes.0.7.jsonl")
-    for number in range(2):
-        journal.append(
-            JournalEntry(
-                episode_id=number,
-                length=5,
-                reward=0.5,
-                type="e",
-                start_time=1.0,
-                end_time=2.0,
-                seed=None,
-                options=None,
-                terminated=True,
-                truncated=False,
-                recording="deferred" if number else None,
-            )
-        )
-    journal.close()
+    entries = [entry(0), entry(1, recording="deferred")]
+    write_journal(tmp_path, "0.7", "X-v0", entries)
     trajectory = write_log(tmp_path, 1, steps=2)
     _, out, _ = mjrec("list", tmp_path)
     assert out.count("pending") == 1
@@ -451,6 +436,26 @@ def test_list_shows_the_directories_in_one(mjrec: Any, tmp_path: Path) -> None:
     _, out, _ = mjrec("list", tmp_path, "--json")
     lines = [json.loads(line) for line in out.splitlines()]
     assert [line["directory"] for line in lines] == ["a", "a", "b"]
+
+
+def test_list_shows_an_evaluation_as_one(mjrec: Any, tmp_path: Path) -> None:
+    """Task, seed, return and video of each episode; what failed says so."""
+    name = "openaigym.video.0.batch.video000000.mp4"
+    write_evaluation(tmp_path, ["a/x", "b/y"], videos={"a/x": name, "b/y": name})
+    (tmp_path / "a-x" / name).touch()
+    status, out, _ = mjrec("list", tmp_path)
+    assert status == 0
+    rows = [line.split() for line in out.splitlines() if "/" in line]
+    assert rows[:3] == [
+        ["a/x", "0", "0", "10", "3", "truncated", name],
+        ["a/x", "0", "1", "10", "1", "truncated"],
+        ["a/x", "7", "0", "10", "failed"],
+    ]
+    assert [rows[4][-1], len(rows)] == ["pending", 8]
+    _, out, _ = mjrec("list", tmp_path, "--json")
+    first, *_ = (json.loads(line) for line in out.splitlines())
+    assert (first["task"], first["seed"], first["reward"]) == ("a/x", 0, 3.0)
+    assert (first["video"], first["pending"]) == (str(tmp_path / "a-x" / name), False)
 
 
 def test_list_says_that_there_is_nothing(mjrec: Any, tmp_path: Path) -> None:
@@ -484,7 +489,7 @@ def test_reader_may_leave_early(mjrec: Any, tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-@pytest.mark.parametrize("command", ["record", "list", "doctor"])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_flows(mjrec: Any, capsys: Any, command: str) -> None:
     """Every command says what it does; descriptions break only at the margin."""
     with pytest.raises(SystemExit) as left:
@@ -494,6 +499,63 @@ def test_help_flows(mjrec: Any, capsys: Any, command: str) -> None:
     assert f"usage: mjrec {command}" in out
     words = " ".join(out.replace("│", " ").split())
     assert command != "record" or "1000 where the environment itself has no" in words
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unneeded"),
+    [
+        (["--help"], {"tyro", "rich", "numpy", "mujoco", "h5py"}),
+        (["list", "."], {"mujoco", "gymnasium", "h5py", "scipy", "imageio"}),
+    ],
+)
+def test_a_command_loads_only_what_it_needs(
+    tmp_path: Path, arguments: list[str], unneeded: set[str]
+) -> None:
+    """So that help is there at once, and a list nearly so."""
+    code = (
+        "import sys\n"
+        "from mjrec.commands import main\n"
+        "try:\n"
+        "    main(sys.argv[1:])\n"
+        "finally:\n"
+        "    print(*sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout
+    assert not unneeded & set(done.stderr.split())
+
+
+def test_what_is_said_by_mujoco_and_of_a_policy_is_said_once(
+    mjrec: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of many episodes, and of several workers of an evaluation."""
+    monkeypatch.chdir(tmp_path)
+    # A tenth of a second a step, with a spring that is far too stiff for it.
+    unstable = PENDULUM.replace("<mujoco>", '<mujoco><option timestep="0.1"/>')
+    unstable = unstable.replace("ref=", 'stiffness="1e9" ref=')
+    Path("unstable.xml").write_text(unstable)
+    Path("crash_policy.py").write_text(
+        "def crash(observation):\n    raise RuntimeError('boom')\n"
+    )
+    run = ("--out", "a", "--episodes", 3, "--schedule", "none", "--max-steps", 50)
+    status, _, err = mjrec("record", "unstable.xml", *run)
+    assert (status, err.count("The simulation is unstable")) == (0, 1)
+    policy = ("--policy", "crash_policy:crash")
+    status, _, err = mjrec("record", "unstable.xml", "--out", "b", *policy)
+    assert status == 1
+    assert err.count('crash_policy.py", line 2, in crash') == 1
+    status, _, err = mjrec(
+        *("evaluate", "Hopper-v5", "CartPole-v1", "--out", "c", "--keep", "none"),
+        *("--episodes", 2, "--num-seeds", 2, "--workers", 2, *policy),
+    )
+    assert status == 1
+    assert err.count('crash_policy.py", line 2, in crash') == 1
 
 
 def _start(tmp_path: Path, **streams: Any) -> subprocess.Popen[bytes]:

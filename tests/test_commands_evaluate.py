@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import pytest
 from parts import parametrize
 
 from mjrec import commands
-from mjrec.commands.evaluate import evaluate
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -35,7 +33,6 @@ def run(
     """Return what runs the command and gives its status and what it said."""
     (tmp_path / "few_policies.py").write_text(POLICIES)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(commands._COMMANDS, "evaluate", evaluate)
 
     def run(*arguments: str) -> tuple[int, str, str]:
         small = ["--episodes", "2", "--num-seeds", "1", "--max-steps", "5"]
@@ -140,9 +137,7 @@ def test_ctrl_c_says_how_to_go_on(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    # By its name it is the command, which has the name of its module.
-    module = sys.modules[evaluate.__module__]
-    monkeypatch.setattr(module, "evaluate_policy", interrupted)
+    monkeypatch.setattr("mjrec.commands.evaluate.evaluate_policy", interrupted)
     status, _, err = run(TASK, "--policy", "zero")
     assert status == 130
     assert "--resume goes on" in err

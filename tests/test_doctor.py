@@ -68,10 +68,22 @@ def test_a_machine_that_renders() -> None:
     packages = {package["name"]: package for package in facts["packages"]}
     assert packages["mujoco"]["version"] == importlib.metadata.version("mujoco")
     assert packages["gymnasium"]["works"] is True, packages["gymnasium"]
+    extras = {extra["name"]: extra for extra in facts["extras"]}
+    assert extras["SciPy"]["version"] == importlib.metadata.version("scipy")
+    assert extras["Slurm"]["version"] or "login node" in extras["Slurm"]["fix"]
+    assert {"Ray", "submitit", "Dask", "report", "GPU"} < extras.keys()
     # A new key is added here, none is renamed.
     assert list(facts) == [
         *("can_render", "backend", "reason", "backends", "problems"),
-        *("gpu_device_files", "ffmpeg", "packages", "cpus", "python", "platform"),
+        *(
+            "gpu_device_files",
+            "ffmpeg",
+            "packages",
+            "extras",
+            "cpus",
+            "python",
+            "platform",
+        ),
     ]
     assert list(by_name["egl"]) == [
         *("backend", "renders", "gl_renderer", "gl_vendor", "gl_version"),
@@ -123,6 +135,10 @@ def report_of(**changed: Any) -> MachineReport:
             Package("dm_control", None, fix="To install it:\n  pip install x"),
             Package("mujoco", "9", works=False, cause="It is too new.", fix="Wait."),
         ),
+        extras=(
+            Package("SciPy", "1.14"),
+            Package("Ray", None, fix='python -m pip install "mjrec[ray]"'),
+        ),
         cpus=Cpus(usable=2, present=64, allowed=4, quota=2.5),
         python="3.11.7",
         platform="Linux",
@@ -157,6 +173,8 @@ def test_what_people_see() -> None:
         "Cause: It is too new.",
         "2 usable (4 allowed of 64 present, a quota of 2.5)",
         "/dev/nvidia0",
+        "SciPy       1.14",
+        'python -m pip install "mjrec[ray]"',
     ):
         assert said in text
 

@@ -15,7 +15,7 @@ import pytest
 import mjrec
 from mjrec.environments.episode_seeds import episode_seeds
 from mjrec.environments.from_name import environment_from_name
-from mjrec.environments.options import EnvironmentOptions
+from mjrec.environments.named_environment import EnvironmentOptions
 
 dm_env = pytest.importorskip("dm_env")
 pytest.importorskip("dm_control")
@@ -25,8 +25,6 @@ from dm_control import suite  # noqa: E402  likewise
 from dm_env import specs, test_utils  # noqa: E402  after importorskip
 
 from mjrec.environments.dm_control_environments import (  # noqa: E402  likewise
-    arguments_of,
-    begin_episode,
     make_dm_control,
 )
 from mjrec.environments.dm_control_scenes import dm_control_scenes  # noqa: E402
@@ -115,7 +113,7 @@ def test_a_task_is_made_with_its_own_limit() -> None:
     assert not isinstance(env, StepLimit)
     assert env.control_timestep() == 0.02
     limited = make_dm_control("ball_in_cup", "catch", EnvironmentOptions(max_steps=4))
-    begin_episode(limited, episode_seeds(0, 0))
+    limited.reset()
     action = np.zeros(2)
     steps = [limited.step(action) for _ in range(4)]
     assert [step.last() for step in steps] == [False, False, False, True]
@@ -148,16 +146,11 @@ def test_the_run_seeds_what_is_drawn_when_a_task_is_made() -> None:
 
 def test_a_monitor_is_told_the_seed(tmp_path: Path) -> None:
     """dm_env's reset takes none that it could see."""
-    env = make_dm_control("ball_in_cup", "catch", EnvironmentOptions())
+    named = environment_from_name("dm_control/ball_in_cup-catch")
+    env = named.environment
     with mjrec.Monitor(env, tmp_path, video_callable=False, env_id="x") as monitor:
-        begin_episode(monitor, episode_seeds(0, 0))
+        named.begin_episode(monitor, episode_seeds(0, 0))
         assert monitor.seed == episode_seeds(0, 0).environment
-
-
-def test_what_has_no_random_state_cannot_be_seeded() -> None:
-    """A run that cannot be repeated must not look as if it could."""
-    with pytest.raises(mjrec.InvalidArgument, match="Countdown cannot be seeded"):
-        begin_episode(Countdown(3), episode_seeds(0, 0))
 
 
 def test_arguments_reach_the_task_and_the_environment() -> None:
@@ -247,24 +240,22 @@ def test_without_dm_control_the_line_to_run_is_named(tmp_path: Path) -> None:
     assert 'pip install "mjrec[dm-control]"' in said
 
 
-@pytest.mark.parametrize("where", ["import", "load"])
 def test_a_mujoco_that_dm_control_does_not_know_names_the_fix(
-    tmp_path: Path, where: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What dm_control 1.0.50 does with mujoco 4.0."""
-    failure = (
-        "raise AttributeError(\"'MjModel' object has no attribute 'flex_vertedge'\")"
-    )
-    suite = (
-        failure
-        if where == "import"
-        else "TASKS_BY_DOMAIN = {'cheetah': ['run']}\n"
-        f"def load(*args, **kwargs):\n    {failure}\n"
-    )
-    said = error_with_dm_control(tmp_path, suite)
+    """What dm_control 1.0.50 does with mujoco 4.0, imported or loading a task."""
+    what = "'MjModel' object has no attribute 'flex_vertedge'"
+    said = error_with_dm_control(tmp_path, f'raise AttributeError("{what}")')
     assert said.startswith("MissingDependency dm_control/cheetah-run")
     assert 'pip install "mujoco<4"' in said
     assert "flex_vertedge" in said
+
+    def load(*_: Any, **__: Any) -> None:
+        raise AttributeError(what)
+
+    monkeypatch.setattr(suite, "load", load)
+    with pytest.raises(mjrec.MissingDependency, match=r'pip install "mujoco<4"'):
+        environment_from_name("dm_control/cheetah-run")
 
 
 def test_a_recording_says_with_what_its_task_was_made() -> None:
@@ -273,11 +264,15 @@ def test_a_recording_says_with_what_its_task_was_made() -> None:
         seed=5, max_steps=3, kwargs={"task_kwargs": {"time_limit": 2}}
     )
     env = make_dm_control("cartpole", "swingup", options)
-    recorded = dm_control_scenes(env, env_id="dm_control/cartpole-swingup").environment
-    assert recorded is not None
-    assert recorded["kwargs"] == {"task_kwargs": {"random": 5, "time_limit": 2}}
+    recorded = dm_control_scenes(env, env_id="dm_control/cartpole-swingup")
+    assert recorded.environment is not None
+    assert recorded.environment["kwargs"] == {
+        "task_kwargs": {"random": 5, "time_limit": 2}
+    }
     other = suite.load("cartpole", "swingup")
-    assert arguments_of(other) is None
+    recorded = dm_control_scenes(other, env_id="dm_control/cartpole-swingup")
+    assert recorded.environment is not None
+    assert recorded.environment["kwargs"] is None
 
 
 @pytest.mark.parametrize("task", ["lqr-lqr_2_1", "pendulum-swingup"])

@@ -14,7 +14,7 @@ import gymnasium
 import pytest
 from parts import parametrize
 
-from mjrec.environments.options import EnvironmentOptions
+from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.sessions import Session, record_session
 
 GYMNASIUM = sorted(

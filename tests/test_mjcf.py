@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 
 import mjrec
 from mjrec.environments.mjcf_environments import MjcfEnvironment, make_mjcf
-from mjrec.environments.options import EnvironmentOptions
+from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.simulation.mjcf import load_mjcf
 
 # A red ball on a rail with a motor, a free one, and a green one far from both.

@@ -11,7 +11,6 @@ import pytest
 
 from mjrec.environments.gymnasium_scenes import gymnasium_scenes
 from mjrec.environments.mjcf_environments import MjcfEnvironment
-from mjrec.environments.mjcf_scenes import mjcf_scenes
 from mjrec.errors import UnknownName
 
 MODEL = """
@@ -68,7 +67,7 @@ def test_begins_with_the_file_and_the_camera(
     """The environment's camera and size, or those asked for."""
     env = MjcfEnvironment(model, camera="top", height=32, width=40)
     env.reset()
-    states = mjcf_scenes(env, **asked).states
+    states = gymnasium_scenes(env, **asked).states
     assert states is not None
     states.open(tmp_path)
     start = states.begin_episode()
@@ -84,4 +83,4 @@ def test_begins_with_the_file_and_the_camera(
 def test_camera_is_checked(model: Path) -> None:
     """At once."""
     with pytest.raises(UnknownName, match="front"):
-        mjcf_scenes(MjcfEnvironment(model), camera="forward")
+        gymnasium_scenes(MjcfEnvironment(model), camera="forward")

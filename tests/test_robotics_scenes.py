@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from robots import robots_that_reset
 
-from mjrec.environments.gymnasium_scenes import gymnasium_scenes
-from mjrec.environments.robotics_scenes import drawn_part, picture_moment
+from mjrec.environments.gymnasium_scenes import (
+    drawn_part,
+    gymnasium_scenes,
+    picture_moment,
+)
 
 pytest.importorskip("gymnasium_robotics")
 

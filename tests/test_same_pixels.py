@@ -21,7 +21,7 @@ from robots import robotics_ids, robots_that_reset
 
 import mjrec
 from mjrec.environments.from_name import environment_from_name
-from mjrec.environments.options import EnvironmentOptions
+from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering.pool import WorkerPool
 from mjrec.simulation.cameras import raw_data, raw_model

@@ -11,7 +11,6 @@ import sys
 import zipfile
 from pathlib import Path
 
-from processes import children
 from waiting import wait_until
 
 from mjrec.sandbox import Sandbox
@@ -32,17 +31,6 @@ def sources(directory: Path, xml: str = "<mujoco/>") -> Path:
     return path
 
 
-def test_what_is_found_is_said_and_the_process_ends(tmp_path: Path) -> None:
-    """What it writes lies in its place."""
-    before = children()
-    request = {"path": str(sources(tmp_path))}
-    with Sandbox(_COMPILER, request, place=tmp_path) as sandbox:
-        assert list(sandbox.said(60)) == [{"compiled": True}]
-        assert sandbox.last_words().startswith("ended with status 0")
-    assert (tmp_path / "model.mjb").exists()
-    assert children() == before
-
-
 def test_a_death_is_told_with_its_last_words(tmp_path: Path) -> None:
     """Of a request that it does not understand, it dies."""
     with Sandbox(_COMPILER, {}, place=tmp_path) as sandbox:
@@ -50,16 +38,6 @@ def test_a_death_is_told_with_its_last_words(tmp_path: Path) -> None:
         said = sandbox.last_words()
     assert said.startswith("ended with status 1")
     assert "KeyError: 'path'" in said
-
-
-# Takes more than five seconds: MuJoCo is loaded, and two seconds of CPU time are used.
-def test_a_limit_of_cpu_time_ends_it(tmp_path: Path) -> None:
-    """In the midst of MuJoCo's code."""
-    request = {"path": str(sources(tmp_path, _FOR_EVER))}
-    limits = {"RLIMIT_CPU": 2, "RLIMIT_CORE": 0}
-    with Sandbox(_COMPILER, request, place=tmp_path, limits=limits) as sandbox:
-        assert list(sandbox.said(60)) == []
-        assert "was killed by SIG" in sandbox.last_words()
 
 
 # Takes more than five seconds: until MuJoCo is at it for certain.

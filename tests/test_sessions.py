@@ -4,16 +4,22 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from recordings import manifest_of, videos_in
 
+import mjrec
 from mjrec import sessions
 from mjrec.commands import main
-from mjrec.environments.options import EnvironmentOptions
+from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.errors import GLError
 from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session
@@ -111,3 +117,39 @@ def test_record_says_which_videos_are_pending(
     assert main([*command, str(tmp_path / "b"), "--json"]) == 0
     [episode] = json.loads(capsys.readouterr().out)["episodes"]
     assert episode["pending"] is True
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("pygame") is not None, reason="pygame is installed"
+)
+@pytest.mark.parametrize("options", [{}, {"keep": "best:1"}])
+def test_what_cannot_be_drawn_is_recorded_without_videos(
+    options: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """CartPole needs pygame: one line says so, unless pictures were asked for."""
+    asked = replace(
+        session(tmp_path, name="CartPole", episodes=2, **options),
+        made=EnvironmentOptions(max_steps=2),
+    )
+    assert [each.video for each in record_session(asked)] == [None, None]
+    assert mjrec.load_results(tmp_path)["episode_lengths"] == [2, 2]
+    [line] = caplog.messages
+    assert "No videos, only statistics. Drawing CartPole-v1 needs pygame" in line
+    live = replace(asked, monitor=RecorderOptions(render="live", force=True))
+    with pytest.raises(mjrec.MissingDependency, match="pygame"):
+        list(record_session(live))
+
+
+@pytest.mark.thorough
+def test_record_without_any_gl(tmp_path: Path) -> None:
+    """On a machine, or in a process, that has none."""
+    command = [*RECORD, "--seed", "0", "--workers", "0"]
+    run = subprocess.run(
+        [sys.executable, "-m", "mjrec", *command, "--out", str(tmp_path)],
+        env={**os.environ, "MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "pending: mjrec render" in run.stdout

@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import os
 import signal
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from mjrec.errors import FileNotWritten, InvalidArgument, UnreadableFile
 from mjrec.formats import row_log, span_writer, spans
 from mjrec.formats.locks import Lock
 from mjrec.formats.monitor_directory import lock_name, trajectory_prefix
-from mjrec.formats.row_log import tail_path
+from mjrec.formats.row_log import TAIL_HEAD, RowLog, tail_path
 from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.spans import (
     add_facts,
@@ -36,7 +37,7 @@ from mjrec.formats.spans import (
 from mjrec.formats.trajectory import ModelChange, packed, row_dtype
 from mjrec.formats.trajectory_log import open_recording
 
-ROW = DTYPE.itemsize
+ROW, CAPACITY = DTYPE.itemsize, 8
 
 
 @pytest.fixture
@@ -48,7 +49,9 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def logs(tmp_path: Path) -> SpanLogs:
     """Logs whose tails hold eight rows."""
-    return SpanLogs(tmp_path, INFIX, numbers=itertools.count(), tail_bytes=8 * ROW)
+    return SpanLogs(
+        tmp_path, INFIX, numbers=itertools.count(), tail_bytes=CAPACITY * ROW
+    )
 
 
 def read(path: Path) -> TrajectoryContent:
@@ -71,7 +74,35 @@ def change(step: int, **fields: Any) -> ModelChange:
     return ModelChange(step=step, fields=fields or {"a": np.ones(2)})
 
 
+@pytest.fixture(params=["a mapped tail", "no tail"])
+def mapped(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether the file system has mappings that outlive a process."""
+    is_mapped = bool(request.param == "a mapped tail")
+    monkeypatch.setattr(row_log, "_may_be_mapped", lambda _: is_mapped)
+    return is_mapped
+
+
 # --- what was written comes back -----------------------------------------------------
+
+
+def test_rows_are_there_when_they_are_counted_and_when_all_is_closed(
+    logs: SpanLogs, path: Path, mapped: bool
+) -> None:
+    """Wherever the tail wraps, also for an open reader; then there is the log alone."""
+    span = write(logs, 2)
+    found, log, tail, _ = files_of(path.parent)
+    assert tail.exists() == mapped
+    with open_recording(path) as reader:
+        for step in range(3, 3 * CAPACITY + 5):
+            write(logs, step, first=step, span=span)
+            check(read(path), step)
+            check(content_of(reader), 2)
+        logs.close()
+        logs.close()
+        check(content_of(reader), 2)
+    check(read(path), step)
+    assert log.stat().st_size == (step + 1) * ROW
+    assert sorted(path.parent.iterdir()) == sorted([found, log])
 
 
 def test_recordings_of_one_log_come_back_bit_for_bit(
@@ -180,6 +211,119 @@ def test_a_reader_beside_a_writer_sees_whole_recordings(tmp_path: Path) -> None:
 # --- a process that is killed, a machine that crashes --------------------------------
 
 
+def killed_in_the_middle_of_a_write(rows: RowLog) -> None:
+    """With some rows of a full tail in the log, and half of one."""
+    if rows.count == 3 * CAPACITY:
+        kill_after_writing(lambda data: data[: len(data) // 2 - 3])
+
+
+def killed_after_a_write(rows: RowLog) -> None:
+    """With a full tail in the log, which nobody has taken note of."""
+    if rows.count == 3 * CAPACITY:
+        kill_after_writing(lambda data: data)
+
+
+def kill_after_writing(part: Callable[[memoryview], memoryview]) -> None:
+    real = os.pwrite
+
+    def pwrite(descriptor: int, data: memoryview, offset: int) -> int:
+        real(descriptor, part(data), offset)
+        kill_self()
+        return 0
+
+    os.pwrite = pwrite
+
+
+def killed_in_the_next_slot(rows: RowLog) -> None:
+    """When the first slot of a tail that was written is filled again."""
+    if rows.count == 3 * CAPACITY:
+        rows.make_room()
+        rows.slots[0] = 5
+        kill_self()
+
+
+def killed_in_a_close(rows: RowLog) -> None:
+    """With all rows in the log, before the tail is removed."""
+    if rows.count == 3 * CAPACITY + 2:
+        Path.unlink = kill_self  # type: ignore[method-assign]
+        rows.close()
+
+
+MOMENTS = [
+    *(killed_in_the_middle_of_a_write, killed_after_a_write),
+    *(killed_in_the_next_slot, killed_in_a_close),
+]
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_killed_process_loses_no_counted_row(
+    logs: SpanLogs, path: Path, mapped: bool, moment: Callable[[RowLog], None]
+) -> None:
+    """At any moment; nothing was flushed, and no signal's handler was called."""
+
+    def record(tell: Callable[[], object]) -> None:
+        span = write(logs, 0)
+        for step in itertools.count(1):
+            moment(span.log.rows)
+            write(logs, step, first=step, span=span)
+            tell()
+
+    steps, status = forked(record)
+    assert os.WTERMSIG(status) == signal.SIGKILL
+    assert steps >= 3 * CAPACITY - 1
+    # Without a tail a row counts as soon as it is in the log.
+    check(read(path), steps + (not mapped and moment is killed_after_a_write))
+
+
+class Interrupt(BaseException):
+    """As Ctrl-C raises it."""
+
+
+@pytest.mark.parametrize("written", [0, 5, 8 * ROW])
+def test_an_interrupted_write_is_taken_up_again(
+    logs: SpanLogs, path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    """After Ctrl-C at any byte of it; each row is there once."""
+    last = 2 * CAPACITY - 1
+    span = write(logs, last)
+    real = os.pwrite
+
+    def pwrite(descriptor: int, data: memoryview, offset: int) -> int:
+        monkeypatch.undo()
+        real(descriptor, data[:written], offset)
+        raise Interrupt
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    with pytest.raises(Interrupt):
+        write(logs, last + 1, first=last + 1, span=span)
+    check(read(path), last)
+    write(logs, last + CAPACITY, first=last + 1, span=span)
+    logs.close()
+    check(read(path), last + CAPACITY)
+
+
+HEADS = {
+    "short": (9, ROW // 8),
+    "other rows": (9, ROW // 8 + 1, CAPACITY),
+    "beyond its end": (9, ROW // 8, CAPACITY + 1),
+    "no rows": (9, ROW // 8, 0),
+}
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_tail_of_something_else_is_passed_over(
+    logs: SpanLogs, path: Path, head: str
+) -> None:
+    """What it says would lead beyond it, or to rows of another size."""
+    write(logs, 4)
+    _, _, tail, _ = files_of(path.parent)
+    logs.close()
+    words = struct.pack(f"={len(HEADS[head])}Q", *HEADS[head])
+    size = len(words) if head == "short" else TAIL_HEAD + CAPACITY * ROW
+    tail.write_bytes(words.ljust(size, b"\0"))
+    check(read(path), 4)
+
+
 def kill_in_line(number: int, part: Callable[[bytes], bytes]) -> None:
     """Have this process die in the writing of a line of a list."""
     real, lines = os.write, itertools.count(1)
@@ -276,12 +420,9 @@ def test_a_stale_tail_ends_a_recording(logs: SpanLogs, path: Path, stale: str) -
 def test_a_log_that_changes_while_it_is_read_is_an_error(
     logs: SpanLogs, path: Path
 ) -> None:
-    """Never rows of something else; what is added behind them is nothing to it."""
-    span = write(logs, 2)
-    with open_recording(path) as reader:
-        write(logs, 30, first=3, span=span)
-        logs.close()
-        check(content_of(reader), 2)
+    """Never rows of something else."""
+    write(logs, 30)
+    logs.close()
     _, log, *_ = files_of(path.parent)
     with open_recording(path) as reader:
         os.truncate(log, 5 * ROW)
@@ -339,22 +480,20 @@ def test_what_a_full_disk_did_not_let_be_said_is_said_later(
     check(read(episode(path.parent, 28)), 5)
 
 
-@pytest.mark.parametrize("is_mapped", [True, False])
 def test_a_full_disk_costs_no_step_that_was_recorded(
-    logs: SpanLogs, path: Path, monkeypatch: pytest.MonkeyPatch, is_mapped: bool
+    logs: SpanLogs, path: Path, mapped: bool
 ) -> None:
     """The step that finds no room is refused, or kept in memory where none is mapped.
 
     With room again all goes on.
     """
-    monkeypatch.setattr(row_log, "_may_be_mapped", lambda _: is_mapped)
     span = write(logs, 3)
     with file_size_limit(6000):
         with pytest.raises(FileNotWritten, match=r"\.log: File too large"):
             write(logs, 1000, first=4, span=span)
         recorded = span.steps
         assert 3 < recorded < 100
-        check(read(path), recorded - (not is_mapped))
+        check(read(path), recorded - (not mapped))
         with pytest.raises(FileNotWritten, match=r"\.log: File too large"):
             logs.close()
     write(logs, recorded + 8, first=recorded + 1, span=span)

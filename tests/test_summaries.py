@@ -22,7 +22,6 @@ from mjrec.evaluation.summaries import (
     AcrossTasks,
     TaskSummary,
     default_score_range,
-    split_by_scale,
     summarize_across,
     summarize_results,
     summarize_task,
@@ -96,8 +95,8 @@ def test_returns_that_are_no_numbers_leave_no_figures(wrong: float) -> None:
     assert (summary.episodes, summary.not_finite) == (3, 1)
     assert (summary.mean, summary.median, summary.maximum) == (None, None, None)
     assert (summary.mean_interval, summary.mean_length) == (None, 5)
-    scores, left_out = split_by_scale({TASK: [1, wrong]}, {TASK: (0, 1000)})
-    assert (scores, left_out[TASK]) == ({}, "1 of 2 returns are NaN or infinite")
+    across = summarize_across({TASK: [1, wrong]}, {TASK: (0, 1000)})
+    assert across.left_out == {TASK: "1 of 2 returns are NaN or infinite"}
 
 
 def test_huge_returns_do_no_harm() -> None:
@@ -150,37 +149,29 @@ def test_the_suites_episodes_have_a_thousand_steps() -> None:
         assert suite.load(domain, task)._step_limit == 1000, domain
 
 
-def test_tasks_without_scores_are_left_out_with_the_reason() -> None:
-    """A page shows them."""
-    scores, left_out = split_by_scale(
+def test_figures_across_tasks_by_hand() -> None:
+    """Three tasks of two episodes; the others are left out, with the reason."""
+    across = summarize_across(
         {
-            "a": [-10, 0, 15, 30],
+            "a": [-10, 6],
+            "b": [5, 5],
+            "c": [0.5, 1.0],
             "x": [1],
             "dm_control/lqr-x": [1],
-            "b": [],
+            "y": [],
         },
-        {"a": (-10, 10), "b": (0, 1)},
-    )
-    assert {task: sample.tolist() for task, sample in scores.items()} == {
-        "a": [0, 0.5, 1.25, 2]
-    }
-    assert left_out == {
-        "x": "it has no scale of its own, and none was given",
-        "dm_control/lqr-x": "its rewards have no bound",
-        "b": "no episode was completed",
-    }
-
-
-def test_figures_across_tasks_by_hand() -> None:
-    """Three tasks of two episodes."""
-    across = summarize_across(
-        {"a": [0.0, 0.8], "b": [0.5, 0.5], "c": [0.5, 1.0]},
-        left_out={"d": "why"},
+        {"a": (-10, 10), "b": (0, 10), "c": (0, 1), "y": (0, 1)},
         bootstrap=QUICK,
     )
-    assert (across.tasks, across.left_out) == (("a", "b", "c"), {"d": "why"})
+    # Scores 0, .8; .5, .5; .5, 1.
+    assert across.tasks == ("a", "b", "c")
+    assert across.left_out == {
+        "x": "it has no scale of its own, and none was given",
+        "dm_control/lqr-x": "its rewards have no bound",
+        "y": "no episode was completed",
+    }
     assert (across.mean, across.median) == (pytest.approx(0.55), pytest.approx(0.5))
-    # Of 0, .5, .5, .5, .8, 1 one is cut off at each end.
+    # One is cut off at each end.
     assert across.iqm == pytest.approx(2.3 / 4)
     assert across.optimality_gap == pytest.approx(0.45)
     profile = across.profile
@@ -193,10 +184,10 @@ def test_figures_across_tasks_by_hand() -> None:
 
 def test_what_cannot_be_said_across_tasks() -> None:
     """A task of one episode leaves no intervals; none with a scale, no figures."""
-    across = summarize_across({"a": [0.5], "b": [0.1, 0.9]}, bootstrap=QUICK)
+    scales = {"a": (0.0, 1.0), "b": (0.0, 1.0)}
+    across = summarize_across({"a": [0.5], "b": [0.1, 0.9]}, scales, bootstrap=QUICK)
     assert across.iqm is not None
     assert (across.iqm_interval, across.interval_method) == (None, None)
     assert across.profile is not None
     assert across.profile.low == across.profile.high == across.profile.shares
-    nothing = summarize_across({}, left_out={"a": "why"})
-    assert nothing == AcrossTasks(tasks=(), left_out={"a": "why"})
+    assert summarize_across({}, {}) == AcrossTasks(tasks=())

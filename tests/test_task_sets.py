@@ -13,11 +13,11 @@ from mjrec.environments import known_names
 from mjrec.evaluation.task_sets import TASK_SETS, tasks_from
 
 
-def test_environments_stay_as_they_are_each_once_in_order() -> None:
-    """What is named twice is evaluated once, where it was named first."""
-    names = ["Hopper-v5", "dm_control/walker-walk", "Ant-v5", "Hopper-v5"]
+def test_each_task_is_there_once_in_order() -> None:
+    """What is named twice is evaluated once; without a version the newest is meant."""
+    names = ["Hopper-v5", "dm_control/walker-walk", "Hopper", "Ant-v5", "Hopper-v5"]
     assert tasks_from(names) == ("Hopper-v5", "dm_control/walker-walk", "Ant-v5")
-    assert tasks_from("Ant-v5") == ("Ant-v5",)
+    assert tasks_from("No_such") == ("No_such",)
 
 
 def test_gymnasium_mujoco_is_the_newest_version_of_each() -> None:
@@ -49,6 +49,7 @@ def test_patterns_are_matched_against_both_frameworks() -> None:
         *("dm_control/walker-run", "dm_control/walker-stand"),
         *("dm_control/walker-walk", "HalfCheetah-v4", "HalfCheetah-v5"),
     )
+    assert tasks_from(["Half*"]) == ("HalfCheetah-v5",)
     assert "dm_control/acrobot-swingup" in tasks_from(["*swingup"])
 
 
@@ -58,13 +59,17 @@ def test_a_pattern_may_name_a_module_that_registers(
     """It may lie in the working directory, and is not imported here."""
     (tmp_path / "my_environments.py").write_text(
         "import gymnasium\n"
-        "for n in (0, 1):\n"
+        "for n in (0, 1, 10):\n"
         "    gymnasium.register(f'Mine-v{n}', 'gymnasium.envs.mujoco:HopperEnv')\n"
     )
     monkeypatch.chdir(tmp_path)
-    assert tasks_from(["my_environments:Mine-v*"]) == (
+    assert tasks_from(["my_environments:Mine-v[01]", "my_environments:*"]) == (
         *("my_environments:Mine-v0", "my_environments:Mine-v1"),
+        "my_environments:Mine-v10",
     )
+    assert tasks_from("my_environments:Mine") == ("my_environments:Mine-v10",)
+    with pytest.raises(UnknownName, match="Mine-v10"):
+        tasks_from(["my_environments:Hopper*"])
     assert "my_environments" not in sys.modules
     with pytest.raises(EnvironmentNotMade, match="No module named 'no_such'"):
         tasks_from(["no_such:Mine-v*"])

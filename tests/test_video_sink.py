@@ -65,6 +65,8 @@ def test_discarded_it_leaves_an_older_video(tmp_path: Path) -> None:
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     newer = film(tmp_path / "v.mp4")
     newer.finish()
+    # The older one's metadata would not be true of it.
+    assert names(tmp_path) == ["v.framehash", "v.mp4"]
     newer.discard()
     newer.discard()
     assert names(tmp_path) == []

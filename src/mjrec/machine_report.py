@@ -8,9 +8,10 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from pathlib import Path
 
 from .errors import EncoderError, Error
 from .formats.encoder_settings import MUXERS, encoder_settings, try_encoding
@@ -38,7 +39,21 @@ _PACKAGES = (
     ),
     ("numpy", "", ""),
 )
+# What extras bring, and engines: name, distributions, and what installs them.
+_EXTRAS = (
+    ("SciPy", ("scipy",), "mjrec[evaluation]"),
+    ("report", ("jinja2", "pillow"), "mjrec[report]"),
+    ("evidence", ("bagit", "jinja2"), "mjrec[evidence]"),
+    ("robotics", ("gymnasium-robotics",), "mjrec[robotics]"),
+    ("TensorBoard", ("tensorboard",), "mjrec[tensorboard]"),
+    ("W&B", ("wandb",), "mjrec[wandb]"),
+    ("Ray", ("ray",), "mjrec[ray]"),
+    ("submitit", ("submitit",), "mjrec[slurm]"),
+    ("Dask", ("dask", "distributed"), "dask[distributed]"),
+)
 _PROGRAM_TIMEOUT = 120
+_COMMAND_TIMEOUT = 10
+_NVIDIA_VERSION = Path("/proc/driver/nvidia/version")
 _TRIAL_FPS = Fraction(50)
 
 
@@ -111,6 +126,8 @@ class MachineReport:
         gpu_device_files: the GPUs that the kernel shows.
         ffmpeg: the encoder.
         packages: what is installed.
+        extras: what is installed for optional parts, and engines; Slurm among them, and
+            the driver of a GPU.
         cpus: the CPUs.
         python: the interpreter's version.
         platform: the operating system and the processor.
@@ -124,6 +141,7 @@ class MachineReport:
     gpu_device_files: tuple[str, ...]
     ffmpeg: Ffmpeg
     packages: tuple[Package, ...]
+    extras: tuple[Package, ...]
     cpus: Cpus
     python: str
     platform: str
@@ -150,6 +168,7 @@ def examine_machine() -> MachineReport:
         gpu_device_files=tuple(gpu_device_files()),
         ffmpeg=examine_ffmpeg(),
         packages=tuple(examine_package(*package) for package in _PACKAGES),
+        extras=(*(_examine_extra(*extra) for extra in _EXTRAS), _slurm(), _gpu()),
         cpus=Cpus(
             usable=usable_cpus(),
             present=os.cpu_count(),
@@ -237,6 +256,43 @@ def examine_package(name: str, program: str, install: str) -> Package:
         failure.strip().splitlines()[-1], f"Install it anew:\n  {install}"
     )
     return Package(name, version, works=False, cause=found.cause, fix=found.fix)
+
+
+def _examine_extra(name: str, distributions: Sequence[str], install: str) -> Package:
+    try:
+        versions = [importlib.metadata.version(each) for each in distributions]
+    except importlib.metadata.PackageNotFoundError:
+        return Package(name, None, fix=f'python -m pip install "{install}"')
+    if len(versions) == 1:
+        return Package(name, versions[0])
+    both = zip(distributions, versions, strict=True)
+    return Package(name, ", ".join(f"{each} {version}" for each, version in both))
+
+
+def _slurm() -> Package:
+    try:
+        done = subprocess.run(
+            ["sbatch", "--version"],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_COMMAND_TIMEOUT,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        fix = "Jobs are sent from a login node of the cluster, which has sbatch."
+        return Package("Slurm", None, fix=fix)
+    return Package("Slurm", done.stdout.decode(errors="replace").strip())
+
+
+def _gpu() -> Package:
+    try:
+        said = _NVIDIA_VERSION.read_text(errors="replace")
+    except OSError:
+        if gpu_device_files():
+            return Package("GPU", "there is one, without NVIDIA's driver")
+        fix = "No device file in /dev: videos are drawn on the CPU."
+        return Package("GPU", None, fix=fix)
+    return Package("GPU", said.partition("\n")[0].strip())
 
 
 # Whether a package works is another question than whether it can draw.

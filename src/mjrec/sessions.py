@@ -9,30 +9,31 @@ can be recorded again without those before it.
 from __future__ import annotations
 
 import contextlib
+import logging
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from .environments.episode_seeds import episode_seeds
-from .environments.from_name import NamedEnvironment, environment_from_name
-from .environments.global_generators import seed_global_generators
-from .environments.names import parse_environment_name
-from .environments.options import EnvironmentOptions
+from .environments.episode_seeds import episode_seeds, seed_global_generators
+from .environments.from_name import environment_from_name
+from .environments.named_environment import EnvironmentOptions, NamedEnvironment
+from .environments.names import parse_environment_name, working_directory_importable
 from .environments.policies import load_policy, policy_file
-from .environments.working_directory import working_directory_importable
 from .errors import GLError, InvalidArgument
 from .formats.manifest import read_manifest
 from .formats.monitor_directory import Infix, infix_of, manifest_name
 from .gl import use_gl
 from .monitors.monitor import monitored
-from .recorder.options import LIVE, OFF, RecorderOptions
+from .recorder.options import DEFERRED, LIVE, OFF, RecorderOptions
 from .schedules import disable_videos, schedule_from_text
 
 if TYPE_CHECKING:
     from .monitors.dm_env_monitor import DmEnvMonitor
     from .monitors.gymnasium_monitor import GymnasiumMonitor
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +92,9 @@ def record_session(
 ) -> Generator[SessionEpisode, None, None]:
     """Record a session, and yield each episode as it ends.
 
+    Of an environment that cannot be drawn here there are statistics and no videos,
+    unless `render` asks for them; the log says why.
+
     The recordings are closed when the iterator ends, is closed, or raises; so close
     it, best with `contextlib.closing`. Only when it ends by itself are the videos
     waited for that are still to be rendered; else they are left pending.
@@ -113,6 +117,11 @@ def record_session(
         named = _environment(session, pictures=drawn)
         closing = stack.enter_context(contextlib.ExitStack())
         closing.callback(named.environment.close)
+        if named.no_pictures is not None:
+            if options.render in (LIVE, DEFERRED):
+                raise named.no_pictures
+            logger.warning("No videos, only statistics. %s", named.no_pictures)
+            schedule, options = disable_videos, replace(options, keep=None)
         policy = load_policy(session.policy, named.environment, session.policy_kwargs)
         view = dict(named.view)
         if session.further_cameras:
@@ -144,7 +153,8 @@ def record_session(
                 observation = named.begin_episode(monitor, seeds)
                 done = False
                 while not done:
-                    observation, done = named.step(monitor, policy(observation))
+                    observation, _, *ends = named.step(monitor, policy(observation))
+                    done = any(ends)
                     on_step()
             stats, video = monitor.stats_recorder, monitor.video_recorder
             has_video = video is not None and video.functional and not video.empty

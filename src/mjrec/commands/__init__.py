@@ -3,42 +3,35 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import importlib
 import logging
 import os
+import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
-
-import tyro
+from collections.abc import Iterator, Sequence
 
 from ..errors import Error
 from ..signals import exiting_on_signals
-from .compare import compare
-from .doctor import doctor
-from .evaluate import evaluate
-from .list_episodes import list_episodes
-from .pack import pack
-from .record import record
-from .recover import recover
-from .render import render
-from .report import report
-from .strip import strip
-from .verify import verify
 
 __all__ = ["main"]
 
-_COMMANDS: dict[str, Callable[..., int]] = {
-    "record": record,
-    "render": render,
-    "recover": recover,
-    "list": list_episodes,
-    "strip": strip,
-    "evaluate": evaluate,
-    "compare": compare,
-    "report": report,
-    "pack": pack,
-    "verify": verify,
-    "doctor": doctor,
+# Each command: its module, which is imported when it is chosen, and has a function that
+# is called like the command (`list_episodes`, because `list` is Python's), and what it
+# does.
+COMMANDS = {
+    "record": ("record", "Record episodes of an environment."),
+    "render": ("render", "Render pending videos, or recorded episodes again."),
+    "recover": ("recover", "Put a directory in order after a kill."),
+    "list": ("list_episodes", "List recorded episodes."),
+    "strip": ("strip", "Make a film strip of an episode."),
+    "evaluate": ("evaluate", "Evaluate a policy on tasks and seeds."),
+    "compare": ("compare", "Compare evaluations."),
+    "report": ("report", "Write a page that shows recordings."),
+    "pack": ("pack", "Pack a monitor directory into one file."),
+    "verify": ("verify", "Check a packed run."),
+    "doctor": ("doctor", "Show whether this machine can record."),
 }
 
 _FAILED = 1
@@ -61,12 +54,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
+    name, *arguments = _arguments(argv)
+    module, _ = COMMANDS[name]
     try:
-        status: int = tyro.extras.subcommand_cli_from_dict(
-            _COMMANDS,
-            prog="mjrec",
-            description="A headless MuJoCo recorder.",
-            args=argv,
+        command = importlib.import_module(f".{module}", __name__)
+        # Later than the overview, which must be quick.
+        tyro = importlib.import_module("tyro")
+        status: int = tyro.cli(
+            getattr(command, module),
+            prog=f"mjrec {name}",
+            args=arguments,
             config=(tyro.conf.FlagCreatePairsOff,),
         )
         # Here, and not at exit, so that a reader who has left is noticed here.
@@ -78,11 +75,31 @@ def _run(argv: Sequence[str] | None) -> int:
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:
-        # Whoever read our output has left (`mjrec list DIR | head`). What Python still
+        # The reader of our output has left (`mjrec list DIR | head`). What Python still
         # holds back would raise once more at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _FAILED
     return status
+
+
+def _arguments(argv: Sequence[str] | None) -> Sequence[str]:
+    """Return the arguments, the first of which is a command.
+
+    Raises:
+        SystemExit: it is none, or help was asked for; that is printed.
+    """
+    parser = argparse.ArgumentParser(
+        prog="mjrec",
+        description="A headless MuJoCo recorder.",
+        epilog="mjrec COMMAND --help says what a command takes.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, dest="command")
+    for name, (_, what) in COMMANDS.items():
+        commands.add_parser(name, help=what, add_help=False, prefix_chars="\0")
+    given = list(sys.argv[1:] if argv is None else argv)
+    parser.parse_args(given[:1])
+    return given
 
 
 @contextlib.contextmanager
@@ -91,9 +108,30 @@ def _warnings_on_stderr() -> Iterator[None]:
     logging.getLogger("absl").setLevel(logging.ERROR)
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    handler.addFilter(_OnceInARun())
     logger = logging.getLogger("mjrec")
     logger.addHandler(handler)
     try:
         yield
     finally:
         logger.removeHandler(handler)
+
+
+class _OnceInARun(logging.Filter):
+    """Lets MuJoCo's warnings pass once of each kind, and one traceback.
+
+    Each worker has its own, at its own time.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        if not text.startswith(("MuJoCo:", "Traceback")):
+            return True
+        kind = "Traceback" if text[0] == "T" else re.sub(r"[\d.]+", "", text)
+        is_new = kind not in self._said
+        self._said.add(kind)
+        return is_new

@@ -7,7 +7,7 @@ import dataclasses
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import rich.box
 import rich.markup
@@ -16,10 +16,10 @@ import tyro
 
 from .. import json_text
 from ..errors import InvalidArgument
-from ..evaluation.comparing import Comparison, TaskComparison
+from ..evaluation.comparing import TASK_FIGURES, Comparison
 from ..evaluation.comparing import compare as compare_evaluations
 from ..evaluation.requirements import parse_requirement
-from ..evaluation.statistics import Interval
+from ..evaluation.statistics import Estimate
 from .counted import counted
 from .help_text import flowing_help
 from .terminal import printable, result_console
@@ -95,143 +95,116 @@ def compare(
     )
     unmet = [why for each in required for why in each.shortfalls(comparison)]
     if required:
-        unmet += _failures(comparison, "A" if no_worse_than == "B" else "B")
+        unmet += _failures(comparison, no_worse_than == "B")
     if as_json:
-        sys.stdout.write(json_text.dumps(_fields(comparison, unmet)) + "\n")
+        fields = {**dataclasses.asdict(comparison), "unmet": unmet}
+        for side in ("a", "b"):
+            fields[side] = list(map(str, fields[side]))
+        sys.stdout.write(json_text.dumps(fields) + "\n")
     else:
         _show(comparison, unmet)
-    cannot = len(comparison.compared) < len(comparison.tasks)
-    return _UNMET if unmet or cannot else 0
+    is_unknown = any(task.unknown for task in comparison.tasks)
+    return _UNMET if unmet or is_unknown else 0
 
 
-def _failures(comparison: Comparison, side: str) -> Iterator[str]:
+def _failures(comparison: Comparison, of_a: bool) -> Iterator[str]:
     for task in comparison.tasks:
-        failed = task.failed_a if side == "A" else task.failed_b
+        failed = task.failed[0 if of_a else 1]
         if failed:
-            yield f"{task.task}: {counted(failed, 'episode')} of {side} failed"
+            name = "A" if of_a else "B"
+            yield f"{task.task}: {counted(failed, 'episode')} of {name} failed"
 
 
 def _show(comparison: Comparison, unmet: Sequence[str]) -> None:
     console = result_console()
-    table = _table(comparison)
-    for shown in (*_lines_before(comparison), table, *_lines_after(comparison, unmet)):
+    lines = [*_lines_after(comparison), *(f"Not met: {why}." for why in unmet)]
+    for shown in (*_lines_before(comparison), _table(comparison), *lines):
         if isinstance(shown, str):
-            shown = rich.markup.escape(printable(shown))
-        console.print(shown, highlight=False, soft_wrap=shown is not table)
+            text = printable(shown)
+            console.print(text, highlight=False, markup=False, soft_wrap=True)
+        else:
+            console.print(shown)
 
 
 def _lines_before(comparison: Comparison) -> Iterator[str]:
     for caution in comparison.cautions:
         yield f"Caution: {caution}."
-    for name, directories, policy in (
-        ("A", comparison.a, comparison.policy_a),
-        ("B", comparison.b, comparison.policy_b),
+    for name, directories, policy in zip(
+        "AB", (comparison.a, comparison.b), comparison.policies, strict=True
     ):
-        listed = ", ".join(map(str, directories))
         count = f"{len(directories)} evaluations: " if len(directories) > 1 else ""
-        yield f"{name}: {count}{listed} (policy {policy})"
+        yield f"{name}: {count}{', '.join(map(str, directories))} (policy {policy})"
 
 
 def _table(comparison: Comparison) -> rich.table.Table:
     table = rich.table.Table(
         box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
-    rows = [_cells(each) for each in comparison.tasks]
-    shown = [
-        name
-        for name in rows[0]
-        if name != "B - A, paired" or any(row[name] for row in rows)
-    ]
-    for name in shown:
-        table.add_column(
-            name, justify="left" if name == "task" else "right", overflow="fold"
+    # All but that of paired differences, which not all comparisons have.
+    names = [n for n in TASK_FIGURES if any(n in t.figures for t in comparison.tasks)]
+    table.add_column("task", overflow="fold")
+    for name in ("episodes", *names):
+        table.add_column(name, justify="right", overflow="fold")
+    for task in comparison.tasks:
+        label = f"{task.task}: {task.unknown}" if task.unknown else task.task
+        table.add_row(
+            rich.markup.escape(printable(label)),
+            ", ".join(map(str, task.episodes)),
+            *(_cell(name, task.figures.get(name)) for name in names),
         )
-    for row in rows:
-        table.add_row(*(rich.markup.escape(printable(row[name])) for name in shown))
     return table
 
 
-def _cells(each: TaskComparison) -> dict[str, str]:
-    paired = each.paired
-    return {
-        "task": f"{each.task}: {each.unknown}" if each.unknown else each.task,
-        "episodes A, B": f"{each.episodes_a}, {each.episodes_b}",
-        "mean A": _number(each.mean_a),
-        "mean B": _number(each.mean_b),
-        "B - A": _number(each.difference, each.difference_interval),
-        "B - A, paired": _number(paired.difference, paired.interval) if paired else "",
-        "P(B > A)": _share(each.probability, each.probability_interval),
-        "p (Holm)": _p_value(each.p_value_holm),
-    }
+def _cell(name: str, estimate: Estimate | None) -> str:
+    if estimate is None:
+        return ""
+    # There is no room for the intervals of all.
+    if name.startswith("mean"):
+        return _number(estimate.value)
+    return _estimate(estimate).replace(" (", "\n(")
 
 
-def _lines_after(comparison: Comparison, unmet: Sequence[str]) -> Iterator[str]:
+def _lines_after(comparison: Comparison) -> Iterator[str]:
     percent = f"{comparison.bootstrap.confidence * 100:g} %"
     yield (
-        f"In brackets: {percent} intervals, over {comparison.unit}. P(B > A): equal "
-        "returns count half."
+        f"In brackets: {percent} intervals, over {comparison.unit}. Equal returns "
+        "count half in the probability of improvement; p-values are Holm's."
     )
-    for name, tasks in (("A", comparison.only_in_a), ("B", comparison.only_in_b)):
+    for name, tasks in zip("AB", comparison.left_out, strict=True):
         if tasks:
             yield f"Only in {name}: {', '.join(tasks)}"
     if comparison.remarks:
         yield f"The two also differ in: {'; '.join(comparison.remarks)}."
     yield _sentence(comparison)
-    for why in unmet:
-        yield f"Not met: {why}."
 
 
 def _sentence(comparison: Comparison) -> str:
     """Return what the figures say, in words."""
-    differences = [task.difference or 0.0 for task in comparison.compared]
+    differences = [
+        each.figures["difference"].value for each in comparison.tasks if each.figures
+    ]
     if not differences:
         return "No task could be compared."
     higher = sum(difference > 0 for difference in differences)
-    same = sum(difference == 0 for difference in differences)
-    text = (
-        f"B has the higher mean return on {higher} of "
-        f"{counted(len(differences), 'task')}{f', and the same on {same}' * bool(same)}"
-        "; probability of improvement of B over A: "
-        f"{_share(comparison.probability, comparison.probability_interval)}"
-    )
-    scores = comparison.scores
-    if scores is not None:
-        text += (
-            f"; interquartile mean of scores {scores.iqm_a:.3f} in A and "
-            f"{scores.iqm_b:.3f} in B, difference "
-            f"{_share(scores.difference, scores.interval, digits=3)}"
-        )
-        count = len(scores.tasks)
-        if count < len(differences):
-            verb = "has" if count == 1 else "have"
-            text += f" ({count} of the tasks {verb} a scale)"
+    same = differences.count(0)
+    tasks = counted(len(differences), "task")
+    text = f"B has the higher mean return on {higher} of {tasks}"
+    if same:
+        text += f", and the same on {same}"
+    for name, estimate in comparison.figures.items():
+        text += f"; {name} {_estimate(estimate)}"
+    if 0 < len(comparison.scored) < len(differences):
+        text += f" (scores of {counted(len(comparison.scored), 'task')})"
     return f"{text}."
 
 
-def _number(value: float | None, interval: Interval | None = None) -> str:
-    return _shown(value, interval, ".6g")
-
-
-def _share(value: float | None, interval: Interval | None, *, digits: int = 2) -> str:
-    return _shown(value, interval, f".{digits}f")
-
-
-def _shown(value: float | None, interval: Interval | None, form: str) -> str:
-    if value is None:
-        return ""
+def _estimate(estimate: Estimate) -> str:
+    interval = estimate.interval
     if interval is None:
-        return f"{value:{form}}"
-    return f"{value:{form}} ({interval.low:{form}} to {interval.high:{form}})"
+        return _number(estimate.value)
+    ends = f"{_number(interval.low)} to {_number(interval.high)}"
+    return f"{_number(estimate.value)} ({ends})"
 
 
-def _p_value(value: float | None) -> str:
-    if value is None:
-        return ""
-    return "< 0.001" if value < 0.001 else f"{value:.3f}"
-
-
-def _fields(comparison: Comparison, unmet: Sequence[str]) -> dict[str, Any]:
-    """Return what `--json` prints: the fields of `Comparison`, and what is not met."""
-    fields = dataclasses.asdict(comparison)
-    a, b = (list(map(str, paths)) for paths in (comparison.a, comparison.b))
-    return {**fields, "a": a, "b": b, "unmet": list(unmet)}
+def _number(value: float) -> str:
+    return f"{value:.4g}" if abs(value) < 1000 else f"{value:.1f}"

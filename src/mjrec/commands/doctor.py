@@ -52,6 +52,13 @@ def show_report(report: MachineReport, console: Console) -> None:
     _line(console, "python", report.python, report.platform)
     for package in report.packages:
         _show_package(console, package)
+    _heading(console, "Extras and engines")
+    for extra in report.extras:
+        if extra.version is not None:
+            _line(console, extra.name, extra.version)
+        else:
+            _line(console, extra.name, "not found", style="yellow")
+            _whole_line(console, extra.fix)
     _heading(console, "Machine")
     _line(console, "CPUs", str(report.cpus.usable), _about_cpus(report.cpus))
     files = ", ".join(report.gpu_device_files)

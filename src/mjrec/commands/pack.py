@@ -54,7 +54,7 @@ def pack(
             videos are drawn again smaller, from the recorded states.
     """
     console = rich.console.Console(stderr=True)
-    with render_progress(console, title="drawing smaller videos ") as on_progress:
+    with render_progress(console, title="drawing smaller videos") as on_progress:
         archive = pack_directory(
             directory,
             out,

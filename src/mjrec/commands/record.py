@@ -13,8 +13,9 @@ import rich.console
 import tyro
 
 from .. import json_text
-from ..environments.options import EnvironmentOptions
+from ..environments.named_environment import EnvironmentOptions
 from ..formats.video_metadata import finished_videos
+from ..monitors.progress import progress_bar
 from ..recorder.options import RecorderOptions
 from ..sessions import (
     Session,
@@ -25,7 +26,6 @@ from ..sessions import (
 from .counted import counted
 from .environment_options import kwargs_of
 from .help_text import flowing_help
-from .progress import EpisodeProgress
 from .view_options import camera_of, number_or_name, size_of
 
 _INTERRUPTED = 130
@@ -152,21 +152,46 @@ def _run(
     session: Session, console: rich.console.Console
 ) -> tuple[list[SessionEpisode], bool]:
     """Return the recorded episodes, and whether Ctrl-C ended them early."""
+    # Not at the top: it loads MuJoCo, and help is there at once without.
+    from ..simulation.warnings import log_mujoco_warnings
+
+    log_mujoco_warnings()
     recorded: list[SessionEpisode] = []
-    progress = EpisodeProgress(
-        console, title=session.environment, episodes=session.episodes
-    )
-    with (
-        progress,
-        contextlib.closing(record_session(session, on_step=progress.step)) as run,
-    ):
-        try:
-            for episode in run:
-                recorded.append(episode)
-                progress.episode(episode)
-        except KeyboardInterrupt:
-            return recorded, True
+    steps, total = 0, session.episodes
+    with progress_bar(console) as show:
+
+        def show_progress() -> None:
+            words = f"{len(recorded)}/{total} episodes, {steps} steps"
+            show(session.environment, len(recorded), total, words)
+
+        def count_step() -> None:
+            nonlocal steps
+            steps += 1
+            # An update costs more than a step of a small environment.
+            if steps % 16 == 0:
+                show_progress()
+
+        with contextlib.closing(record_session(session, on_step=count_step)) as run:
+            try:
+                for episode in run:
+                    recorded.append(episode)
+                    show_progress()
+                    if not console.is_terminal:
+                        _print_episode(episode, len(recorded), total, console)
+            except KeyboardInterrupt:
+                return recorded, True
     return recorded, False
+
+
+def _print_episode(
+    episode: SessionEpisode, done: int, total: int, console: rich.console.Console
+) -> None:
+    console.print(
+        f"episode {episode.episode_id} ({done}/{total}): {episode.length} steps, "
+        f"return {episode.reward:.6g}",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def _print_summary(

@@ -3,18 +3,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import rich.console
-import rich.progress
 import tyro
 
 from .. import json_text
-from ..reporting.media import OnProgress, ReportProgress
+from ..monitors.progress import progress_bar
 from ..reporting.report_folder import write_report
 from .help_text import flowing_help
 
@@ -55,7 +52,7 @@ def report(
         as_json: print one JSON object at the end.
     """
     console = rich.console.Console(stderr=True)
-    with _progress_on(console) as told:
+    with progress_bar(console) as show:
         page = write_report(
             directories,
             out,
@@ -63,34 +60,15 @@ def report(
             single_file=single_file,
             max_single_file_bytes=max_single_file_bytes,
             verifications=verification,
-            on_progress=told,
+            on_progress=lambda progress: show(
+                progress.what,
+                progress.done,
+                progress.total,
+                f"{progress.done}/{progress.total}",
+            ),
         )
     if as_json:
         sys.stdout.write(json_text.dumps({"page": str(page.absolute())}) + "\n")
     else:
         sys.stdout.write(f"{page.absolute()}\n")
     return 0
-
-
-@contextlib.contextmanager
-def _progress_on(console: rich.console.Console) -> Iterator[OnProgress | None]:
-    """Show a bar for posters and one for videos on a terminal; nothing elsewhere."""
-    if not console.is_terminal:
-        yield None
-        return
-    bar = rich.progress.Progress(
-        rich.progress.TextColumn("{task.description:8}"),
-        rich.progress.BarColumn(bar_width=30),
-        rich.progress.MofNCompleteColumn(),
-        console=console,
-        transient=True,
-    )
-    tasks: dict[str, rich.progress.TaskID] = {}
-
-    def show(progress: ReportProgress) -> None:
-        if progress.what not in tasks:
-            tasks[progress.what] = bar.add_task(progress.what)
-        bar.update(tasks[progress.what], completed=progress.done, total=progress.total)
-
-    with bar:
-        yield show

@@ -3,23 +3,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import rich.box
 import rich.console
 import rich.markup
-import rich.progress
 import rich.table
 import tyro
 
 from .. import json_text
 from ..evidence.verification import Check, Level, Verdict, Verification
-from ..evidence.verifying import VerificationProgress
 from ..evidence.verifying import verify as verify_archive
+from ..monitors.progress import progress_bar
 from .help_text import flowing_help
 from .terminal import printable, result_console
 
@@ -69,7 +67,7 @@ def verify(
         as_json: print one JSON object, instead of text.
     """
     console = rich.console.Console(stderr=True)
-    with _progress_on(console) as told:
+    with progress_bar(console) as show:
         verification = verify_archive(
             path,
             level=level,
@@ -77,44 +75,18 @@ def verify(
             seed=seed,
             trust=trust,
             report=report,
-            on_progress=told,
+            on_progress=lambda progress: show(
+                progress.level.value,
+                progress.done,
+                max(1, progress.total),
+                f"{100 * progress.done // max(1, progress.total)} %",
+            ),
         )
     if as_json:
         sys.stdout.write(json_text.dumps(_fields(verification)) + "\n")
     else:
         _show(verification)
     return 0 if verification.passed else _FAILED
-
-
-@contextlib.contextmanager
-def _progress_on(
-    console: rich.console.Console,
-) -> Iterator[Callable[[VerificationProgress], object] | None]:
-    """Show a bar for each level on a terminal; nothing elsewhere."""
-    if not console.is_terminal:
-        yield None
-        return
-    bar = rich.progress.Progress(
-        rich.progress.TextColumn("{task.description:8}"),
-        rich.progress.BarColumn(bar_width=30),
-        rich.progress.TaskProgressColumn(),
-        rich.progress.TimeElapsedColumn(),
-        console=console,
-        transient=True,
-    )
-    tasks: dict[Level, rich.progress.TaskID] = {}
-
-    def show(progress: VerificationProgress) -> None:
-        if progress.level not in tasks:
-            tasks[progress.level] = bar.add_task(progress.level.value)
-        bar.update(
-            tasks[progress.level],
-            completed=progress.done,
-            total=max(1, progress.total),
-        )
-
-    with bar:
-        yield show
 
 
 def _show(verification: Verification) -> None:

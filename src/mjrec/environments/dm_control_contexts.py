@@ -30,7 +30,7 @@ class ContextsOnDemand:
         self._env = env
         self._is_resetting = False
         self._hooked = False
-        self._replaced: list[tuple[Any, _Contexts]] = []
+        self._replaced: list[_Contexts] = []
 
     @contextlib.contextmanager
     def resetting(self) -> Iterator[None]:
@@ -41,99 +41,54 @@ class ContextsOnDemand:
         the physics is as it was.
         """
         self._is_resetting = True
-        self._hook()
+        # A physics which the reset itself compiles is met in time.
+        if not self._hooked and hasattr(self._env, "add_extra_hook"):
+            # Composer has no way to take one out again; it does nothing but in resets.
+            self._env.add_extra_hook("after_compile", self._stand_in)
+            self._hooked = True
         self._stand_in(self._env.physics)
         try:
             yield
         finally:
             self._is_resetting = False
-            self._take_out()
+            while self._replaced:
+                # Composer's are weak references to what a compilation has freed.
+                with contextlib.suppress(ReferenceError):
+                    self._replaced.pop().take_out()
 
-    def _hook(self) -> None:
-        """See to it that a physics which the reset itself compiles is met in time."""
-        add_extra_hook = getattr(self._env, "add_extra_hook", None)
-        if add_extra_hook is not None and not self._hooked:
-            # Composer has no way to take one out again; it does nothing but in resets.
-            add_extra_hook("after_compile", self._compiled)
-            self._hooked = True
-
-    def _compiled(self, physics: Any, _random_state: Any) -> None:
-        if self._is_resetting:
-            self._stand_in(physics)
-
-    def _stand_in(self, physics: Any) -> None:
-        if isinstance(physics, engine.Physics) and not physics._contexts:
-            contexts = _Contexts(physics)
-            self._replaced.append((physics, contexts))
-            physics._contexts = contexts
-
-    def _take_out(self) -> None:
-        while self._replaced:
-            physics, contexts = self._replaced.pop()
-            # Composer's are weak references to what a compilation has freed.
-            with contextlib.suppress(ReferenceError):
-                contexts.take_out(physics)
+    def _stand_in(self, physics: Any, _random_state: Any = None) -> None:
+        is_known = self._is_resetting and isinstance(physics, engine.Physics)
+        if is_known and not physics._contexts:
+            physics._contexts = _Contexts(physics)
+            self._replaced.append(physics._contexts)
 
 
 class _Contexts:
-    """Stands for the contexts of a physics until something is drawn."""
+    """Stands for the contexts of a physics, and for each of them, until one draws."""
 
     def __init__(self, physics: Any) -> None:
         self._physics = physics
-        self.gl = _GL(self)
-        self.mujoco = _Mujoco(self)
+        self.gl = self.mujoco = self.ptr = self
 
-    def real(self) -> Any:
-        """Return the physics' own contexts, made now if there were none."""
-        self.take_out(self._physics)
-        return self._physics.contexts
-
-    def take_out(self, physics: Any) -> None:
+    def take_out(self) -> None:
         """Leave the physics without contexts, unless it has real ones by now."""
-        if physics._contexts is self:
-            physics._contexts = None
+        if self._physics._contexts is self:
+            self._physics._contexts = None
+
+    @contextlib.contextmanager
+    def make_current(self) -> Iterator[_Contexts]:
+        """Give what calls functions."""
+        yield self
 
     def call(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """Call what is to run where the contexts are, unless it is an upload."""
         if getattr(function, "__name__", None) in _UPLOADS:
             return None
-        real = self.real()
-        own = [real.mujoco.ptr if arg is self.mujoco else arg for arg in args]
+        self.take_out()
+        real = self._physics.contexts
+        own = [real.mujoco.ptr if arg is self else arg for arg in args]
         with real.gl.make_current() as context:
             return context.call(function, *own, **kwargs)
 
-
-class _GL:
-    """Stands for the OpenGL context."""
-
-    def __init__(self, contexts: _Contexts) -> None:
-        self._contexts = contexts
-
-    @contextlib.contextmanager
-    def make_current(self) -> Iterator[_Contexts]:
-        """Give what calls functions."""
-        yield self._contexts
-
     def free(self) -> None:
         """Do nothing: there is none."""
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._contexts.real().gl, name)
-
-
-class _Mujoco:
-    """Stands for MuJoCo's context, and for what it calls `ptr`."""
-
-    def __init__(self, contexts: _Contexts) -> None:
-        self._contexts = contexts
-
-    @property
-    def ptr(self) -> _Mujoco:
-        """Return what stands for the context among the arguments of a call."""
-        return self
-
-    def free(self) -> None:
-        """Do nothing: there is none."""
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._contexts.real().mujoco, name)

@@ -4,24 +4,31 @@
 from __future__ import annotations
 
 import math
-import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import dm_env
 import numpy as np
 from dm_control import suite
 
-from ..errors import InvalidArgument, UnknownName
-from .dm_control_failures import dm_control_failure
-from .dm_env_episodes import StepLimit
+from ..errors import UnknownName
+from ..simulation.cameras import default_camera, resolve_camera
+from .dm_control_contexts import ContextsOnDemand
+from .dm_control_scenes import MADE_WITH, dm_control_scenes, generator_of
+from .dm_env_episodes import StepLimit, is_terminated, is_truncated
 from .episode_seeds import EpisodeSeeds
-from .options import EnvironmentOptions
+from .known_names import dm_control_failure
+from .named_environment import EnvironmentOptions, NamedEnvironment, Step
+from .names import DmControlName
+from .scenes import Scenes, set_generator_state
 
 _ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
-# Nothing in an environment says with which arguments it was made.
-_made: weakref.WeakKeyDictionary[Any, dict[str, Any]] = weakref.WeakKeyDictionary()
+
+def tasks_of(domain: str) -> Sequence[str]:
+    """Return the tasks that the installed suite has of a domain."""
+    tasks: Sequence[str] = suite.TASKS_BY_DOMAIN.get(domain, ())
+    return tasks
 
 
 def make_dm_control(
@@ -46,104 +53,6 @@ def make_dm_control(
         MissingDependency: this dm_control does not work with this mujoco.
         EnvironmentNotMade: making it failed otherwise; the cause is kept.
     """
-    _check_name(domain, task)
-    arguments = _arguments(options.kwargs)
-    arguments["task_kwargs"] = {"random": options.seed, **arguments["task_kwargs"]}
-    try:
-        environment = suite.load(domain, task, **arguments)
-    except Exception as error:
-        raise dm_control_failure(f"dm_control/{domain}-{task}", error) from error
-    _made[environment.task] = arguments
-    return _limited(environment, options)
-
-
-def arguments_of(env: dm_env.Environment) -> dict[str, Any] | None:
-    """Return what `suite.load` was given besides domain and task.
-
-    Args:
-        env: a task of the suite, or a wrapper that shows its `task`.
-
-    Returns:
-        None where it was not `make_dm_control` that made it.
-    """
-    try:
-        return _made.get(getattr(env, "task", None))
-    except TypeError:
-        # No task, or one that can be no key.
-        return None
-
-
-def begin_episode(env: dm_env.Environment, seeds: EpisodeSeeds) -> Any:
-    """Reset the environment, or a wrapper of it, to an episode's seeds.
-
-    dm_env's `reset` takes no seed. dm_control's tasks draw all their random numbers
-    from one `RandomState`, which is seeded in place, because what else holds it must
-    see the same. A monitor is told the seed, for its metadata.
-
-    Returns:
-        The first observation.
-
-    Raises:
-        InvalidArgument: the environment has no random state.
-    """
-    _random_state(env).seed(seeds.environment)
-    if not callable(getattr(env, "seed", print)):
-        env.seed = seeds.environment
-    return env.reset().observation
-
-
-def begin_stream(env: dm_env.Environment, seed: int, seeds: EpisodeSeeds) -> Any:
-    """Reset the environment, seeded for all episodes that follow.
-
-    An environment that was made with this seed and never reset is not seeded again:
-    it is as `suite.load(..., task_kwargs={"random": seed})` made it, and what it drew
-    while it was made stays drawn. Any other begins the seed's sequence anew.
-
-    Args:
-        env: the environment, or a wrapper of it.
-        seed: of the environment's randomness from here on.
-        seeds: of this episode; nothing of dm_env takes one.
-
-    Returns:
-        The first observation.
-
-    Raises:
-        InvalidArgument: the environment has no random state.
-    """
-    made = arguments_of(env) or {}
-    if made.get("task_kwargs", {}).get("random") != seed:
-        _random_state(env).seed(seed)
-    return next_episode(env, seeds)
-
-
-def next_episode(env: dm_env.Environment, seeds: EpisodeSeeds) -> Any:
-    """Reset the environment, whose randomness goes on where it is.
-
-    A monitor says of such an episode that it had no seed.
-
-    Returns:
-        The first observation.
-    """
-    if not callable(getattr(env, "seed", print)):
-        env.seed = None
-    return env.reset().observation
-
-
-def step_limit(env: dm_env.Environment) -> int:
-    """Return after how many steps the episodes of what was made here end."""
-    if isinstance(env, StepLimit):
-        return env.max_steps
-    # Nothing public tells it, and what is not limited by us has one.
-    return int(env._step_limit)
-
-
-def step(env: dm_env.Environment, action: Any) -> tuple[Any, bool]:
-    """Return the next observation, and whether it is the episode's last."""
-    timestep = env.step(action)
-    return timestep.observation, timestep.last()
-
-
-def _check_name(domain: str, task: str) -> None:
     if domain not in suite.TASKS_BY_DOMAIN:
         raise UnknownName(
             "dm_control domain",
@@ -151,9 +60,123 @@ def _check_name(domain: str, task: str) -> None:
             suite.TASKS_BY_DOMAIN,
             hint="An environment is named dm_control/<domain>-<task>.",
         )
-    tasks = suite.TASKS_BY_DOMAIN[domain]
-    if task not in tasks:
-        raise UnknownName(f"task of dm_control's {domain}", task, tasks)
+    if task not in tasks_of(domain):
+        raise UnknownName(f"task of dm_control's {domain}", task, tasks_of(domain))
+    arguments = _arguments(options.kwargs)
+    arguments["task_kwargs"] = {"random": options.seed, **arguments["task_kwargs"]}
+    try:
+        environment = suite.load(domain, task, **arguments)
+    except Exception as error:
+        raise dm_control_failure(f"dm_control/{domain}-{task}", error) from error
+    # Nothing in an environment says with which arguments it was made.
+    setattr(environment.task, MADE_WITH, arguments)
+    return _limited(environment, options)
+
+
+class DmControlEnvironment(NamedEnvironment):
+    """A task of the suite.
+
+    Args:
+        name: of the task.
+        options: how it is made; camera and size are what the monitor is to be given.
+
+    Raises:
+        Error: of `make_dm_control`; or the model has no such camera.
+    """
+
+    def __init__(self, name: DmControlName, options: EnvironmentOptions) -> None:
+        environment = make_dm_control(name.domain, name.task, options)
+        view: dict[str, Any] = {}
+        if options.pictures:
+            camera = options.camera
+            if camera is None:
+                camera = default_camera(environment.physics.model)
+            resolve_camera(environment.physics.model, camera)
+            view = {"camera": camera, **options.size}
+        limited = isinstance(environment, StepLimit)
+        super().__init__(
+            environment,
+            env_id=str(name),
+            # Nothing public tells it, and what is not limited by us has one.
+            step_limit=int(
+                environment.max_steps if limited else environment._step_limit
+            ),
+            view=view,
+        )
+        self._contexts = ContextsOnDemand(environment)
+        self._made_with = getattr(environment.task, MADE_WITH)["task_kwargs"]["random"]
+        self._draws_when_made = not _is_fresh(self._generator(), self._made_with)
+        self._was_reset = False
+
+    @property
+    def draws_when_made(self) -> bool:
+        """Whether its model depends on the seed that it was made with."""
+        return self._draws_when_made
+
+    def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
+        """Reset to an episode's seeds.
+
+        dm_env's `reset` takes no seed. dm_control's tasks draw all their random numbers
+        from one `RandomState`, which is seeded in place, because what else holds it
+        must see the same. A monitor is told the seed, for its metadata.
+        """
+        self._generator().seed(seeds.environment)
+        return self._reset(around, seeds.environment)
+
+    def begin_stream(self, around: Any, seed: int, seeds: EpisodeSeeds) -> Any:
+        """Reset, seeded for all episodes that follow.
+
+        An environment that was made with this seed and never reset is not seeded again:
+        it is as `suite.load(..., task_kwargs={"random": seed})` made it, and what it
+        drew while it was made stays drawn. Any other begins the seed's sequence anew.
+        """
+        if self._was_reset or self._made_with != seed:
+            self._generator().seed(seed)
+        return self._reset(around, None)
+
+    def next_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
+        """Reset without seeding; a monitor says that the episode had no seed."""
+        return self._reset(around, None)
+
+    def step(self, around: Any, action: Any) -> Step:
+        """Step, and return what that gave."""
+        timestep = around.step(action)
+        return Step(
+            timestep.observation,
+            timestep.reward,
+            is_terminated(timestep),
+            is_truncated(timestep),
+        )
+
+    def scenes(self) -> Scenes:
+        """Return what is known of its pictures and its states."""
+        return dm_control_scenes(self.environment)
+
+    def begin_again(self, seed: int | None, state: Any, options: Any) -> Any:
+        """Begin an episode as a recording says; of two, the state is what counts."""
+        if options:
+            raise ValueError("dm_control's resets take no options")
+        if state is not None:
+            set_generator_state(self._generator(), state)
+        else:
+            self._generator().seed(seed)
+        with self._contexts.resetting():
+            return self.environment.reset().observation
+
+    def _generator(self) -> Any:
+        return generator_of(self.environment)
+
+    def _reset(self, around: Any, seed: int | None) -> Any:
+        self._was_reset = True
+        if not callable(getattr(around, "seed", print)):
+            around.seed = seed
+        return around.reset().observation
+
+
+def _is_fresh(generator: Any, seed: Any) -> bool:
+    """Tell whether a generator, made with a seed, has drawn nothing."""
+    states = (each.get_state() for each in (generator, np.random.RandomState(seed)))
+    return all(map(np.array_equal, *states))
 
 
 def _arguments(kwargs: Mapping[str, Any]) -> dict[str, Any]:
@@ -176,15 +199,3 @@ def _limited(
     own = getattr(environment, "_step_limit", math.inf)
     limit = options.limit(own)
     return environment if limit >= own else StepLimit(environment, limit)
-
-
-def _random_state(env: dm_env.Environment) -> np.random.RandomState:
-    """Return what the suite's tasks, and composer's environments, draw from."""
-    for holder, name in ((getattr(env, "task", None), "random"), (env, "random_state")):
-        state = getattr(holder, name, None)
-        if isinstance(state, np.random.RandomState):
-            return state
-    raise InvalidArgument(
-        f"{type(env).__name__} cannot be seeded: it has neither task.random nor "
-        "random_state, as dm_control's environments have."
-    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of a dm_control environment, from which its pictures follow."""
+"""The states of a dm_control environment, and the pictures that follow from them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from collections.abc import Callable, Mapping
 from operator import attrgetter
 from typing import Any
 
+import numpy as np
 from dm_control.mujoco import wrapper
 
+from ..frames import check_size
 from ..simulation.cameras import (
     FREE_CAMERA,
     camera_label,
@@ -18,6 +20,7 @@ from ..simulation.cameras import (
     resolve_camera,
 )
 from ..simulation.capture import Capture
+from ..simulation.gl_context import current_gl_facts
 from ..simulation.model_sources import AuthoredModel
 from ..simulation.view import (
     SceneView,
@@ -25,9 +28,8 @@ from ..simulation.view import (
     place_free_camera,
 )
 from .dm_control_contexts import ContextsOnDemand
-from .dm_control_environments import arguments_of
-from .dm_control_pictures import drawn_by_physics, picture_size
 from .scenes import (
+    NoPictureSource,
     Scenes,
     class_name,
     generator_state,
@@ -39,12 +41,24 @@ from .scenes import (
 from .wrapping import around_dm_env
 
 _SUITE = "dm_control/"
+# What a task of the suite that was made here is given: `suite.load`'s other arguments.
+MADE_WITH = "_mjrec_made_with"
 
 # Asked at every captured step. It is dm_control's own, which belongs to one model.
 _DATA = attrgetter("physics.data")
 
 # Of pictures that `physics.render()` does not draw.
 _MAX_GEOM = 10000
+
+
+_NOT_BY_PHYSICS = (
+    "physics.render() draws no picture from an MjvCamera, nor one that is larger than "
+    "the model's offscreen buffer; such pictures are drawn from recorded states and "
+    "never live. Leave render= out"
+)
+
+# The size of `physics.render()` where none is asked for.
+_HEIGHT, _WIDTH = 240, 320
 
 
 def dm_control_scenes(
@@ -66,14 +80,14 @@ def dm_control_scenes(
         env_id: `dm_control/<domain>-<task>`, of a task of the suite.
 
     The pictures are those of `physics.render()`, or where that draws no such picture
-    (see `drawn_by_physics`) those of the same scene.
+    (see `_drawn_by_physics`) those of the same scene.
 
     Raises:
         UnknownName: the model has no such camera.
         InvalidArgument: a camera number, or a size, that cannot be.
     """
-    height, width = picture_size(height, width)
-    by_physics = drawn_by_physics(env.physics, camera, height, width)
+    height, width = _picture_size(height, width)
+    by_physics = _drawn_by_physics(env.physics, camera, height, width)
     scene = _PhysicsScene(
         env,
         camera=FREE_CAMERA if camera is None else camera,
@@ -91,8 +105,86 @@ def dm_control_scenes(
         ),
         obstacle=_obstacle(env.physics) if by_physics else None,
         environment=_environment(env, env_id),
-        random_state=lambda: _random_state(env),
+        random_state=lambda: generator_state(generator_of(env)),
     )
+
+
+def dm_control_pictures(
+    env: Any,
+    *,
+    camera: Any = None,
+    height: int | None = None,
+    width: int | None = None,
+) -> PhysicsPictures | NoPictureSource:
+    """Return the source of a dm_control environment's pictures.
+
+    Args:
+        env: an environment with dm_control's `physics`.
+        camera: a name or number; None is dm_control's default, the free camera.
+        height: in pixels; None is 240, dm_control's default.
+        width: in pixels; None is 320, likewise.
+
+    The pictures are those of `physics.render()`. What that cannot draw is not drawn
+    live: a picture larger than the model's offscreen buffer, and one from an
+    `MjvCamera`.
+
+    Raises:
+        UnknownName: the model has no such camera.
+        InvalidArgument: a number or a size that cannot be.
+    """
+    height, width = _picture_size(height, width)
+    if camera is not None:
+        resolve_camera(raw_model(env.physics.model), camera)
+    if not _drawn_by_physics(env.physics, camera, height, width):
+        return NoPictureSource(_NOT_BY_PHYSICS)
+    return PhysicsPictures(env, camera=camera, height=height, width=width)
+
+
+def generator_of(env: Any) -> Any:
+    """Return what an environment draws its random numbers from; None for nothing."""
+    # Of the suite's tasks, and of composer's environments.
+    for holder, name in ((getattr(env, "task", None), "random"), (env, "random_state")):
+        found = getattr(holder, name, None)
+        if isinstance(found, np.random.RandomState):
+            return found
+    return None
+
+
+class PhysicsPictures:
+    """The pictures that `physics.render()` gives.
+
+    Args:
+        env: the environment; its physics may be another one at each call.
+        camera: a name or number; None is the free camera.
+        height: in pixels.
+        width: in pixels.
+    """
+
+    render_mode = "rgb_array"
+
+    def __init__(self, env: Any, *, camera: Any, height: int, width: int) -> None:
+        self._env = env
+        self._camera = -1 if camera is None else camera
+        self._height = height
+        self._width = width
+
+    def render(self) -> Any:
+        """Return the picture of this moment, `(height, width, 3) uint8`."""
+        return self._env.physics.render(
+            height=self._height, width=self._width, camera_id=self._camera
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the metadata of a video says about its pictures."""
+        physics = self._env.physics
+        facts: dict[str, Any] = {
+            "pictures": "env.render",
+            "quality": "full",
+            "camera": camera_label(raw_model(physics.model), self._camera),
+        }
+        with physics.contexts.gl.make_current() as context:
+            facts.update(context.call(current_gl_facts))
+        return facts
 
 
 class _PhysicsScene:
@@ -159,6 +251,24 @@ class _PhysicsScene:
         )
 
 
+def _picture_size(height: int | None, width: int | None) -> tuple[int, int]:
+    """Return `(height, width)` with dm_control's default for what is None.
+
+    Raises:
+        InvalidArgument: a size that cannot be.
+    """
+    return check_size(
+        _HEIGHT if height is None else height, _WIDTH if width is None else width
+    )
+
+
+def _drawn_by_physics(physics: Any, camera: Any, height: int, width: int) -> bool:
+    """Tell whether `physics.render()` draws such pictures."""
+    buffer = physics.model.vis.global_
+    named = camera is None or isinstance(camera, str | int)
+    return bool(named and height <= buffer.offheight and width <= buffer.offwidth)
+
+
 def _max_geom(model: Any) -> int:
     # What dm_control chooses is known only to its scenes.
     return int(wrapper.MjvScene(model).maxgeom)
@@ -213,17 +323,7 @@ def _bytes(content: str | bytes) -> bytes:
 def _environment(env: Any, env_id: str | None) -> dict[str, Any] | None:
     if env_id is None or not env_id.startswith(_SUITE):
         return None
-    arguments = arguments_of(env)
+    arguments = getattr(getattr(env, "task", None), MADE_WITH, None)
     kwargs = None if arguments is None else plain_arguments(arguments)
     known = {"framework": "dm_control", "id": env_id, "kwargs": kwargs}
     return {**known, **around_dm_env(env)}
-
-
-def _random_state(env: Any) -> Any:
-    """Return the state of what the environment draws its random numbers from."""
-    # Of the suite's tasks, and of composer's environments.
-    for holder, name in ((getattr(env, "task", None), "random"), (env, "random_state")):
-        state = generator_state(getattr(holder, name, None))
-        if state is not None:
-            return state
-    return None

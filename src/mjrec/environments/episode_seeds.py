@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the seed of a run to the seeds of one episode.
+"""From the seed of a run to the seeds of one episode, and of a process.
 
 The recipe, to be redone by hand::
 
@@ -13,6 +13,8 @@ two numbers, so any episode can be recorded again without those before it.
 
 from __future__ import annotations
 
+import random
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +55,22 @@ def episode_seeds(seed: int, episode: int) -> EpisodeSeeds:
     words = np.random.SeedSequence(entropy).generate_state(3)
     environment, actions, policy = (int(word) >> 1 for word in words)
     return EpisodeSeeds(environment=environment, actions=actions, policy=policy)
+
+
+def seed_global_generators(seed: int) -> None:
+    """Seed Python's, NumPy's and, where it is loaded, PyTorch's generators.
+
+    Policies draw from them (`numpy.random.uniform`, dropout) without knowing of any
+    seed. For processes of our own only: in a user's they are the user's.
+
+    Args:
+        seed: from 0 to 2**32 - 1.
+    """
+    random.seed(seed)
+    np.random.seed(seed)
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        torch.manual_seed(seed)
 
 
 def _checked(name: str, number: object) -> int:

@@ -24,8 +24,11 @@ from ..errors import (
 )
 from ..simulation.find_simulation import simulation_in
 from .episode_seeds import EpisodeSeeds
-from .options import EnvironmentOptions
-from .working_directory import working_directory_importable
+from .gymnasium_scenes import drawn_part, gymnasium_scenes
+from .known_names import newest_versions
+from .named_environment import EnvironmentOptions, NamedEnvironment, Step
+from .names import working_directory_importable
+from .scenes import Scenes, set_generator_state
 
 # What records as a video, before what records as text.
 _PREFERRED_MODES = ("rgb_array", "ansi")
@@ -68,54 +71,63 @@ def make_gymnasium(env_id: str, options: EnvironmentOptions) -> gymnasium.Env[An
         return _make_known(_spec(env_id), options)
 
 
-def begin_episode(env: gymnasium.Env[Any, Any], seeds: EpisodeSeeds) -> Any:
-    """Reset the environment, or a wrapper of it, to an episode's seeds.
-
-    Its action space is seeded too, for policies that sample from it.
-
-    Returns:
-        The first observation.
-    """
-    env.action_space.seed(seeds.actions)
-    observation, _ = env.reset(seed=seeds.environment)
-    return observation
-
-
-def begin_stream(env: gymnasium.Env[Any, Any], seed: int, seeds: EpisodeSeeds) -> Any:
-    """Reset the environment, seeded for all episodes that follow.
+class GymnasiumEnvironment(NamedEnvironment):
+    """One of Gymnasium's environments.
 
     Args:
-        env: the environment, or a wrapper of it.
-        seed: of the environment's randomness from here on.
-        seeds: of this episode; only the action space takes one.
-
-    Returns:
-        The first observation.
+        environment: as `make_gymnasium` made it, or an MJCF file's.
+        no_pictures: why it was made without pictures though they were asked for.
+        is_random: whether anything in it is.
     """
-    env.action_space.seed(seeds.actions)
-    observation, _ = env.reset(seed=seed)
-    return observation
 
+    def __init__(
+        self,
+        environment: gymnasium.Env[Any, Any],
+        *,
+        no_pictures: Error | None = None,
+        is_random: bool = True,
+    ) -> None:
+        # Environments that are made from names always have one, and a limit.
+        spec: Any = environment.spec
+        super().__init__(
+            environment,
+            env_id=spec.id,
+            step_limit=spec.max_episode_steps,
+            no_pictures=no_pictures,
+            is_random=is_random,
+        )
 
-def next_episode(env: gymnasium.Env[Any, Any], seeds: EpisodeSeeds) -> Any:
-    """Reset the environment, whose randomness goes on where it is.
+    def begin_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
+        """Reset to an episode's seeds; its action space too, for who samples there."""
+        return self.begin_stream(around, seeds.environment, seeds)
 
-    Args:
-        env: the environment, or a wrapper of it.
-        seeds: of this episode; only the action space takes one.
+    def begin_stream(self, around: Any, seed: int, seeds: EpisodeSeeds) -> Any:
+        """Reset, seeded for all episodes that follow."""
+        around.action_space.seed(seeds.actions)
+        return around.reset(seed=seed)[0]
 
-    Returns:
-        The first observation.
-    """
-    env.action_space.seed(seeds.actions)
-    observation, _ = env.reset()
-    return observation
+    def next_episode(self, around: Any, seeds: EpisodeSeeds) -> Any:
+        """Reset without seeding."""
+        around.action_space.seed(seeds.actions)
+        return around.reset()[0]
 
+    def step(self, around: Any, action: Any) -> Step:
+        """Step, and return what that gave."""
+        return Step(*around.step(action)[:4])
 
-def step(env: gymnasium.Env[Any, Any], action: Any) -> tuple[Any, bool]:
-    """Return the next observation, and whether it is the episode's last."""
-    observation, _, terminated, truncated, _ = env.step(action)
-    return observation, bool(terminated or truncated)
+    def scenes(self) -> Scenes:
+        """Return what is known of its pictures and its states."""
+        return gymnasium_scenes(self.environment)
+
+    def begin_again(self, seed: int | None, state: Any, options: Any) -> Any:
+        """Begin an episode as a recording says; of two, the seed is what counts."""
+        base: Any = self.environment.unwrapped
+        if seed is None and state is not None:
+            parts = state if "inner" in state else {"env": state, "inner": None}
+            for holder, part in ((base, "env"), (drawn_part(base), "inner")):
+                if parts[part] is not None:
+                    set_generator_state(holder.np_random, parts[part])
+        return self.environment.reset(seed=seed, options=options)[0]
 
 
 def _make_known(
@@ -146,7 +158,8 @@ def _spec(env_id: str) -> registration.EnvSpec:
     module, colon, name = env_id.rpartition(":")
     if colon:
         _import_registering_module(module, env_id)
-    spec = registration.registry.get(name) or _latest_version(name)
+    newest = newest_versions(registration.registry)
+    spec = registration.registry.get(newest.get(name, name))
     if spec is None:
         raise UnknownName(
             "Gymnasium environment",
@@ -168,17 +181,6 @@ def _import_registering_module(module: str, env_id: str) -> None:
             f"importing the module {module!r} gave {_what_was_raised(error)}",
             hint="It must be installed, or lie in the working directory.",
         ) from error
-
-
-def _latest_version(name: str) -> registration.EnvSpec | None:
-    try:
-        namespace, base, version = registration.parse_env_id(name)
-    except gymnasium.error.Error:
-        return None
-    if version is not None:
-        return None
-    latest = registration.find_highest_version(namespace, base)
-    return registration.registry.get(registration.get_env_id(namespace, base, latest))
 
 
 def _make(
@@ -219,49 +221,30 @@ def _what_was_raised(error: Exception) -> str:
 
 def _render_mode(spec: registration.EnvSpec, kwargs: Mapping[str, Any]) -> str:
     with _failures_of(spec.id):
-        creator = _creator(spec)
-    modes = _render_modes(creator)
-    mode = _chosen_mode(spec.id, modes, kwargs)
-    _check_pygame(spec.id, creator, mode, modes)
-    return mode
-
-
-def _creator(spec: registration.EnvSpec) -> Any:
-    if isinstance(spec.entry_point, str):
-        return registration.load_env_creator(spec.entry_point)
-    if spec.entry_point is None:
-        raise EnvironmentNotMade(spec.id, "only its vectorised form is registered")
-    return spec.entry_point
-
-
-def _render_modes(creator: Any) -> list[str] | None:
-    """Return the modes that a creator declares; None for one that says nothing."""
-    metadata = getattr(creator, "metadata", None)
+        creator: Any = spec.entry_point
+        if creator is None:
+            raise EnvironmentNotMade(spec.id, "only its vectorised form is registered")
+        if isinstance(creator, str):
+            creator = registration.load_env_creator(creator)
     # A function has none, and on a wrapper's class it is a property.
-    if not isinstance(metadata, dict):
-        return None
-    return list(metadata.get("render_modes") or [])
-
-
-def _chosen_mode(
-    env_id: str, modes: list[str] | None, kwargs: Mapping[str, Any]
-) -> str:
+    metadata = getattr(creator, "metadata", None)
+    modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
     if "render_mode" in kwargs:
-        return _checked_mode(env_id, modes, kwargs["render_mode"])
-    if modes is None:
-        return _PREFERRED_MODES[0]
-    for mode in _PREFERRED_MODES:
-        if mode in modes:
-            return mode
-    raise _no_pictures(env_id, f"its render modes are {modes}")
-
-
-def _checked_mode(env_id: str, modes: list[str] | None, mode: Any) -> str:
-    if mode in (None, "human"):
-        raise _no_pictures(env_id, f"render_mode={mode!r} was asked for")
-    # Gymnasium itself collects the pictures of `rgb_array` into `rgb_array_list`.
-    if modes is not None and str(mode).removesuffix("_list") not in modes:
-        raise UnknownName(f"render mode of {env_id}", mode, modes)
+        mode = kwargs["render_mode"]
+        if mode in (None, "human"):
+            raise _no_pictures(spec.id, f"render_mode={mode!r} was asked for")
+        # Gymnasium itself collects the pictures of `rgb_array` into `rgb_array_list`.
+        if modes is not None and str(mode).removesuffix("_list") not in modes:
+            raise UnknownName(f"render mode of {spec.id}", mode, modes)
+    else:
+        # What says nothing is asked for pictures.
+        there = _PREFERRED_MODES if modes is None else modes
+        mode = next((each for each in _PREFERRED_MODES if each in there), None)
+        if mode is None:
+            raise _no_pictures(spec.id, f"its render modes are {modes}")
+    family = str(getattr(creator, "__module__", "")).rpartition(".")[0]
+    if family in _PYGAME_EXTRAS and str(mode).startswith("rgb_array"):
+        _check_pygame(spec.id, _PYGAME_EXTRAS[family], has_text="ansi" in (modes or ()))
     return str(mode)
 
 
@@ -273,25 +256,15 @@ def _no_pictures(env_id: str, why: str) -> NoPictures:
     )
 
 
-def _check_pygame(
-    env_id: str, creator: Any, mode: str, modes: list[str] | None
-) -> None:
+def _check_pygame(env_id: str, extra: str, *, has_text: bool) -> None:
     """Say before the first episode what would fail at its first picture."""
-    family = str(getattr(creator, "__module__", "")).rpartition(".")[0]
-    extra = _PYGAME_EXTRAS.get(family)
-    drawn = mode.startswith("rgb_array")
-    if extra is None or not drawn or importlib.util.find_spec("pygame") is not None:
-        return
-    text_instead = (
-        ' (or record its text: --env-kwargs \'{"render_mode": "ansi"}\')'
-        if "ansi" in (modes or [])
-        else ""
-    )
-    raise MissingDependency(
-        "pygame",
-        purpose=f"Drawing {env_id}",
-        install=f'pip install "gymnasium[{extra}]"{text_instead}',
-    )
+    if importlib.util.find_spec("pygame") is None:
+        text_instead = ' (or record its text: --env-kwargs \'{"render_mode": "ansi"}\')'
+        raise MissingDependency(
+            "pygame",
+            purpose=f"Drawing {env_id}",
+            install=f'pip install "gymnasium[{extra}]"{text_instead * has_text}',
+        )
 
 
 def _make_drawn(
@@ -301,13 +274,11 @@ def _make_drawn(
     try:
         if env.render_mode is None:
             raise _no_pictures(spec.id, "it took no render mode")
-        camera = _camera(env, spec.id, kwargs, options.camera)
+        _choose_camera(env, spec.id, kwargs, options.camera)
     except BaseException:
         env.close()
         raise
-    if camera is None:
-        return env
-    return _make_with_camera(spec, {**kwargs, **options.size}, env, camera)
+    return env
 
 
 def _make_sized(
@@ -322,7 +293,8 @@ def _make_sized(
     try:
         return _make(spec, {**kwargs, **size})
     except EnvironmentNotMade as error:
-        if not _refuses(error, size):
+        unknown = (f"unexpected keyword argument {name!r}" for name in size)
+        if not any(text in str(error.__cause__) for text in unknown):
             raise
         raise InvalidArgument(
             f"{spec.id} takes no size: its pictures have the size that it chooses. "
@@ -330,92 +302,40 @@ def _make_sized(
         ) from error.__cause__
 
 
-def _refuses(error: EnvironmentNotMade, arguments: Mapping[str, Any]) -> bool:
-    """Tell whether making failed because an argument is not known."""
-    return isinstance(error.__cause__, TypeError) and any(
-        f"unexpected keyword argument {name!r}" in str(error) for name in arguments
-    )
-
-
-def _camera(
+def _choose_camera(
     env: gymnasium.Env[Any, Any],
     env_id: str,
     kwargs: Mapping[str, Any],
     asked: str | int | None,
-) -> str | int | None:
-    """Return the camera that the environment is to be given; None for none."""
+) -> None:
+    """Let a MuJoCo environment show the camera that was asked for, or one that tracks.
+
+    Its renderer is told: Gymnasium-Robotics' environments take no camera themselves.
+    """
     chosen = [name for name in _VIEW_ARGUMENTS if name in kwargs]
     if asked is None and chosen:
-        return None
+        return
     if chosen:
         raise InvalidArgument(
             f"The camera is given twice: as {asked!r} and among the environment's own "
             f"arguments as {chosen[0]}={kwargs[chosen[0]]!r}."
         )
-    simulated = _simulated(env)
-    if simulated is not None:
-        return _camera_of_model(simulated, asked)
-    if asked is not None:
-        raise InvalidArgument(
-            f"{env_id} has no cameras to choose from: it is not a MuJoCo environment."
-        )
-    return None
-
-
-def _camera_of_model(simulated: Any, asked: str | int | None) -> str | int | None:
-    cameras = _cameras()
-    if asked is not None:
-        cameras.resolve_camera(simulated.model, asked)
-        return asked
-    # An environment that shows one of its model's cameras has made its own choice, and
-    # Gymnasium before 1.4 has followed the robot.
-    if getattr(simulated.mujoco_renderer, "camera_id", None) != cameras.FREE_CAMERA:
-        return None
-    tracking: str | int | None = cameras.tracking_camera(simulated.model)
-    return tracking
-
-
-def _make_with_camera(
-    spec: registration.EnvSpec,
-    kwargs: dict[str, Any],
-    env: gymnasium.Env[Any, Any],
-    camera: str | int,
-) -> gymnasium.Env[Any, Any]:
-    """Return `env` with another camera, made anew where it takes one.
-
-    Made so, its spec says what it shows.
-    """
-    argument = "camera_name" if isinstance(camera, str) else "camera_id"
-    try:
-        with_camera = _make(spec, {**kwargs, argument: camera})
-    except EnvironmentNotMade as error:
-        # Gymnasium-Robotics' environments take none, and their renderer has one.
-        if _refuses(error, {argument: camera}):
-            _set_camera(_simulated(env), camera)
-            return env
-        env.close()
-        raise
-    except BaseException:
-        env.close()
-        raise
-    env.close()
-    return with_camera
-
-
-def _set_camera(simulated: Any, camera: str | int) -> None:
-    resolved = _cameras().resolve_camera(simulated.model, camera)
-    simulated.mujoco_renderer.camera_id = resolved.fixedcamid
-
-
-def _simulated(env: gymnasium.Env[Any, Any]) -> Any:
-    """Return the object inside `env` with MuJoCo's model and Gymnasium's renderer."""
-    simulation = simulation_in(env)
-    return simulation if hasattr(simulation, "mujoco_renderer") else None
-
-
-def _cameras() -> Any:
-    # Not imported above, because a Gymnasium environment that has no use for MuJoCo
-    # must not load it.
+    simulated = simulation_in(env)
+    renderer = getattr(simulated, "mujoco_renderer", None)
+    if renderer is None:
+        if asked is not None:
+            raise InvalidArgument(
+                f"{env_id} has no cameras to choose from: it is not a MuJoCo "
+                "environment."
+            )
+        return
+    # Not at the top: an environment that has no use for MuJoCo must not load it.
     from ..simulation import cameras
 
-    return cameras
+    # An environment that shows one of its model's cameras has made its own choice, and
+    # Gymnasium before 1.4 has followed the robot.
+    if asked is None and renderer.camera_id == cameras.FREE_CAMERA:
+        asked = cameras.tracking_camera(simulated.model)
+    if asked is not None:
+        resolved = cameras.resolve_camera(simulated.model, asked)
+        renderer.camera_id = resolved.fixedcamid

@@ -11,7 +11,7 @@ import gymnasium
 
 from ..errors import InvalidArgument
 from ..simulation.find_simulation import simulation_in
-from .no_pictures import NoPictureSource
+from .scenes import NoPictureSource, simulation_below
 
 _ANOTHER_VIEW = (
     "camera, height and width ask for another picture than render() gives, which is "
@@ -44,9 +44,7 @@ def gymnasium_pictures(
     """
     if camera is None and height is None and width is None:
         return EnvironmentPictures(env)
-    # An environment of ours keeps its simulation in an object of its own.
-    own = getattr(env.unwrapped, "simulation", None)
-    simulated = simulation_in(env) or simulation_in(own)
+    simulated = simulation_below(env)
     if simulated is None:
         raise InvalidArgument(
             "camera, height and width choose among the pictures of a MuJoCo "

@@ -3,16 +3,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 from ..simulation.find_simulation import simulation_in
-from .robotics_scenes import drawn_part, has_known_render, picture_moment
 from .scenes import (
     Scenes,
     class_name,
@@ -32,6 +31,26 @@ if TYPE_CHECKING:
 _MUJOCO_ENV = ("gymnasium.envs.mujoco.mujoco_env", "MujocoEnv.render")
 _RENDERING = "gymnasium.envs.mujoco.mujoco_rendering"
 _RENDERER = (_RENDERING, "MujocoRenderer.render")
+
+# Of Gymnasium-Robotics, which is not imported: its environments exist only where it
+# is loaded.
+_MAZES = "gymnasium_robotics.envs.maze"
+
+# Environments whose `render` is that of an environment inside them: the module, the
+# function, and the attribute with what is inside.
+_DELEGATING = (
+    (f"{_MAZES}.point_maze", "PointMazeEnv.render", "point_env"),
+    (f"{_MAZES}.ant_maze_v3", "AntMazeEnv.render", "ant_env"),
+    (f"{_MAZES}.ant_maze_v4", "AntMazeEnv.render", "ant_env"),
+    (f"{_MAZES}.ant_maze_v5", "AntMazeEnv.render", "ant_env"),
+    (
+        "gymnasium_robotics.envs.franka_kitchen.kitchen_env",
+        "KitchenEnv.render",
+        "robot_env",
+    ),
+)
+
+_ROBOT_ENV = "gymnasium_robotics.envs.robot_env"
 
 # Wrappers whose `render` gives what it gets. RecordVideo's does so for single
 # pictures; array conversion changes what holds the numbers, not the numbers.
@@ -71,7 +90,9 @@ def gymnasium_scenes(
     view = {"camera": camera, "height": height, "width": width}
     own_view = any(asked is not None for asked in view.values())
     base: Any = env.unwrapped
-    scenes = _mjcf(base, view) if _is_mjcf(base) else _scenes(env, base, view)
+    # An environment of ours knows itself.
+    own = getattr(type(base), "mjrec_scenes", None)
+    scenes = own(base, **view) if own else _scenes(env, base, view)
     obstacle = None if own_view else _override_above(env) or scenes.obstacle
     environment = scenes.environment
     if environment is not None:
@@ -79,16 +100,17 @@ def gymnasium_scenes(
     return dataclasses.replace(scenes, obstacle=obstacle, environment=environment)
 
 
-def _is_mjcf(base: Any) -> bool:
-    # Not imported: the module loads mujoco.
-    module = sys.modules.get("mjrec.environments.mjcf_environments")
-    return module is not None and isinstance(base, module.MjcfEnvironment)
+def drawn_part(base: Any) -> Any:
+    """Return the environment that a maze or a kitchen shows; others show themselves.
 
-
-def _mjcf(base: Any, view: dict[str, Any]) -> Scenes:
-    from .mjcf_scenes import mjcf_scenes
-
-    return mjcf_scenes(base, **view)
+    Args:
+        base: an environment without its wrappers.
+    """
+    render = getattr(type(base), "render", None)
+    for module, function, attribute in _DELEGATING:
+        if is_defined_by(render, module, function):
+            return getattr(base, attribute)
+    return base
 
 
 def _scenes(env: gymnasium.Env[Any, Any], base: Any, view: dict[str, Any]) -> Scenes:
@@ -122,7 +144,7 @@ def _obstacle(base: Any, shown: Any) -> str | None:
         if has_own_method(part, "render"):
             return f"the environment {class_name(type(part))} overrides render()"
     render = type(shown).render
-    if not (has_known_render(shown) or is_defined_by(render, *_MUJOCO_ENV)):
+    if not (_is_robot(shown) or is_defined_by(render, *_MUJOCO_ENV)):
         kind = overriding_class(type(shown), "render")
         return f"the environment {kind} overrides render()"
     renderer = getattr(shown, "mujoco_renderer", None)
@@ -172,6 +194,59 @@ def _at_picture(
     if moment is None:
         return scene.at_picture
     return lambda capture: moment(lambda: scene.at_picture(capture))
+
+
+def _is_robot(drawn: Any) -> bool:
+    """Tell whether an environment shows itself as Gymnasium-Robotics' robots do."""
+    render = getattr(type(drawn), "render", None)
+    return is_defined_by(render, _ROBOT_ENV, "MujocoRobotEnv.render")
+
+
+def picture_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
+    """Return what makes the moment at which an environment draws itself.
+
+    Fetch's and the hand's environments move their goal's markers, and call
+    `mj_forward`, in each `render`; so a picture changes what happens afterwards. What
+    is returned calls `render` with something else in the place of what draws, and puts
+    the simulation back afterwards: the picture is the one that `render` gives, and the
+    episode is the one that nobody looked at.
+
+    Args:
+        drawn: an environment without its wrappers.
+
+    Returns:
+        A function that calls its argument in that moment; None where there is no such
+        moment, because drawing the environment changes nothing.
+    """
+    callback = getattr(type(drawn), "_render_callback", None)
+    if not _is_robot(drawn) or is_defined_by(
+        callback, _ROBOT_ENV, "BaseRobotEnv._render_callback"
+    ):
+        return None
+    # Loaded where there is a simulation, and so mujoco, already.
+    from ..simulation.replay import PreservedState
+
+    simulation = PreservedState()
+
+    def at_picture(capture: Callable[[], None]) -> None:
+        with (
+            simulation.around(drawn.model, drawn.data),
+            _drawing_instead(drawn.mujoco_renderer, capture),
+        ):
+            drawn.render()
+
+    return at_picture
+
+
+@contextlib.contextmanager
+def _drawing_instead(renderer: Any, capture: Callable[[], None]) -> Iterator[None]:
+    """Let `renderer.render` call `capture`, for the block, and draw nothing."""
+    # On the object, where it hides the class's own until it is deleted.
+    renderer.render = lambda *_args, **_kwargs: capture()
+    try:
+        yield
+    finally:
+        del renderer.render
 
 
 def _authored(simulated: Any) -> AuthoredModel | None:

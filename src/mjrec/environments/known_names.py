@@ -9,16 +9,17 @@ imported, and what only wants to know names shall not choose for its process.
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from ..child_python import Child, Parent
-from ..errors import EnvironmentNotMade
-from .dm_control_failures import dm_control_failure
+from ..errors import EnvironmentNotMade, Error, MissingDependency
 
+_VERSION = re.compile(r"-v([0-9]+)$", re.ASCII)
 _SUITE = "dm_control"
 _GYMNASIUM = "gymnasium"
 
@@ -47,7 +48,7 @@ def gymnasium_ids(module: str | None = None) -> tuple[str, ...]:
     """Return the ids in Gymnasium's registry.
 
     Args:
-        module: imported first, because it registers environments.
+        module: that registers environments when it is imported; then only its ids.
 
     Raises:
         EnvironmentNotMade: the module cannot be imported.
@@ -64,17 +65,48 @@ def gymnasium_ids(module: str | None = None) -> tuple[str, ...]:
 
 def mujoco_ids() -> tuple[str, ...]:
     """Return the ids of Gymnasium's own MuJoCo environments, the newest of each."""
-    newest: dict[str, int] = {}
-    for env_id in _names_of("mujoco"):
-        name, _, version = env_id.rpartition("-v")
-        newest[name] = max(int(version), newest.get(name, 0))
-    return tuple(f"{name}-v{version}" for name, version in newest.items())
+    return tuple(newest_versions(gymnasium_ids("gymnasium.envs.mujoco")).values())
 
 
-def _names_of(part: str) -> tuple[str, ...]:
-    said = _ask(_GYMNASIUM, "", part)
-    names: list[str] = said.get("names", [])
-    return tuple(names)
+def newest_versions(env_ids: Iterable[str]) -> dict[str, str]:
+    """Return the newest of the ids that differ in their version, by what is before it.
+
+    One without a version is its own newest.
+    """
+    newest: dict[str, str] = {}
+    for env_id in sorted(env_ids, key=version_of):
+        newest[_VERSION.sub("", env_id)] = env_id
+    return newest
+
+
+def version_of(env_id: str) -> int:
+    """Return the version at the end of an id; -1 for one without."""
+    match = _VERSION.search(env_id)
+    return int(match[1]) if match else -1
+
+
+def dm_control_failure(name: str, error: Exception) -> Error:
+    """Return the error for what importing dm_control, or loading a task, raised.
+
+    Args:
+        name: of the environment.
+        error: what was raised.
+    """
+    missing = error.name if isinstance(error, ModuleNotFoundError) else None
+    if missing in ("dm_control", "dm_env"):
+        return MissingDependency(
+            "dm_control", purpose=name, install='pip install "mjrec[dm-control]"'
+        )
+    # dm_control 1.0.50 reads fields of MuJoCo's structures that mujoco 4 lacks.
+    if re.search(r"Mj(Model|Data)\b.* has no attribute", str(error)):
+        dm_control, mujoco = map(importlib.metadata.version, ("dm-control", "mujoco"))
+        return MissingDependency(
+            "a mujoco that it knows (below version 4)",
+            purpose=f"{name}: dm_control {dm_control} does not work with mujoco "
+            f"{mujoco} ({error}) and",
+            install='pip install "mujoco<4"',
+        )
+    return EnvironmentNotMade(name, f"{type(error).__name__}: {error}")
 
 
 def _ask(*arguments: str) -> dict[str, Any]:
@@ -105,18 +137,24 @@ def _main(arguments: Sequence[str]) -> None:
         parent.send(kind=kind, text=str(error), name=name)
 
 
-def _names(framework: str, what: str, part: str = "") -> list[str]:
+def _names(framework: str, what: str) -> list[str]:
     if framework == _SUITE:
         return _suite_names(what)
-    from gymnasium.envs import registration
+    from gymnasium.envs.registration import registry
 
-    if what:
-        # The working directory may hold it, as it may hold a policy.
-        sys.path.append(os.getcwd())  # noqa: PTH109  sys.path holds texts
-        importlib.import_module(what)
-    known = registration.registry.values()
-    inside = re.compile(rf"gymnasium\.envs\.{part}\." if part else "")
-    return [spec.id for spec in known if inside.match(str(spec.entry_point))]
+    if not what:
+        return list(registry)
+    before = dict(registry)
+    # The working directory may hold it, as it may hold a policy.
+    sys.path.append(os.getcwd())  # noqa: PTH109  sys.path holds texts
+    importlib.import_module(what)
+    return [
+        env_id
+        for env_id, spec in registry.items()
+        # Gymnasium itself may have loaded it before.
+        if before.get(env_id) is not spec
+        or f"{spec.entry_point}".startswith((f"{what}.", f"{what}:"))
+    ]
 
 
 def _suite_names(tag: str) -> list[str]:

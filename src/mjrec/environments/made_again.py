@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """From what a recording says of its environment to that environment, or to a refusal.
 
-A recording may come from anybody, and making an environment runs its code. So nothing
-that a recording names is imported: an environment is made only where its id stands in
-the installed registry already, as one of Gymnasium's own MuJoCo environments, of
-Gymnasium-Robotics or of dm_control's suite, with arguments that are plain values and
-name no file. The reader may trust further ids, one by one.
+It is made as from a name, with a shorter list of names. A recording may come from
+anybody, and making an environment runs its code. So nothing that a recording names is
+imported: an environment is made only where its id stands in the installed registry
+already, as one of Gymnasium's own MuJoCo environments, of Gymnasium-Robotics or of
+dm_control's suite, with arguments that are plain values and name no file. The reader
+may trust further ids, one by one.
 """
 
 from __future__ import annotations
@@ -13,19 +14,19 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import re
-from collections.abc import Callable, Iterator, Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from pathlib import Path
+from typing import Any
 
-import gymnasium
-import numpy as np
 from gymnasium.envs import registration
 
-from ..simulation.find_simulation import simulation_in
-from .environment_arguments import VIEW_ARGUMENTS, shown_arguments
-from .names import DmControlName, parse_environment_name
-from .robotics_scenes import drawn_part
-from .working_directory import working_directory_importable
+from .from_name import environment_from_name
+from .gymnasium_environments import GymnasiumEnvironment
+from .named_environment import EnvironmentOptions, NamedEnvironment, Step
+from .names import DmControlName, GymnasiumName
+from .scenes import VIEW_ARGUMENTS, shown_arguments, simulation_below
 
 UNKNOWN = "unknown"
 
@@ -41,6 +42,7 @@ _WORD = re.compile(r"[A-Za-z0-9_ -]{0,64}", re.ASCII)
 _FILES = re.compile(r"(xml|model|mesh|asset|file|path|texture)", re.IGNORECASE)
 _MOST_VALUES = 10_000
 
+_SUITE_NAME = re.compile(r"dm_control/(\w{1,50})-(\w{1,50})")
 _SUITE_ARGUMENTS = ("task_kwargs", "environment_kwargs", "visualize_reward")
 
 
@@ -85,19 +87,12 @@ class EpisodeStart:
     options: Any
 
 
-class StepAgain(NamedTuple):
-    """What a step gave."""
-
-    observation: Any
-    reward: float
-    terminated: bool
-    truncated: bool
-
-
-class EnvironmentAgain(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class EnvironmentAgain:
     """An environment that was made again.
 
     Attributes:
+        named: the environment.
         is_settled: whether what follows from a state is computed after each step.
         is_all_in_state: whether it goes on from a state as if it had come there itself:
             it keeps nothing between steps that depends on where it has been.
@@ -105,12 +100,16 @@ class EnvironmentAgain(Protocol):
             to say.
     """
 
-    is_settled: bool
-    is_all_in_state: bool
+    named: NamedEnvironment
+    is_settled: bool = False
+    is_all_in_state: bool = True
     made_with: str
 
     def simulation(self) -> tuple[Any, Any]:
         """Return MuJoCo's own model and data of this moment."""
+        simulated = simulation_below(self.named.environment)
+        model, data = simulated.model, simulated.data
+        return getattr(model, "ptr", model), getattr(data, "ptr", data)
 
     def begin(self, start: EpisodeStart) -> Any:
         """Begin an episode as it was begun, and return the first observation.
@@ -118,6 +117,16 @@ class EnvironmentAgain(Protocol):
         Raises:
             NotMadeAgain: what it was begun with is not known, or not plain.
         """
+        options = start.options
+        if options is not None and not (
+            isinstance(options, Mapping) and all(map(_is_plain_item, options.items()))
+        ):
+            raise NotMadeAgain(
+                f"the options of the reset ({options!r:.100}) are more than plain "
+                "values"
+            )
+        seed = start.seed if type(start.seed) is int else None
+        return self._begin(seed, start.random_state, options)
 
     def begin_anyhow(self) -> Any:
         """Begin an episode, whichever, and return its first observation.
@@ -128,12 +137,25 @@ class EnvironmentAgain(Protocol):
         Raises:
             NotMadeAgain: its reset fails.
         """
+        return self._begin(0, None, None)
 
-    def step(self, action: Any) -> StepAgain:
+    def step(self, action: Any) -> Step:
         """Step the environment."""
+        step = self.named.step(self.named.environment, action)
+        return step._replace(reward=float(step.reward or 0))
 
     def close(self) -> None:
         """Close the environment."""
+        self.named.environment.close()
+
+    def _begin(self, seed: int | None, state: Any, options: Any) -> Any:
+        if self.named.is_random and seed is None and state is None:
+            raise NotMadeAgain(
+                "neither a seed nor a random state was recorded for the reset: give "
+                "reset(seed=...) where episodes are to be begun again"
+            )
+        with _failures("its reset"):
+            return self.named.begin_again(seed, state, options)
 
 
 def recorded_environment(facts: Mapping[str, Any]) -> RecordedEnvironment:
@@ -152,20 +174,23 @@ def recorded_environment(facts: Mapping[str, Any]) -> RecordedEnvironment:
         framework not in ("gymnasium", "dm_control", "mjcf")
         or not isinstance(env_id, str)
         or not isinstance(kwargs, Mapping | None)
-        or not _is_limit(limit)
+        or not (limit in (None, UNKNOWN) or (type(limit) is int and limit > 0))
     ):
         raise NotMadeAgain(f"what it says of its environment cannot be: {said!r:.200}")
     return RecordedEnvironment(
         framework=framework,
         id=env_id,
         kwargs=kwargs,
-        wrappers=_texts(wrappers),
+        wrappers=tuple(map(str, wrappers)) if isinstance(wrappers, list) else None,
         max_episode_steps=limit,
     )
 
 
 def make_again(
-    recorded: RecordedEnvironment, *, trust: frozenset[str] = frozenset()
+    recorded: RecordedEnvironment,
+    *,
+    trust: frozenset[str] = frozenset(),
+    model: Any = None,
 ) -> EnvironmentAgain:
     """Return the environment of a recording.
 
@@ -173,27 +198,31 @@ def make_again(
         recorded: what the recording says of it.
         trust: further ids that the reader has named, `Id` or `module:Id`. The module
             is the reader's word, never the recording's.
+        model: compiled from the sources in the archive, of an MJCF file's environment.
 
     Raises:
         NotMadeAgain: the rule of trust forbids it, or it cannot be made here.
     """
     if recorded.wrappers:
-        raise wrappers_refused(recorded.wrappers)
+        raise NotMadeAgain(
+            "wrappers stood between the monitor and the environment, and none is made "
+            f"again: {', '.join(recorded.wrappers):.300}; what is recorded below them "
+            "can be checked: put Monitor around the environment itself, and wrappers "
+            "around the monitor"
+        )
     match recorded.framework:
         case "gymnasium":
             return _gymnasium(recorded, trust)
         case "dm_control":
             return _dm_control(recorded)
-    raise NotMadeAgain("it is of an MJCF file, which is made again from its sources")
+    # It loads MuJoCo.
+    from .mjcf_environments import make_mjcf
 
-
-def wrappers_refused(wrappers: tuple[str, ...]) -> NotMadeAgain:
-    """Return what there is to say of wrappers, none of which is made again."""
-    return NotMadeAgain(
-        "wrappers stood between the monitor and the environment, and none is made "
-        f"again: {', '.join(wrappers):.300}; what is recorded below them can be "
-        "checked: put Monitor around the environment itself, and wrappers around the "
-        "monitor"
+    with _failures(recorded.id):
+        env = make_mjcf(Path("model.xml"), _options(recorded, {}), model)
+    return EnvironmentAgain(
+        named=GymnasiumEnvironment(env, is_random=False),
+        made_with="made from the sources in the archive",
     )
 
 
@@ -208,24 +237,30 @@ def made_with(recorded: RecordedEnvironment) -> str:
 def is_installed_name(name: str) -> bool:
     """Tell whether a name is that of an environment that can be made here by it."""
     if name.startswith("dm_control/"):
-        return _is_of_suite(name)
-    return ":" not in name and _spec(name) is not None
+        return _suite_name(name) is not None
+    return _entry_point(name) is not None
 
 
-def _is_of_suite(name: str) -> bool:
-    try:
-        from dm_control import suite
+def _options(
+    recorded: RecordedEnvironment, arguments: Mapping[str, Any]
+) -> EnvironmentOptions:
+    limit = recorded.max_episode_steps
+    return EnvironmentOptions(
+        pictures=False,
+        # Where none was in force, none is.
+        max_steps=limit if isinstance(limit, int) else sys.maxsize,
+        kwargs=arguments,
+    )
 
-        parsed = _suite_name(name)
-    # Where dm_control does not work none of its names is one that is installed.
-    except Exception:
-        return False
-    return parsed.task in suite.TASKS_BY_DOMAIN.get(parsed.domain, ())
 
-
-def plain_argument(name: str, value: Any) -> bool:
+def _is_plain_item(item: tuple[Any, Any]) -> bool:
     """Tell whether an argument is a plain value, and names no file."""
-    return not _FILES.search(name) and _is_plain(value, [_MOST_VALUES])
+    name, value = item
+    return (
+        isinstance(name, str)
+        and not _FILES.search(name)
+        and _is_plain(value, [_MOST_VALUES])
+    )
 
 
 def _is_plain(value: Any, left: list[int]) -> bool:
@@ -239,317 +274,98 @@ def _is_plain(value: Any, left: list[int]) -> bool:
     return value is None or isinstance(value, bool | int | float)
 
 
-def _is_limit(limit: Any) -> bool:
-    if limit is None or limit is UNKNOWN:
-        return True
-    return type(limit) is int and limit > 0
-
-
-def _texts(value: Any) -> tuple[str, ...] | None:
-    if not isinstance(value, list):
-        return None
-    return tuple(str(item) for item in value)
-
-
-def _arguments(recorded: RecordedEnvironment) -> dict[str, Any]:
-    """Return what the environment is made with, but for how it is shown."""
-    given = recorded.kwargs
-    if given is None:
-        raise NotMadeAgain(
-            "it was made with arguments that a recording cannot hold, and so cannot "
-            "be made again"
-        )
-    kept = {name: given[name] for name in given if name not in VIEW_ARGUMENTS}
-    for name, value in kept.items():
-        if name in _MAKE or not plain_argument(name, value):
-            raise NotMadeAgain(
-                f"its argument {name!r:.80} ({value!r:.80}) is more than a plain "
-                "value, or names a file"
-            )
-    return kept
-
-
-# Gymnasium ---------------------------------------------------------------------------
-
-
 def _gymnasium(
     recorded: RecordedEnvironment, trust: frozenset[str]
 ) -> EnvironmentAgain:
-    trusted = _trusted_id(recorded.id, trust)
-    if trusted is None:
-        _check_registered(recorded.id)
-    arguments = _arguments(recorded)
-    limit = recorded.max_episode_steps
-    if limit is not UNKNOWN:
-        # gymnasium.make's word for no limit.
-        arguments["max_episode_steps"] = -1 if limit is None else limit
-    here = working_directory_importable() if trusted else contextlib.nullcontext()
-    with here, _failures(recorded.id):
-        env = gymnasium.make(
-            trusted or recorded.id, disable_env_checker=True, **arguments
-        )
-    entry_point = env.spec.entry_point if env.spec is not None else None
-    return _GymnasiumAgain(
-        env,
-        is_all_in_state=_is_below(entry_point, _OWN),
-        made_with=made_with(recorded),
-    )
-
-
-def _trusted_id(env_id: str, trust: frozenset[str]) -> str | None:
-    """Return what the reader has named that is this id."""
-    if env_id in trust:
-        return env_id
-    named = (each for each in trust if each.rpartition(":")[2] == env_id)
-    return next(named, None)
-
-
-def _check_registered(env_id: str) -> None:
-    """Raise NotMadeAgain unless the installed registry holds a trusted id."""
-    spec = None if ":" in env_id else _spec(env_id)
-    entry_point = None if spec is None else spec.entry_point
-    if not (_is_below(entry_point, _OWN) or _is_below(entry_point, _ROBOTICS)):
+    env_id = recorded.id
+    trusted = {each.rpartition(":")[2]: each for each in trust}.get(env_id)
+    entry_point = _entry_point(env_id)
+    is_own = _is_below(entry_point, _OWN)
+    if trusted is None and not (is_own or _is_below(entry_point, _ROBOTICS)):
         raise NotMadeAgain(
             f"would run code from the archive: {env_id!r:.100} is none of the "
             "environments of Gymnasium's MuJoCo, Gymnasium-Robotics or dm_control that "
             f"are installed here. If you trust it: --trust {env_id:.100}"
         )
+    if recorded.kwargs is None:
+        raise NotMadeAgain(
+            "it was made with arguments that a recording cannot hold, and so cannot "
+            "be made again"
+        )
+    arguments = {k: v for k, v in recorded.kwargs.items() if k not in VIEW_ARGUMENTS}
+    for name, value in arguments.items():
+        if name in _MAKE or not _is_plain_item((name, value)):
+            raise NotMadeAgain(
+                f"its argument {name!r:.80} ({value!r:.80}) is more than a plain "
+                "value, or names a file"
+            )
+    arguments["disable_env_checker"] = True
+    limit = recorded.max_episode_steps
+    if limit is not UNKNOWN:
+        # gymnasium.make's word for no limit.
+        arguments["max_episode_steps"] = -1 if limit is None else limit
+    with _failures(env_id):
+        named = environment_from_name(
+            GymnasiumName(trusted or env_id), _options(recorded, arguments)
+        )
+    if simulation_below(named.environment) is None:
+        named.environment.close()
+        raise NotMadeAgain("the environment has no MuJoCo simulation to be seen")
+    return EnvironmentAgain(
+        named=named, is_all_in_state=is_own, made_with=made_with(recorded)
+    )
 
 
-def _spec(env_id: str) -> registration.EnvSpec | None:
+def _entry_point(env_id: str) -> Any:
+    """Return where the installed registry says that an id's environment is defined."""
     spec = registration.registry.get(env_id)
     if spec is None and importlib.util.find_spec(_ROBOTICS) is not None:
         # It registers its environments when it is imported; its name is ours.
         with contextlib.suppress(Exception):
             importlib.import_module(_ROBOTICS)
         spec = registration.registry.get(env_id)
-    return spec
+    return None if spec is None else spec.entry_point
 
 
 def _is_below(entry_point: Any, package: str) -> bool:
     module = entry_point.partition(":")[0] if isinstance(entry_point, str) else ""
-    return module == package or module.startswith(f"{package}.")
-
-
-class _GymnasiumAgain:
-    is_settled = False
-
-    def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        *,
-        is_all_in_state: bool,
-        made_with: str,
-    ) -> None:
-        self.is_all_in_state = is_all_in_state
-        self.made_with = made_with
-        self._env = env
-        self._base: Any = env.unwrapped
-        if simulation_in(env) is None:
-            env.close()
-            raise NotMadeAgain("the environment has no MuJoCo simulation to be seen")
-
-    def simulation(self) -> tuple[Any, Any]:
-        holder = simulation_in(self._env)
-        return (
-            getattr(holder.model, "ptr", holder.model),
-            getattr(holder.data, "ptr", holder.data),
-        )
-
-    def begin(self, start: EpisodeStart) -> Any:
-        seed = start.seed if type(start.seed) is int else None
-        if seed is None:
-            self._set_random_state(start.random_state)
-        options = _plain_options(start.options)
-        with _failures("its reset"):
-            return self._env.reset(seed=seed, options=options)[0]
-
-    def begin_anyhow(self) -> Any:
-        with _failures("its reset"):
-            return self._env.reset(seed=0)[0]
-
-    def step(self, action: Any) -> StepAgain:
-        observation, reward, terminated, truncated, _ = self._env.step(action)
-        return StepAgain(observation, float(reward), bool(terminated), bool(truncated))
-
-    def close(self) -> None:
-        self._env.close()
-
-    def _set_random_state(self, state: Any) -> None:
-        if not isinstance(state, Mapping):
-            raise _unseeded()
-        if "inner" not in state:
-            _set_generator(self._base, state)
-            return
-        inner = drawn_part(self._base)
-        for holder, part in ((self._base, state.get("env")), (inner, state["inner"])):
-            if part is not None:
-                _set_generator(holder, part)
-
-
-def _set_generator(holder: Any, state: Any) -> None:
-    generator = holder.np_random
-    try:
-        generator.bit_generator.state = _arrays(state)
-    except (TypeError, ValueError, KeyError, OverflowError, AttributeError) as error:
-        raise NotMadeAgain(f"its random state is none: {error!s:.200}") from error
-
-
-def _unseeded() -> NotMadeAgain:
-    return NotMadeAgain(
-        "neither a seed nor a random state was recorded for the reset: give "
-        "reset(seed=...) where episodes are to be begun again"
-    )
-
-
-def _plain_options(options: Any) -> dict[str, Any] | None:
-    if options is None:
-        return None
-    plain = isinstance(options, Mapping) and all(
-        isinstance(name, str) and plain_argument(name, value)
-        for name, value in options.items()
-    )
-    if not plain:
-        raise NotMadeAgain(
-            f"the options of the reset ({options!r:.100}) are more than plain values"
-        )
-    return dict(options)
-
-
-# dm_control --------------------------------------------------------------------------
+    return f"{module}.".startswith(f"{package}.")
 
 
 def _dm_control(recorded: RecordedEnvironment) -> EnvironmentAgain:
     name = _suite_name(recorded.id)
-    arguments = _suite_arguments(recorded.kwargs)
-    limit = recorded.max_episode_steps
-    return _DmControlAgain(
-        name,
-        arguments,
-        limit if isinstance(limit, int) else None,
-        made_with=made_with(recorded),
-    )
-
-
-def _suite_name(env_id: str) -> DmControlName:
-    if env_id.startswith("dm_control/") and re.fullmatch(r"[\w/-]{1,100}", env_id):
-        # No file is looked for under such a name.
-        with contextlib.suppress(Exception):
-            name = parse_environment_name(env_id)
-            if isinstance(name, DmControlName):
-                return name
-    raise NotMadeAgain(f"{env_id!r:.100} is no task of dm_control's suite")
-
-
-def _suite_arguments(kwargs: Mapping[str, Any] | None) -> dict[str, Any]:
-    if kwargs is None:
-        return {}
-    arguments: dict[str, Any] = {}
-    for name, value in kwargs.items():
-        parts = value if isinstance(value, Mapping) else {name: value}
-        if name not in _SUITE_ARGUMENTS or not all(
-            isinstance(part, str) and plain_argument(part, parts[part])
-            for part in parts
-        ):
+    if name is None:
+        raise NotMadeAgain(
+            f"{recorded.id!r:.100} is no task of the installed dm_control's suite, or "
+            'that does not work here: pip install "mjrec[dm-control]"'
+        )
+    arguments = recorded.kwargs or {}
+    for key, value in arguments.items():
+        parts = value if isinstance(value, Mapping) else {key: value}
+        if key not in _SUITE_ARGUMENTS or not all(map(_is_plain_item, parts.items())):
             raise NotMadeAgain(
-                f"its argument {name!r:.80} ({value!r:.80}) is more than plain values"
+                f"its argument {key!r:.80} ({value!r:.80}) is more than plain values"
             )
-        arguments[name] = dict(value) if isinstance(value, Mapping) else value
-    return arguments
-
-
-class _DmControlAgain:
-    is_settled = True
-    is_all_in_state = True
-
-    def __init__(
-        self,
-        name: DmControlName,
-        arguments: dict[str, Any],
-        limit: int | None,
-        *,
-        made_with: str,
-    ) -> None:
-        # dm_control is optional, and is loaded where one of its environments is asked
-        # for; so is what knows it.
-        try:
-            from dm_control import suite
-
-            from .dm_control_contexts import ContextsOnDemand
-            from .dm_env_episodes import StepLimit, is_terminated, is_truncated
-        except Exception as error:
-            raise NotMadeAgain(
-                f"dm_control does not work here ({error!s:.200}); pip install "
-                '"mjrec[dm-control]"'
-            ) from error
-        if name.task not in suite.TASKS_BY_DOMAIN.get(name.domain, ()):
-            raise NotMadeAgain(f"{name} is no task of the installed dm_control's suite")
+    with _failures(recorded.id):
         if name.domain == "lqr" and "random" not in arguments.get("task_kwargs", {}):
             raise NotMadeAgain(
                 f"{name} draws its model at random when it is made, and from which "
                 "seed is not recorded"
             )
-        with _failures(str(name)):
-            env = suite.load(name.domain, name.task, **arguments)
-        # Nothing public tells the limit that time_limit and control_timestep make.
-        own = getattr(env, "_step_limit", np.inf)
-        self._env = env if limit is None or limit >= own else StepLimit(env, limit)
-        self._inner = env
-        self._resetting: Callable[[], Any] = ContextsOnDemand(env).resetting
-        self._is_terminated, self._is_truncated = is_terminated, is_truncated
-        self.made_with = made_with
-
-    def simulation(self) -> tuple[Any, Any]:
-        physics = self._inner.physics
-        return physics.model.ptr, physics.data.ptr
-
-    def begin(self, start: EpisodeStart) -> Any:
-        generator = self._generator()
-        if start.options:
-            raise NotMadeAgain("dm_control's resets take no options")
-        try:
-            if start.random_state is not None:
-                generator.set_state(_arrays(start.random_state))
-            elif type(start.seed) is int:
-                generator.seed(start.seed)
-            else:
-                raise _unseeded()
-        except (TypeError, ValueError, KeyError, OverflowError) as error:
-            raise NotMadeAgain(f"its random state is none: {error!s:.200}") from error
-        return self._reset()
-
-    def begin_anyhow(self) -> Any:
-        self._generator().seed(0)
-        return self._reset()
-
-    def step(self, action: Any) -> StepAgain:
-        timestep = self._env.step(action)
-        return StepAgain(
-            observation=timestep.observation,
-            reward=0.0 if timestep.reward is None else float(timestep.reward),
-            terminated=self._is_terminated(timestep),
-            truncated=self._is_truncated(timestep),
-        )
-
-    def close(self) -> None:
-        self._env.close()
-
-    def _reset(self) -> Any:
-        with _failures("its reset"), self._resetting():
-            return self._env.reset().observation
-
-    def _generator(self) -> np.random.RandomState:
-        state = getattr(self._inner.task, "random", None)
-        if not isinstance(state, np.random.RandomState):
-            raise NotMadeAgain("the task has no random state that could be set")
-        return state
+        named = environment_from_name(name, _options(recorded, arguments))
+    return EnvironmentAgain(named=named, is_settled=True, made_with=made_with(recorded))
 
 
-def _arrays(state: Any) -> Any:
-    """Return a random state as NumPy takes it: with arrays for lists."""
-    if isinstance(state, Mapping):
-        return {name: _arrays(value) for name, value in state.items()}
-    return np.array(state, dtype=np.uint64) if isinstance(state, list) else state
+def _suite_name(env_id: str) -> DmControlName | None:
+    """Return the name of a task that the installed suite has; None for another."""
+    # Where dm_control does not work none of its names is one that is installed.
+    with contextlib.suppress(Exception):
+        from .dm_control_environments import tasks_of
+
+        match = _SUITE_NAME.fullmatch(env_id)
+        if match and match[2] in tasks_of(match[1]):
+            return DmControlName(match[1], match[2])
+    return None
 
 
 @contextlib.contextmanager
@@ -557,6 +373,8 @@ def _failures(what: str) -> Iterator[None]:
     """Turn whatever an environment's own code raises into a reason."""
     try:
         yield
+    except NotMadeAgain:
+        raise
     except Exception as error:
         raise NotMadeAgain(
             f"{what:.100} failed here: {type(error).__name__}: {error!s:.300}"

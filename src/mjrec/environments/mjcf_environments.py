@@ -17,19 +17,26 @@ from numpy.typing import NDArray
 from ..errors import InvalidArgument, NoPictures
 from ..frames import Frame, check_size
 from ..simulation.cameras import camera_label, default_camera, resolve_camera
+from ..simulation.capture import Capture
 from ..simulation.mjcf import MjcfSimulation, load_mjcf
+from ..simulation.model_sources import authored_from_file
 from ..simulation.renderer import SceneRenderer
-from .options import EnvironmentOptions
+from .named_environment import EnvironmentOptions
+from .scenes import Scenes, generator_state, has_own_method, overriding_class
+from .viewer_scene import ViewerScene
 
 _SIDE = 480
 
 
-def make_mjcf(path: Path, options: EnvironmentOptions) -> gymnasium.Env[Any, Any]:
+def make_mjcf(
+    path: Path, options: EnvironmentOptions, model: Any = None
+) -> gymnasium.Env[Any, Any]:
     """Return the environment of an MJCF file; episodes end after `max_steps`.
 
     Args:
         path: of the file.
         options: `kwargs` must be empty: all there is to say stands in the file.
+        model: where the file was compiled already; it need not be there then.
 
     Raises:
         UnreadableFile: MuJoCo refuses the file.
@@ -45,6 +52,7 @@ def make_mjcf(path: Path, options: EnvironmentOptions) -> gymnasium.Env[Any, Any
         path,
         render_mode="rgb_array" if options.pictures else None,
         camera=options.camera,
+        model=model,
         **options.size,
     )
     return TimeLimit(environment, options.limit(None))
@@ -75,6 +83,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
             first, else the free one.
         height: of the pictures, in pixels.
         width: likewise.
+        model: where the file was compiled already.
 
     Raises:
         UnreadableFile: MuJoCo refuses the file.
@@ -98,6 +107,7 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         camera: str | int | None = None,
         height: int = _SIDE,
         width: int = _SIDE,
+        model: Any = None,
     ) -> None:
         self._renderer: SceneRenderer | None = None
         if render_mode not in (None, "rgb_array"):
@@ -107,8 +117,8 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         self.render_mode = render_mode
         self.height, self.width = check_size(height, width)
         self.path = Path(path)
-        self.simulation = MjcfSimulation(load_mjcf(self.path))
-        model = self.simulation.model
+        model = load_mjcf(self.path) if model is None else model
+        self.simulation = MjcfSimulation(model)
         self.camera = default_camera(model) if camera is None else camera
         resolve_camera(model, self.camera)
         self.metadata = {**self.metadata, "render_fps": _plain(self._frame_rate)}
@@ -169,6 +179,41 @@ class MjcfEnvironment(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         if self._renderer is None:
             return facts
         return {**facts, **self._renderer.gl_facts}
+
+    def mjrec_scenes(
+        self, *, camera: Any, height: int | None, width: int | None
+    ) -> Scenes:
+        """Return how its states are recorded, from which its pictures always follow."""
+        simulation = self.simulation
+        scene = ViewerScene(
+            simulation,
+            camera=self.camera if camera is None else camera,
+            height=self.height if height is None else height,
+            width=self.width if width is None else width,
+        )
+        obstacle = None
+        is_own = type(self).render is MjcfEnvironment.render
+        if not is_own or has_own_method(self, "render"):
+            kind = overriding_class(type(self), "render")
+            obstacle = f"the environment {kind} overrides render()"
+        return Scenes(
+            states=Capture(
+                lambda: (simulation.model, simulation.data),
+                view=scene,
+                forget=scene.forget,
+                at_picture=scene.at_picture,
+                authored=lambda: authored_from_file(self.path),
+            ),
+            obstacle=obstacle,
+            environment={
+                "framework": "mjcf",
+                "id": self.spec.id if self.spec else None,
+                # All there is to say stands in the file.
+                "kwargs": {},
+            },
+            # Nothing in it is random.
+            random_state=lambda: generator_state(self._np_random),
+        )
 
     def close(self) -> None:
         """Close the renderer; idempotent."""

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The three ways in which a person names an environment."""
+"""What a person names: environments in three ways, and modules nearby."""
 
 from __future__ import annotations
 
+import contextlib
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -111,3 +114,16 @@ def _mjcf_name(path: Path) -> MjcfName:
         [str(p) for p in there if p.suffix.lower() in _MJCF_SUFFIXES and p.is_file()],
         hint=f"Looked in {folder.absolute()}.",
     )
+
+
+@contextlib.contextmanager
+def working_directory_importable() -> Iterator[None]:
+    """Let modules in the working directory be imported, before installed ones."""
+    directory = str(Path.cwd())
+    sys.path.insert(0, directory)
+    try:
+        yield
+    finally:
+        # What was imported may have changed the list itself.
+        with contextlib.suppress(ValueError):
+            sys.path.remove(directory)

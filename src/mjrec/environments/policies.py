@@ -23,6 +23,7 @@ import contextlib
 import copy
 import importlib
 import inspect
+import logging
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -34,8 +35,10 @@ import numpy as np
 
 from ..errors import Error, InvalidArgument, PolicyError, UnknownName
 from .episode_seeds import EpisodeSeeds
+from .names import working_directory_importable
 from .policy_files import file_of_policy, policy_in_file
-from .working_directory import working_directory_importable
+
+logger = logging.getLogger(__name__)
 
 _BUILT_IN = ("random", "zero")
 _FORMS = (
@@ -294,4 +297,19 @@ def _failures_named(*what: str) -> Iterator[None]:
         if not isinstance(error, SyntaxError):
             place = traceback.extract_tb(error.__traceback__)[-1]
             text += f" ({place.filename}, line {place.lineno})"
+            _log_traceback(error, place.filename, place.lineno)
         raise PolicyError(f"{text}.") from error
+
+
+_logged: set[tuple[object, ...]] = set()
+
+
+def _log_traceback(error: BaseException, *where: object) -> None:
+    """Log where third-party code raised, once for each place."""
+    if (type(error), *where) not in _logged:
+        _logged.add((type(error), *where))
+        own = error.__traceback__
+        while own is not None and own.tb_frame.f_code.co_filename == __file__:
+            own = own.tb_next
+        told = traceback.format_exception(type(error), error, own)
+        logger.warning("%s", "".join(told).rstrip())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a monitor needs to know of an environment to record its states."""
+"""What a monitor needs to know of an environment to record its states and pictures."""
 
 from __future__ import annotations
 
@@ -8,12 +8,23 @@ import sys
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from ..simulation.find_simulation import simulation_in
+
 if TYPE_CHECKING:
     from ..simulation.capture import Capture
+
+# How an environment is shown, on which no state and no reward depends.
+VIEW_ARGUMENTS: Final = frozenset(
+    (
+        *("render_mode", "camera_name", "camera_id", "default_camera_config"),
+        *("width", "height", "max_geom", "visual_options"),
+    )
+)
+_MOST_CHARACTERS = 400
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +47,35 @@ class Scenes:
     obstacle: str | None = None
     environment: dict[str, Any] | None = None
     random_state: Callable[[], Any] = lambda: None
+
+
+class NoPictureSource:
+    """Stands for the pictures of an environment that cannot be drawn live.
+
+    Args:
+        missing: what the environment lacks, and what to do about it.
+    """
+
+    render_mode = None
+
+    def __init__(self, missing: str) -> None:
+        self.missing = missing
+
+    def render(self) -> None:
+        """Return None: there is no picture."""
+
+    def facts(self) -> dict[str, Any]:
+        """Return nothing: there is no video."""
+        return {}
+
+
+def simulation_below(env: Any) -> Any:
+    """Return what has the MuJoCo model and data of an environment; None for nothing.
+
+    An environment of ours keeps them in an object of its own.
+    """
+    base = getattr(env, "unwrapped", env)
+    return simulation_in(base) or simulation_in(getattr(base, "simulation", None))
 
 
 def is_defined_by(function: object, module: str, qualified_name: str) -> bool:
@@ -99,6 +139,18 @@ def generator_state(generator: Any) -> Any:
     return None
 
 
+def set_generator_state(generator: Any, state: Any) -> None:
+    """Put one of NumPy's random generators into a state that `generator_state` gave.
+
+    Raises:
+        Exception: it is no state of such a generator.
+    """
+    if isinstance(generator, np.random.RandomState):
+        generator.set_state(_arrays(state))
+    else:
+        generator.bit_generator.state = _arrays(state)
+
+
 def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return arguments as JSON can hold them; None if one of them is more than that.
 
@@ -110,11 +162,39 @@ def plain_arguments(arguments: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
 
 
+def shown_arguments(kwargs: Any) -> str:
+    """Return `name=value, ...` of what an environment was made with.
+
+    Args:
+        kwargs: as a recording has them; they may be anything.
+
+    Returns:
+        "" where there are none but for how it is shown.
+    """
+    if not isinstance(kwargs, Mapping):
+        return ""
+    said = ", ".join(
+        f"{name}={value!r:.100}"
+        for name, value in kwargs.items()
+        if name not in VIEW_ARGUMENTS
+    )
+    if len(said) > _MOST_CHARACTERS:
+        return f"{said[:_MOST_CHARACTERS]} ..."
+    return said
+
+
 def _lists(value: Any) -> Any:
     """Return `value` with lists and plain numbers for NumPy's."""
     if isinstance(value, dict):
         return {name: _lists(item) for name, item in value.items()}
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def _arrays(state: Any) -> Any:
+    """Return a random state as NumPy takes it: with arrays for lists."""
+    if isinstance(state, Mapping):
+        return {name: _arrays(value) for name, value in state.items()}
+    return np.array(state, dtype=np.uint64) if isinstance(state, list) else state
 
 
 def _plain(value: Any) -> Any:

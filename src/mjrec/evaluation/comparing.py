@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
@@ -23,139 +23,83 @@ from . import statistics
 from .plan import SEEDED
 from .result_columns import ResultColumns
 from .results_files import ReadResults, read_results
-from .statistics import Bootstrap, FloatArray, Interval
+from .statistics import Bootstrap, Estimate, FloatArray
 from .summaries import scaled
 
 Directories: TypeAlias = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
+IMPROVEMENT: Final = "probability of improvement"
+TASK_FIGURES: Final = (
+    *("mean A", "mean B", "difference", "paired difference"),
+    *(IMPROVEMENT, "p-value"),
+)
+"""What is said of a task, in the order of tables."""
+OVERALL_FIGURES: Final = (IMPROVEMENT, "IQM A", "IQM B", "IQM difference")
+"""What is said of all tasks together, likewise."""
+
 _MOST_TOLD: Final = 10
-
-
-@dataclass(frozen=True)
-class PairedDifference:
-    """How much more B got than A, from the same initial states.
-
-    Attributes:
-        episodes: how many seeds and numbers both completed.
-        difference: the mean of B - A over them.
-        interval: of that, by resampling pairs; None of a single one.
-    """
-
-    episodes: int
-    difference: float
-    interval: Interval | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskComparison:
-    """What is said of one task. What cannot be said is None.
+    """What is said of one task; what is in pairs is of A and of B.
 
     Attributes:
         task: its name.
-        episodes_a: how many were completed; the figures are theirs.
-        episodes_b: likewise.
-        failed_a: how many were not.
-        failed_b: likewise.
-        not_finite_a: how many of the completed ones have a return that is NaN or
+        episodes: how many were completed; the figures are theirs.
+        failed: how many were not.
+        not_finite: how many of the completed ones have a return that is NaN or
             infinite. Where any has, there are no figures.
-        not_finite_b: likewise.
-        mean_a: of the returns; of several evaluations that of their means.
-        mean_b: likewise.
-        difference: `mean_b - mean_a`.
-        difference_interval: of that.
-        probability: that B is better, where equal returns count half: of an episode of
-            B against one of A, or of an evaluation's mean against another's.
-        probability_interval: of that.
-        p_value: of the two-sided Mann-Whitney test that neither tends to be higher.
-        p_value_holm: that, adjusted (Holm) for the number of tasks.
-        paired: the same difference from episodes that began alike; None where the two
-            evaluations have none.
-        interval_method: how the intervals were made.
+        figures: by name, those of `TASK_FIGURES` that can be said. The means are of the
+            returns or, of several evaluations, of their means. The paired difference is
+            that of episodes which began alike. The p-value is that of the two-sided
+            Mann-Whitney test, adjusted (Holm) for the number of tasks.
+        pairs: of how many pairs of episodes the paired difference is.
         unknown: why there are no figures; None where there are.
     """
 
     task: str
-    episodes_a: int
-    episodes_b: int
-    failed_a: int = 0
-    failed_b: int = 0
-    not_finite_a: int = 0
-    not_finite_b: int = 0
-    mean_a: float | None = None
-    mean_b: float | None = None
-    difference: float | None = None
-    difference_interval: Interval | None = None
-    probability: float | None = None
-    probability_interval: Interval | None = None
-    p_value: float | None = None
-    p_value_holm: float | None = None
-    paired: PairedDifference | None = None
-    interval_method: str | None = None
-    unknown: str | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScoreComparison:
-    """The interquartile means of the scores of all tasks with one scale everywhere.
-
-    Attributes:
-        tasks: which ones.
-        iqm_a: the interquartile mean of their scores.
-        iqm_b: likewise.
-        difference: `iqm_b - iqm_a`.
-        interval: of that; None where there is a single score of a task.
-    """
-
-    tasks: tuple[str, ...]
-    iqm_a: float
-    iqm_b: float
-    difference: float
-    interval: Interval | None
+    episodes: tuple[int, int]
+    failed: tuple[int, int]
+    not_finite: tuple[int, int]
+    figures: Mapping[str, Estimate]
+    pairs: int
+    unknown: str | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """B against A.
+    """B against A; what is in pairs is of A and of B.
 
     Attributes:
         a: the directories of the one side.
         b: the directories of the other.
         unit: what the figures are of, and is resampled: `"episodes"` of one evaluation
             on each side, or `"evaluations"`.
-        policy_a: what was evaluated in A.
-        policy_b: what was evaluated in B.
+        policies: what was evaluated.
         cautions: what must be known before the figures are believed: that not all was
             made under the same conditions, or that episodes failed.
         remarks: in what else the two differ; their figures can be compared all the
             same.
-        only_in_a: tasks that are not in all evaluations of B.
-        only_in_b: tasks that are not in all evaluations of A.
+        left_out: tasks that are not in all evaluations of the other.
         tasks: those that are everywhere, in the order of A.
-        probability: that B is better, averaged over tasks; None where no task has one.
-        probability_interval: of that; None also where a task has a single value.
-        scores: of all tasks that have the same scale everywhere; None where none has.
+        figures: by name, those of `OVERALL_FIGURES` that can be said: the probability
+            of improvement, averaged over tasks, and interquartile means of scores.
+        scored: the tasks whose scores these are: with the same scale everywhere.
         bootstrap: how intervals were made.
     """
 
     a: tuple[Path, ...]
     b: tuple[Path, ...]
     unit: Literal["episodes", "evaluations"]
-    policy_a: str
-    policy_b: str
+    policies: tuple[str, str]
     cautions: tuple[str, ...]
     remarks: tuple[str, ...]
-    only_in_a: tuple[str, ...]
-    only_in_b: tuple[str, ...]
+    left_out: tuple[tuple[str, ...], tuple[str, ...]]
     tasks: tuple[TaskComparison, ...]
-    probability: float | None
-    probability_interval: Interval | None
-    scores: ScoreComparison | None
+    figures: Mapping[str, Estimate]
+    scored: tuple[str, ...]
     bootstrap: Bootstrap
-
-    @property
-    def compared(self) -> tuple[TaskComparison, ...]:
-        """The tasks that have figures."""
-        return tuple(task for task in self.tasks if task.unknown is None)
 
 
 def compare(
@@ -195,35 +139,52 @@ def compare(
             + "; ".join(f"{side.told} has {', '.join(side.tasks)}" for side in sides)
         )
     is_single = len(of_a.results) == len(of_b.results) == 1
-    for side in sides:
-        side.is_single = is_single
-    tasks = [_compared_task(task, of_a, of_b, how) for task in common]
-    adjusted = holm_adjusted(
-        {each.task: each.p_value for each in tasks if each.p_value is not None}
-    )
-    known = [each.task for each in tasks if each.unknown is None]
-    better = statistics.average(
-        statistics.improvement(of_b.sample(task), of_a.sample(task)) for task in known
-    )
+    unknown = {task: of_a.unknown(task) or of_b.unknown(task) for task in common}
+    samples = {
+        task: (of_a.sample(task, is_single), of_b.sample(task, is_single))
+        for task, why in unknown.items()
+        if why is None
+    }
+    p_values = holm_adjusted({task: _p_value(*both) for task, both in samples.items()})
+    tasks = []
+    for task in common:
+        pairs = np.empty(0)
+        figures: dict[str, Estimate] = {}
+        if task in samples:
+            if is_single:
+                pairs = _paired_differences(task, of_a.results[0], of_b.results[0])
+            figures = _task_figures(*samples[task], pairs, how)
+            figures["p-value"] = Estimate(p_values[task])
+        episodes, failed, not_finite = zip(
+            of_a.counts(task), of_b.counts(task), strict=True
+        )
+        tasks.append(
+            TaskComparison(
+                task=task,
+                episodes=episodes,
+                failed=failed,
+                not_finite=not_finite,
+                figures=figures,
+                pairs=len(pairs),
+                unknown=unknown[task],
+            )
+        )
+    scales = _scales([*of_a.results, *of_b.results])
+    scored = tuple(task for task in samples if task in scales)
     return Comparison(
         a=of_a.directories,
         b=of_b.directories,
         unit="episodes" if is_single else "evaluations",
-        policy_a=_listed(each.plan.policy for each in of_a.results),
-        policy_b=_listed(each.plan.policy for each in of_b.results),
+        policies=(_listed(of_a.policies), _listed(of_b.policies)),
         cautions=tuple(_cautions(of_a, of_b, tasks)),
         remarks=tuple(
             f"{name}: {in_a} in A, {in_b} in B"
             for name, in_a, in_b in _different(of_a, of_b, _choices)
         ),
-        only_in_a=tuple(task for task in of_a.tasks if task not in common),
-        only_in_b=tuple(task for task in of_b.tasks if task not in common),
-        tasks=tuple(
-            replace(each, p_value_holm=adjusted.get(each.task)) for each in tasks
-        ),
-        probability=better.value if known else None,
-        probability_interval=better.interval(how) if known else None,
-        scores=_compared_scores(of_a, of_b, known, how),
+        left_out=(of_a.without(common), of_b.without(common)),
+        tasks=tuple(tasks),
+        figures=_overall_figures(samples, {task: scales[task] for task in scored}, how),
+        scored=scored,
         bootstrap=how,
     )
 
@@ -261,8 +222,6 @@ class _Side:
         if len({path.resolve() for path in self.directories}) < len(self.directories):
             raise InvalidArgument(f"An evaluation is there twice: {self.told}.")
         self.results = [read_results(path) for path in self.directories]
-        # Whether the other side is one evaluation, too.
-        self.is_single = True
 
     @property
     def told(self) -> str:
@@ -275,20 +234,29 @@ class _Side:
         first = self.results[0].columns
         return [task for task in first if all(task in other for other in rest)]
 
+    @property
+    def policies(self) -> list[str]:
+        return [each.plan.policy for each in self.results]
+
+    def without(self, tasks: Sequence[str]) -> tuple[str, ...]:
+        """Return the other tasks."""
+        return tuple(task for task in self.tasks if task not in tasks)
+
     def returns(self, task: str) -> list[FloatArray]:
         """Return those of the completed episodes of each evaluation."""
         columns = [each.columns[task] for each in self.results]
         return [each.total_reward[~each.failed] for each in columns]
 
-    def sample(self, task: str) -> FloatArray:
-        """Return what the figures are of."""
+    def sample(self, task: str, is_single: bool) -> FloatArray:
+        """Return what the figures are of: returns, or the mean of each evaluation."""
         returns = self.returns(task)
-        if self.is_single:
-            return returns[0]
-        return np.array([each.mean() for each in returns])
+        return returns[0] if is_single else np.array([r.mean() for r in returns])
 
-    def failed(self, task: str) -> int:
-        return sum(len(each.columns[task].failures) for each in self.results)
+    def counts(self, task: str) -> tuple[int, int, int]:
+        """Return how many episodes were completed, failed, and returned no number."""
+        failed = sum(len(each.columns[task].failures) for each in self.results)
+        returns = np.concatenate(self.returns(task))
+        return len(returns), failed, _not_finite(returns)
 
     def unknown(self, task: str) -> str | None:
         """Return why there are no figures of a task."""
@@ -307,39 +275,42 @@ def _not_finite(returns: FloatArray) -> int:
     return int(np.count_nonzero(~np.isfinite(returns)))
 
 
-def _compared_task(task: str, a: _Side, b: _Side, how: Bootstrap) -> TaskComparison:
-    returns_a, returns_b = (np.concatenate(side.returns(task)) for side in (a, b))
-    compared = TaskComparison(
-        task=task,
-        episodes_a=len(returns_a),
-        episodes_b=len(returns_b),
-        failed_a=a.failed(task),
-        failed_b=b.failed(task),
-        not_finite_a=_not_finite(returns_a),
-        not_finite_b=_not_finite(returns_b),
-        unknown=a.unknown(task) or b.unknown(task),
-    )
-    if compared.unknown is not None:
-        return compared
-    x, y = a.sample(task), b.sample(task)
+def _task_figures(
+    x: FloatArray, y: FloatArray, pairs: FloatArray, how: Bootstrap
+) -> dict[str, Estimate]:
     mean_a, mean_b = statistics.mean(x), statistics.mean(y)
-    difference, better = mean_b - mean_a, statistics.improvement(y, x)
-    return replace(
-        compared,
-        mean_a=mean_a.value,
-        mean_b=mean_b.value,
-        difference=difference.value,
-        difference_interval=difference.interval(how),
-        probability=better.value,
-        probability_interval=better.interval(how),
-        p_value=_mann_whitney(x, y),
-        paired=_paired(task, a.results[0], b.results[0], how) if a.is_single else None,
-        interval_method=difference.interval_method,
-    )
+    figures = {"mean A": mean_a, "mean B": mean_b, "difference": mean_b - mean_a}
+    if len(pairs):
+        figures["paired difference"] = statistics.mean(pairs)
+    figures[IMPROVEMENT] = statistics.improvement(y, x)
+    return {name: figure.estimate(how) for name, figure in figures.items()}
 
 
-def _mann_whitney(x: FloatArray, y: FloatArray) -> float:
-    """Return the two-sided p-value; exact for small samples without equal values."""
+def _overall_figures(
+    samples: Mapping[str, tuple[FloatArray, FloatArray]],
+    scales: Mapping[str, tuple[float, float]],
+    how: Bootstrap,
+) -> dict[str, Estimate]:
+    figures = {}
+    if samples:
+        better = [statistics.improvement(y, x) for x, y in samples.values()]
+        figures[IMPROVEMENT] = statistics.average(better)
+    if scales:
+        iqm_a, iqm_b = (
+            statistics.interquartile_mean(
+                scaled(samples[task][side], scale) for task, scale in scales.items()
+            )
+            for side in (0, 1)
+        )
+        figures |= {"IQM A": iqm_a, "IQM B": iqm_b, "IQM difference": iqm_b - iqm_a}
+    return {name: figure.estimate(how) for name, figure in figures.items()}
+
+
+def _p_value(x: FloatArray, y: FloatArray) -> float:
+    """Return that of the two-sided Mann-Whitney test.
+
+    It is exact for small samples without equal values.
+    """
     try:
         # Here, because it takes longer to import than all else, and is optional.
         from scipy.stats import mannwhitneyu  # type: ignore[import-untyped] # no stubs
@@ -355,50 +326,21 @@ def _mann_whitney(x: FloatArray, y: FloatArray) -> float:
     return float(mannwhitneyu(y, x, alternative="two-sided").pvalue)
 
 
-def _paired(
-    task: str, a: ReadResults, b: ReadResults, how: Bootstrap
-) -> PairedDifference | None:
+def _paired_differences(task: str, a: ReadResults, b: ReadResults) -> FloatArray:
+    """Return B - A of the episodes that began in the same state in both."""
     if not (
         a.plan.protocol == b.plan.protocol == SEEDED
         and a.plan.env_kwargs == b.plan.env_kwargs
     ):
-        # Episodes of the same seed and number began in different states.
-        return None
+        return np.empty(0)
     of_a, of_b = _by_unit(a.columns[task]), _by_unit(b.columns[task])
-    pairs = [of_b[unit] - of_a[unit] for unit in of_a if unit in of_b]
-    if not pairs:
-        return None
-    difference = statistics.mean(np.array(pairs))
-    return PairedDifference(len(pairs), difference.value, difference.interval(how))
+    return np.array([of_b[unit] - of_a[unit] for unit in of_a if unit in of_b])
 
 
 def _by_unit(columns: ResultColumns) -> dict[tuple[int, int], float]:
     done = ~columns.failed
     units = zip(columns.seed[done], columns.episode[done], strict=True)
     return dict(zip(units, columns.total_reward[done].tolist(), strict=True))
-
-
-def _compared_scores(
-    a: _Side, b: _Side, tasks: Sequence[str], how: Bootstrap
-) -> ScoreComparison | None:
-    scales = _scales([*a.results, *b.results])
-    scaled_tasks = tuple(task for task in tasks if task in scales)
-    if not scaled_tasks:
-        return None
-    iqm_a, iqm_b = (
-        statistics.interquartile_mean(
-            scaled(side.sample(task), scales[task]) for task in scaled_tasks
-        )
-        for side in (a, b)
-    )
-    difference = iqm_b - iqm_a
-    return ScoreComparison(
-        tasks=scaled_tasks,
-        iqm_a=iqm_a.value,
-        iqm_b=iqm_b.value,
-        difference=difference.value,
-        interval=difference.interval(how),
-    )
 
 
 def _scales(results: Sequence[ReadResults]) -> dict[str, tuple[float, float]]:
@@ -428,9 +370,8 @@ def _cautions(a: _Side, b: _Side, tasks: Sequence[TaskComparison]) -> Iterator[s
             "conditions do not tell which policy is better"
         )
     for task in tasks:
-        for name, failed, completed in (
-            ("A", task.failed_a, task.episodes_a),
-            ("B", task.failed_b, task.episodes_b),
+        for name, failed, completed in zip(
+            "AB", task.failed, task.episodes, strict=True
         ):
             if failed:
                 yield (
@@ -448,24 +389,19 @@ def _conditions(results: ReadResults) -> Mapping[str, object]:
 def _choices(results: ReadResults) -> Mapping[str, object]:
     """Return what chooses which episodes are seen, and what ran them."""
     plan = results.plan
-    return {
-        "protocol": plan.protocol,
-        "seeds": plan.seeds,
-        "episodes": plan.episodes,
-        **results.versions,
-    }
+    chosen = {name: getattr(plan, name) for name in ("protocol", "seeds", "episodes")}
+    return {**chosen, **results.versions}
 
 
 def _different(
     a: _Side, b: _Side, facts: Callable[[ReadResults], Mapping[str, object]]
 ) -> Iterator[tuple[str, str, str]]:
     """Yield the facts that are not the same everywhere, as each side says them."""
-    results = [*a.results, *b.results]
-    for name in dict.fromkeys(name for each in results for name in facts(each)):
-        values = [facts(each).get(name, "none") for each in results]
-        if any(value != values[0] for value in values):
-            split = len(a.results)
-            yield name, _listed(values[:split]), _listed(values[split:])
+    said = [[facts(each) for each in side.results] for side in (a, b)]
+    for name in dict.fromkeys(name for side in said for fact in side for name in fact):
+        of_a, of_b = ([fact.get(name, "none") for fact in side] for side in said)
+        if any(value != of_a[0] for value in (*of_a, *of_b)):
+            yield name, _listed(of_a), _listed(of_b)
 
 
 def _listed(values: Iterable[object]) -> str:

@@ -50,7 +50,6 @@ from .summaries import (
     AcrossTasks,
     TaskSummary,
     default_score_range,
-    split_by_scale,
     summarize_across,
     summarize_results,
 )
@@ -484,6 +483,4 @@ def _summarized(
         ]
         for of in runs
     }
-    scores, left_out = split_by_scale(returns, scales)
-    across = summarize_across(scores, left_out=left_out, bootstrap=bootstrap)
-    return summaries, across
+    return summaries, summarize_across(returns, scales, bootstrap=bootstrap)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ..environments.episode_seeds import episode_seeds
+from ..environments.named_environment import EnvironmentOptions
 from ..environments.names import MjcfName, parse_environment_name
-from ..environments.options import EnvironmentOptions
 from ..errors import InvalidArgument, UnknownName
 from ..frames import check_quality
 from ..json_text import loads

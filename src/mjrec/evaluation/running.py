@@ -18,12 +18,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from ..environments.episode_seeds import EpisodeSeeds, episode_seeds
-from ..environments.from_name import NamedEnvironment, environment_from_name
-from ..environments.global_generators import seed_global_generators
-from ..environments.options import EnvironmentOptions
+from ..environments.episode_seeds import (
+    EpisodeSeeds,
+    episode_seeds,
+    seed_global_generators,
+)
+from ..environments.from_name import environment_from_name
+from ..environments.named_environment import EnvironmentOptions, NamedEnvironment
+from ..environments.names import working_directory_importable
 from ..environments.policies import Policy, load_policy, policy_file, policy_from
-from ..environments.working_directory import working_directory_importable
 from ..errors import Error, InvalidArgument, PolicyError
 from ..monitors import Monitor
 from ..monitors.base import rendering_choice
@@ -380,7 +383,8 @@ def _run_episode(
         before = _warnings(named.environment)
         done = False
         while not done:
-            observation, done = named.step(monitor, policy(observation))
+            observation, _, *ends = named.step(monitor, policy(observation))
+            done = any(ends)
     after = _warnings(named.environment)
     # Not every reset sets them to zero; and an unstable simulation may be set back.
     counts = {name: n - before.get(name, 0) for name, n in after.items()}

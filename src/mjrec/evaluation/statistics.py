@@ -53,6 +53,21 @@ class Interval:
     high: float
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """A figure, and how far it could be off.
+
+    Attributes:
+        value: the figure.
+        interval: of that; None where there is none.
+        interval_method: how it was made; None likewise.
+    """
+
+    value: float
+    interval: Interval | None = None
+    interval_method: str | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Bootstrap:
     """How confidence intervals are made.
@@ -141,6 +156,10 @@ class Figure:
         """Return the interval of a figure that is one number."""
         ends = self.ends(how)
         return None if ends is None else Interval(*map(float, ends))
+
+    def estimate(self, how: Bootstrap) -> Estimate:
+        """Return a figure that is one number, with its interval."""
+        return Estimate(self.value, self.interval(how), self.interval_method)
 
     def __sub__(self, other: Figure) -> Figure:
         """Return the difference of the figures of independent samples."""

@@ -237,49 +237,36 @@ def scaled(total_rewards: FloatArray, score_range: tuple[float, float]) -> Float
     return (total_rewards - low) / (high - low)
 
 
-def split_by_scale(
+def summarize_across(
     total_rewards: Mapping[str, npt.ArrayLike],
     score_ranges: Mapping[str, tuple[float, float] | None],
-) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Return the scores of the tasks that have any, and why the others have none.
+    *,
+    bootstrap: Bootstrap | None = None,
+) -> AcrossTasks:
+    """Return what is said of all tasks that have a scale.
 
     Args:
         total_rewards: the returns of the completed episodes, for each task.
-        score_ranges: for each task; one that is not there has no scale.
+        score_ranges: the returns that count as 0 and as 1; a task that is not there has
+            no scale.
+        bootstrap: how intervals are made; as `Bootstrap()` says, if None.
     """
     scores: dict[str, FloatArray] = {}
     left_out: dict[str, str] = {}
     for task, values in total_rewards.items():
         returns = np.asarray(values, dtype=np.float64)
         score_range = score_ranges.get(task)
-        infinite = int(np.count_nonzero(~np.isfinite(returns)))
         if score_range is None:
             left_out[task] = _why_no_scale(task)
         elif not len(returns):
             left_out[task] = "no episode was completed"
-        elif infinite:
-            left_out[task] = f"{infinite} of {len(returns)} returns are NaN or infinite"
+        elif wrong := np.count_nonzero(~np.isfinite(returns)):
+            left_out[task] = f"{wrong} of {len(returns)} returns are NaN or infinite"
         else:
             scores[task] = scaled(returns, score_range)
-    return scores, left_out
-
-
-def summarize_across(
-    scores: Mapping[str, npt.ArrayLike],
-    *,
-    left_out: Mapping[str, str] | None = None,
-    bootstrap: Bootstrap | None = None,
-) -> AcrossTasks:
-    """Return what is said of several tasks.
-
-    Args:
-        scores: of the completed episodes of each task; finite, and at least one.
-        left_out: further tasks, and why they are not among them.
-        bootstrap: how intervals are made; as `Bootstrap()` says, if None.
-    """
-    samples = [np.asarray(sample, dtype=np.float64) for sample in scores.values()]
-    if not samples:
-        return AcrossTasks(tasks=(), left_out=left_out or {})
+    if not scores:
+        return AcrossTasks(tasks=(), left_out=left_out)
+    samples = scores.values()
     how = bootstrap or Bootstrap()
     means = [sample.mean() for sample in samples]
     iqm = statistics.interquartile_mean(samples)
@@ -289,7 +276,7 @@ def summarize_across(
     low, high = profile.ends(how) or (shares, shares)
     return AcrossTasks(
         tasks=tuple(scores),
-        left_out=left_out or {},
+        left_out=left_out,
         mean=float(np.mean(means)),
         median=float(np.median(means)),
         iqm=iqm.value,

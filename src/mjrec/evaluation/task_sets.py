@@ -3,11 +3,13 @@
 
 ======================  ==============================================================
 `HalfCheetah-v5`        an environment as in `mjrec record`: an id of Gymnasium's,
-                        `dm_control/<domain>-<task>`, or the path of an MJCF file
+                        `dm_control/<domain>-<task>`, or the path of an MJCF file;
+                        an id without its version is the newest
 `dm_control:all`        a set, see `TASK_SETS`
 `dm_control/walker-*`   a pattern of `*`, `?` and `[...]`, matched against the tasks of
-                        the dm_control suite and the ids in Gymnasium's registry
-`module:Fetch*-v4`      likewise, after importing a module that registers environments
+                        the dm_control suite and the ids in Gymnasium's registry; one
+                        that names no versions (`Half*`) means the newest of each
+`module:Fetch*-v4`      likewise, of the ids that this module registers
 ======================  ==============================================================
 """
 
@@ -19,8 +21,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from ..environments.known_names import gymnasium_ids, mujoco_ids, suite_tasks
-from ..environments.names import parse_environment_name
+from ..environments.known_names import (
+    gymnasium_ids,
+    mujoco_ids,
+    newest_versions,
+    suite_tasks,
+    version_of,
+)
+from ..environments.names import GymnasiumName, parse_environment_name
 from ..errors import InvalidArgument, MissingDependency, UnknownName
 
 TASK_SETS: Mapping[str, Callable[[], Sequence[str]]] = {
@@ -34,7 +42,6 @@ TASK_SETS: Mapping[str, Callable[[], Sequence[str]]] = {
 
 _SUITE = "dm_control/"
 _WILD = re.compile(r"[*?\[]")
-_VERSION = re.compile(r"-v[0-9]+$", re.ASCII)
 
 
 def tasks_from(texts: Sequence[str]) -> tuple[str, ...]:
@@ -70,8 +77,13 @@ def _named(text: str) -> Sequence[str]:
     # A file may have brackets in its name.
     if _WILD.search(text) and not Path(text).expanduser().is_file():
         return _matching(text)
-    parse_environment_name(text)
-    return [text]
+    name = parse_environment_name(text)
+    if not isinstance(name, GymnasiumName) or version_of(text) >= 0:
+        return [text]
+    module, colon, env_id = text.rpartition(":")
+    # Where there is none, making it says what there is.
+    newest = newest_versions(gymnasium_ids(module)).get(env_id, env_id)
+    return [f"{module}{colon}{newest}"]
 
 
 def _is_set(text: str) -> bool:
@@ -81,13 +93,17 @@ def _is_set(text: str) -> bool:
         return False
     # `gymnasium:Ant-v5` is an environment of a module that registers some.
     return framework == "dm_control" or (
-        framework == "gymnasium" and not _VERSION.search(name)
+        framework == "gymnasium" and version_of(name) < 0
     )
 
 
 def _matching(pattern: str) -> Sequence[str]:
-    known = list(_candidates(pattern))
-    matching = [name for name in known if fnmatch.fnmatchcase(name, pattern)]
+    module, colon, wanted = pattern.rpartition(":")
+    known = list(_candidates(module, wanted))
+    newest = newest_versions(known)
+    matching = [newest[name] for name in newest if fnmatch.fnmatchcase(name, wanted)]
+    # Else the pattern is one of names with their versions.
+    matching = matching or [n for n in known if fnmatch.fnmatchcase(n, wanted)]
     if not matching:
         raise UnknownName(
             "task that matches",
@@ -97,22 +113,17 @@ def _matching(pattern: str) -> Sequence[str]:
             "installed, and the ids in Gymnasium's registry. Sets are "
             f"{', '.join(TASK_SETS)}.",
         )
-    return matching
+    return [f"{module}{colon}{name}" for name in matching]
 
 
-def _candidates(pattern: str) -> Iterator[str]:
-    module, colon, _ = pattern.rpartition(":")
-    if colon:
-        for env_id in gymnasium_ids(module):
-            yield f"{module}:{env_id}"
-        return
-    beginning = _WILD.split(pattern, maxsplit=1)[0]
-    if beginning.startswith(_SUITE):
+def _candidates(module: str, wanted: str) -> Iterator[str]:
+    beginning = _WILD.split(wanted, maxsplit=1)[0]
+    if not module and beginning.startswith(_SUITE):
         yield from suite_tasks("all")
         return
-    if _SUITE.startswith(beginning):
+    if not module and _SUITE.startswith(beginning):
         yield from _suite_if_installed()
-    yield from gymnasium_ids()
+    yield from gymnasium_ids(module)
 
 
 def _suite_if_installed() -> Sequence[str]:

@@ -93,7 +93,7 @@ class MonitorBase:
         """
         try:
             if wait:
-                with render_progress(title="rendering ") as on_progress:
+                with render_progress() as on_progress:
                     self._finish(on_progress)
         finally:
             self._guard.close()

@@ -11,8 +11,7 @@ from typing import Any
 import dm_env
 
 from ..environments.dm_env_episodes import is_terminated, is_truncated
-from ..environments.no_pictures import NoPictureSource
-from ..environments.scenes import Scenes
+from ..environments.scenes import NoPictureSource, Scenes
 from ..errors import InvalidArgument
 from ..recorder.options import RecorderOptions
 from .base import EnvironmentMonitor
@@ -162,7 +161,7 @@ def _pictures(
     env: dm_env.Environment, *, camera: Any, height: int | None, width: int | None
 ) -> Any:
     if getattr(env, "physics", None) is not None:
-        from ..environments.dm_control_pictures import dm_control_pictures
+        from ..environments.dm_control_scenes import dm_control_pictures
 
         return dm_control_pictures(env, camera=camera, height=height, width=width)
     if (camera, height, width) != (None, None, None):

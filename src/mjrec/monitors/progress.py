@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of a rendering: a bar on a terminal, nothing elsewhere."""
+"""The progress bar of all that takes long: on a terminal, nothing elsewhere."""
 
 from __future__ import annotations
 
@@ -7,30 +7,31 @@ import contextlib
 import random
 import sys
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from ..rendering.jobs import Progress
 
 if TYPE_CHECKING:
     import rich.console
 
+# Shows how far something is: what it is, how much is done, of how much (None where that
+# is not known), and that in words.
+ShowProgress: TypeAlias = Callable[[str, int, int | None, str], None]
+
 
 @contextlib.contextmanager
-def render_progress(
-    console: rich.console.Console | None = None, *, title: str = ""
-) -> Iterator[Callable[[Progress], None]]:
-    """Yield a function that shows how far a rendering is, on a terminal only.
+def progress_bar(console: rich.console.Console | None = None) -> Iterator[ShowProgress]:
+    """Yield a function that shows a bar for each thing that it is told of.
 
-    The bar vanishes at the end: what a program prints is its own business.
+    The bars vanish at the end: what a program prints is its own business.
 
     Args:
         console: where to, standard error if None; lines that are printed to it
-            meanwhile stand above the bar.
-        title: stands before the number of videos.
+            meanwhile stand above the bars.
     """
     is_terminal = sys.stderr.isatty() if console is None else console.is_terminal
     if not is_terminal:
-        yield lambda progress: None
+        yield lambda what, done, total, words: None
         return
     # Rich draws random numbers when it is imported, and the user's are not ours. Loaded
     # only where there is a bar to show.
@@ -39,28 +40,47 @@ def render_progress(
     import rich.progress
 
     random.setstate(state)
-    bar = rich.progress.Progress(
-        rich.progress.TextColumn("{task.description}{task.fields[videos]}"),
+    bars = rich.progress.Progress(
+        rich.progress.TextColumn("{task.description}", markup=False),
         rich.progress.BarColumn(bar_width=20),
-        rich.progress.TextColumn("{task.fields[frames]}"),
+        rich.progress.TextColumn("{task.fields[words]}"),
         rich.progress.TimeElapsedColumn(),
         rich.progress.TextColumn("left:"),
         rich.progress.TimeRemainingColumn(),
         console=console or rich.console.Console(stderr=True),
         transient=True,
     )
-    task = bar.add_task(title, total=0, videos="", frames="")
+    tasks: dict[str, rich.progress.TaskID] = {}
 
-    def show(progress: Progress) -> None:
-        """Count frames, or videos where nobody knows how many frames there are."""
-        done, total = progress.frames_done, progress.frames
-        bar.update(
-            task,
-            completed=progress.videos_done if total is None else done,
-            total=progress.videos if total is None else total,
-            videos=f"{progress.videos_done}/{progress.videos} videos",
-            frames=f"{done} frames" if total is None else f"{done}/{total} frames",
-        )
+    def show(what: str, done: int, total: int | None, words: str) -> None:
+        if what not in tasks:
+            tasks[what] = bars.add_task(what, total=None, words="")
+        bars.update(tasks[what], completed=done, total=total, words=words)
 
-    with bar:
+    with bars:
         yield show
+
+
+@contextlib.contextmanager
+def render_progress(
+    console: rich.console.Console | None = None, *, title: str = "rendering"
+) -> Iterator[Callable[[Progress], None]]:
+    """Yield a function that shows how far a rendering is.
+
+    Args:
+        console: as for `progress_bar`.
+        title: what is rendered.
+    """
+    with progress_bar(console) as show:
+
+        def show_rendering(progress: Progress) -> None:
+            """Count frames, or videos where nobody knows how many frames there are."""
+            videos, frames = progress.videos_done, progress.frames_done
+            words = f"{videos}/{progress.videos} videos, {frames}"
+            if progress.frames is None:
+                show(title, videos, progress.videos, f"{words} frames")
+            else:
+                words = f"{words}/{progress.frames} frames"
+                show(title, frames, progress.frames, words)
+
+        yield show_rendering

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import functools
 import logging
+import re
 from typing import Any
 
 import mujoco
@@ -12,21 +12,26 @@ import mujoco
 logger = logging.getLogger(__name__)
 
 _PREFIX = "mjWARN_"
+_NUMBERS = re.compile(r"[\d.]+")
 
 
 def log_mujoco_warnings() -> None:
-    """Log each warning of MuJoCo once, for the rest of this process.
+    """Log each kind of MuJoCo's warnings once, for the rest of this process.
 
     MuJoCo itself would write `MUJOCO_LOG.TXT` into the working directory; a full scene,
     for one, warns at each frame. For processes of our own only: there is one handler
     in a process.
     """
-    mujoco.set_mju_user_warning(_warn_once)
+    said: set[str] = set()
 
+    def warn(text: str) -> None:
+        # One that says when it was, or where, is no other warning the next time.
+        kind = _NUMBERS.sub("", text)
+        if kind not in said:
+            said.add(kind)
+            logger.warning("MuJoCo: %s", text)
 
-@functools.lru_cache(maxsize=100)
-def _warn_once(text: str) -> None:
-    logger.warning("MuJoCo: %s", text)
+    mujoco.set_mju_user_warning(warn)
 
 
 def warning_counts(simulation: Any) -> dict[str, int]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...environments.environment_arguments import shown_arguments
+from ...environments.scenes import shown_arguments
 from ...formats.json_fields import read_object, unreadable
 from ...formats.monitor_directory import episode_of, infix_of, iter_monitor_files
 from ...formats.trajectory_file import open_trajectory

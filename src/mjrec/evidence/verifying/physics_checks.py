@@ -29,7 +29,6 @@ from ...environments.made_again import (
     make_again,
     recorded_environment,
 )
-from ...environments.mjcf_again import MjcfAgain
 from ...errors import Error, UnreadableFile
 from ...formats.monitor_directory import episode_of, infix_of, iter_monitor_files
 from ...formats.spans import is_in_flight, recordings_in_flight
@@ -149,4 +148,4 @@ class _Workshop:
             raise NotMadeAgain(
                 f"its MJCF cannot be had: {error.reason}".rstrip(".")
             ) from error
-        return MjcfAgain(recorded, model)
+        return make_again(recorded, model=model)
