@@ -22,12 +22,12 @@ from recordings import in_flight, videos_in
 import mjrec
 from conftest import Corridor
 from evaluated import FOLDER, PENDULUM, facts_of, plan_of, run_job, states_of, worker_of
-from mjrec.child_python import unpacked
 from mjrec.environments.episode_seeds import episode_seeds
 from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.ledger import read_ledgers
 from mjrec.evaluation.plan import EvaluationPlan
+from mjrec.messages import unpacked
 from mjrec.recorder.options import RecorderOptions
 from mjrec.sessions import Session, record_session
 from mjrec.signals import Terminated

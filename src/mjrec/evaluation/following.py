@@ -16,10 +16,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..child_python import unpacked
 from ..engines.jobs import Job, JobOutcome, Run, results_of
 from ..errors import EnvironmentNotMade, PicturesDiffer
 from ..formats.monitor_directory import Infix
+from ..messages import unpacked
 from ..rendering.engine_jobs import result_of
 from ..rendering.jobs import RecordingKey, RenderedVideos, VideoJob
 from ..rendering.recordings import may_be_left

@@ -33,10 +33,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..child_python import carried
 from ..engines.worker import AGAIN
 from ..errors import Error, GLError
 from ..gl import use_gl
+from ..messages import carried
 from ..recorder.options import DEFERRED
 from ..simulation.find_simulation import simulation_in
 from ..simulation.model_trust import note_models, noting_models

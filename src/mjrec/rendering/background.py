@@ -31,9 +31,11 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..child_python import Child, Parent, log_message, wait_for_news
+from ..child_python import Child, wait_for_news
 from ..errors import Error
 from ..formats.monitor_directory import infix_of
+from ..messages import log_message
+from ..parent import Parent
 from ..patience import Patience, patience_s
 from .jobs import Progress, VideoJob, key_of
 from .pool import check_workers

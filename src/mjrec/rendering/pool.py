@@ -22,7 +22,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..child_python import Child, log_message, unpacked, wait_for_news
+from ..child_python import Child, wait_for_news
 from ..errors import (
     ClosedError,
     DirectoryNotWritable,
@@ -41,6 +41,7 @@ from ..gl.backends import (
     rendering_is_off,
 )
 from ..machine import usable_cpus
+from ..messages import log_message, unpacked
 from ..patience import Patience
 from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
 from .views import PlainCamera, View, plain_camera
@@ -85,9 +86,8 @@ class WorkerPool:
         directory: whose CPUs are shared.
         trust_models: whether they load compiled models that a stranger wrote; they do
             in any case where `MJREC_TRUST_MODELS` says so here.
-        forks: whether `start` forks this process, which then imports once for all, and
-            sets its environment variables. It has a single thread until then, and
-            never uses OpenGL.
+        forks: whether `start` forks this process, which then imports once for all. It
+            has a single thread until then, and never uses OpenGL.
 
     Raises:
         InvalidArgument: `workers` is not a whole number of at least 1.
@@ -264,6 +264,7 @@ class WorkerPool:
     def _main_of_fork(self) -> Callable[[], object] | None:
         if not self._forks or threading.active_count() > 1:
             return None
+        before = dict(os.environ)
         # Read when mujoco is imported.
         os.environ.update(self._environ)
         try:
@@ -273,6 +274,10 @@ class WorkerPool:
             # A process of its own says why; or another backend works.
             self._forks = False
             return None
+        finally:
+            # Which backend is the user's choice is asked again where this one fails.
+            os.environ.clear()
+            os.environ.update(before)
         return main
 
     def _try_backends(self) -> None:

@@ -29,9 +29,9 @@ from typing import Any
 
 import numpy as np
 
-from ..child_python import Parent
 from ..gl.egl import egl_devices
 from ..machine import gpu_device_files
+from ..parent import Parent
 
 _SIZE = 480
 _SMALL = 96
