@@ -2,9 +2,8 @@
 """Directories into which thousands of monitors have recorded, made without recording.
 
 One monitor records. Its manifest, with all that it says of the machine, is then written
-again under other infixes, by the writers that monitors use, as are statistics, journals
-and ledgers. Trajectories are there by their names only: who
-reads results opens none of them.
+again under other infixes, by the writers that monitors use, as are statistics and
+journals. Trajectories are there by their names only: reading results opens none.
 """
 
 from __future__ import annotations
@@ -19,10 +18,9 @@ import gymnasium
 
 import mjrec
 from mjrec.evaluation.episode_results import EpisodeResult
-from mjrec.evaluation.ledger import Ledger, ledger_name
-from mjrec.evaluation.plan import Batch, EvaluatedTask, EvaluationPlan
+from mjrec.evaluation.plan import Chunk, EvaluatedTask, EvaluationPlan
 from mjrec.evaluation.plan_file import write_plan
-from mjrec.evaluation.recorded_files import RecordedFiles
+from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.results_files import write_results
 from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import summarize_results
@@ -44,6 +42,7 @@ from mjrec.formats.monitor_directory import (
 
 TASK = "InvertedPendulum-v5"
 
+_CHUNK = "seed-000"
 _START = 1.79e9
 _SECONDS = 0.5
 _STEPS = 1000
@@ -103,15 +102,16 @@ def write_evaluation(
         seeds=(0,),
         episodes=monitors * episodes,
         keep="none",
+        chunks=(Chunk(_CHUNK, (0,), 0, monitors * episodes),),
     )
     pattern = _recorded_manifest()
     for task in planned:
-        _write_monitors(directory / task.folder, monitors, episodes, pattern)
+        _write_monitors(directory / task.folder / _CHUNK, monitors, episodes, pattern)
     results = {
         task.name: list(results_of(task.name, monitors=monitors, episodes=episodes))
         for task in planned
     }
-    files = {task.name: RecordedFiles(directory / task.folder, ()) for task in planned}
+    folders = {task.name: f"{task.folder}/{_CHUNK}" for task in planned}
     few = Bootstrap(resamples=10)
     write_plan(directory, plan)
     write_results(
@@ -126,7 +126,10 @@ def write_evaluation(
         bootstrap=few,
         selection={},
         versions={},
-        files=lambda result: files[result.task].of(result),
+        files=lambda result: EpisodeFiles(
+            folder=folders[result.task],
+            trajectory=f"{_trajectory_of(result)}.h5",
+        ),
     )
 
 
@@ -135,6 +138,13 @@ def results_of(task: str, *, monitors: int, episodes: int) -> Iterator[EpisodeRe
     for written in _monitors(monitors, episodes):
         for number in written.numbers:
             yield _result(task, written, number)
+
+
+def _trajectory_of(result: EpisodeResult) -> str:
+    infix = Infix.parse(str(result.monitor))
+    assert infix is not None
+    assert result.episode_id is not None
+    return trajectory_prefix(infix, result.episode_id)
 
 
 def _recorded_manifest() -> Manifest:
@@ -178,7 +188,6 @@ def _write_monitor(folder: Path, written: _Written, pattern: Manifest) -> None:
         trajectory = trajectory_prefix(written.infix, entry.episode_id)
         (folder / f"{trajectory}.h5").touch()
     writer.close()
-    _write_ledger(folder, written)
     stats = f"{stats_prefix(written.infix)}.stats.json"
     write_stats_file(folder / stats, _stats(entries))
     details = {
@@ -188,22 +197,6 @@ def _write_monitor(folder: Path, written: _Written, pattern: Manifest) -> None:
     }
     manifest = replace(pattern, stats=stats, videos=(), mjrec=details)
     write_manifest(folder / manifest_name(written.infix), manifest)
-
-
-def _write_ledger(folder: Path, written: _Written) -> None:
-    batch = Batch(
-        task=TASK,
-        folder=folder.name,
-        seed=written.seed,
-        episodes=tuple(written.numbers),
-    )
-    path = folder / ledger_name(str(written.infix))
-    ledger = Ledger(path, batch, whole=False)
-    for number in written.numbers:
-        result = _result(TASK, written, number)
-        ledger.begin(result.unit, monitor=str(written.infix), episode_id=number)
-        ledger.end(result)
-    ledger.close()
 
 
 def _entry(number: int) -> JournalEntry:
@@ -220,6 +213,7 @@ def _entry(number: int) -> JournalEntry:
         terminated=False,
         truncated=True,
         success=None,
+        evaluation={"seed": 0, "episode": number, "warnings": {}},
     )
 
 

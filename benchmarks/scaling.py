@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import functools
 import importlib
-import itertools
 import math
 import shutil
 import statistics
@@ -19,14 +18,11 @@ from typing import Any
 import gymnasium
 
 import mjrec
-from mjrec.evaluation.ledger import read_ledgers
+from mjrec.evaluation.chunk_results import read_chunk
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.progress_counts import LedgerCounts
 from mjrec.evaluation.results_files import write_results
-from mjrec.evaluation.settling import settle_monitor
 from mjrec.evaluation.statistics import Bootstrap
 from mjrec.evaluation.summaries import summarize_results
-from mjrec.recorder.keep_rules import UNDECIDED
 from mjrec.rendering.recordings import remove_unfinished
 
 from .children import call
@@ -192,19 +188,12 @@ def _resume(directory: Path) -> _Work:
     return lambda: _monitor(env, directory, resume=True)
 
 
-def _settle(directory: Path) -> _Work:
-    with _monitor(gymnasium.make(TASK), directory) as monitor:
-        monitor.reset(seed=0)
-        monitor.step(monitor.action_space.sample())
-    return lambda: settle_monitor(directory, monitor.infix, {}, rule="best")
-
-
 def _monitor(env: Any, directory: Path, *, resume: bool | str = "join") -> Any:
     """Open a monitor, by itself as a worker of an evaluation does."""
     return mjrec.Monitor(
         env,
         directory,
-        keep=UNDECIDED,
+        video_callable=False,
         resume=resume,
         mode="evaluation",
         render="deferred",
@@ -218,15 +207,8 @@ def _recover(directory: Path) -> _Work:
     return lambda: recover(directory)
 
 
-def _read_ledgers(directory: Path) -> _Work:
-    return lambda: read_ledgers(directory)
-
-
-def _look_again(directory: Path) -> _Work:
-    # Not resting: what is asked is how long a look takes.
-    counts = LedgerCounts([directory], clock=itertools.repeat(0.0).__next__)
-    counts.look()
-    return counts.look
+def _read_journals(directory: Path) -> _Work:
+    return lambda: read_chunk(directory, TASK)
 
 
 def _remove_unfinished(directory: Path) -> _Work:
@@ -240,10 +222,8 @@ _OF_MONITORS: Mapping[str, _Prepare] = {
     _REPORTED: _report,
     "a monitor joins": _join,
     "a monitor resumes": _resume,
-    "a monitor is settled": _settle,
     "mjrec recover": _recover,
-    "ledgers read": _read_ledgers,
-    "ledgers looked at again": _look_again,
+    "journals read": _read_journals,
     "a video's leftovers removed": _remove_unfinished,
 }
 _REPORTED_EVALUATION = "mjrec report of an evaluation"

@@ -24,7 +24,7 @@ from typing import Any, Self
 
 MEMORY = 1 << 30
 # A machine may be busy with other things.
-SECONDS = 60
+SECONDS = 120
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,13 +4,8 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
-import threading
 from collections.abc import Iterator
-from pathlib import Path
-
-from waiting import wait_until
 
 
 @contextlib.contextmanager
@@ -23,20 +18,3 @@ def ctrl_c_soon() -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, earlier)
-
-
-@contextlib.contextmanager
-def ctrl_c_once_there_is(path: Path) -> Iterator[None]:
-    """Raise KeyboardInterrupt once there is a file, which is then removed."""
-
-    def interrupt() -> None:
-        wait_until(path.exists)
-        path.unlink()
-        os.kill(os.getpid(), signal.SIGINT)
-
-    thread = threading.Thread(target=interrupt)
-    thread.start()
-    try:
-        yield
-    finally:
-        thread.join()

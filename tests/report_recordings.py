@@ -13,7 +13,6 @@ import mjrec
 from mjrec.evaluation.dataclass_json import to_json
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.result_columns import ResultVideo
 from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.results_files import ChosenEpisode, write_results
 from mjrec.evaluation.statistics import Bootstrap
@@ -133,9 +132,8 @@ def write_evaluation(
 
     def files(result: EpisodeResult) -> EpisodeFiles:
         first = result.unit == units[0] and result.task in shown
-        return EpisodeFiles(
-            video=ResultVideo(shown[result.task], None) if first else None
-        )
+        folder = result.task.replace("/", "-")
+        return EpisodeFiles(folder, video=shown[result.task] if first else None)
 
     write_results(
         directory,

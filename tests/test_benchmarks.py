@@ -26,15 +26,10 @@ from benchmarks import (
     verifying,
 )
 from benchmarks.children import ChildFailed, call
-from benchmarks.many_monitors import TASK, write_evaluation, write_monitors
 from benchmarks.results import Reference, Result, at_least, at_most
 from benchmarks.rounds import take_turns
 from benchmarks.tables import table_of
 from rich.console import Console
-
-import mjrec
-from mjrec.evaluation.ledger import read_ledgers
-from mjrec.evaluation.results_files import read_results
 
 ROOT = Path(__file__).parents[1]
 TINY = (16, 16)
@@ -195,31 +190,6 @@ def test_each_measurement_gives_its_numbers(
     assert given in (None, len(variants), variants)
     assert all(r.median > 0 for r in results if r.samples)
     assert promises <= {str(r.promise) for r in results if r.promise}
-
-
-# --- the files that are measured ------------------------------------------------------
-
-
-def test_written_monitors_are_as_recorded_ones(tmp_path: Path) -> None:
-    """All readers find the same episodes, and nothing is to be put in order."""
-    write_monitors(tmp_path / "task", monitors=3, episodes=2)
-    results = mjrec.load_results(tmp_path / "task")
-    assert results is not None
-    assert len(results["manifests"]) == 3
-    assert results["env_info"]["env_id"] == TASK
-    assert results["episode_lengths"] == [1000] * 6
-    listed = mjrec.iter_episodes(tmp_path / "task")
-    assert [episode.episode_id for episode in listed] == [*range(6)]
-    assert len(read_ledgers(tmp_path / "task")) == 6
-    assert not mjrec.recover(tmp_path / "task")
-
-
-def test_written_evaluation_can_be_read(tmp_path: Path) -> None:
-    """Its tables have the episodes of all monitors."""
-    write_evaluation(tmp_path / "e", tasks=2, monitors=3, episodes=2)
-    read = read_results(tmp_path / "e", needs_timing=True)
-    assert [len(columns) for columns in read.columns.values()] == [6, 6]
-    assert all(columns.has_trajectory.any() for columns in read.columns.values())
 
 
 # --- the command ---------------------------------------------------------------------

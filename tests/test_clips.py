@@ -8,7 +8,6 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from recordings import frames_of
@@ -119,46 +118,3 @@ def test_a_clip_that_runs_at_close_is_kept_and_marked(tmp_path: Path) -> None:
     metadata = metadata_of_one(tmp_path)
     assert (metadata["complete"], metadata["reason"]) == (False, "close")
     assert metadata["length"] == 3
-
-
-@pytest.mark.parametrize("render", [None, "live"])
-def test_mujoco_clips_are_rendered_later(render: str | None, tmp_path: Path) -> None:
-    """Unless asked for live; the metadata says which it was."""
-    made = gymnasium.make("InvertedPendulum-v5", render_mode="rgb_array", width=64)
-    with mjrec.Monitor(
-        made, tmp_path, render=render, video_length=3, **begins((1,))
-    ) as env:
-        env.reset(seed=0)
-        for _ in range(5):
-            env.step(np.zeros(1, np.float32))
-    metadata = metadata_of_one(tmp_path)
-    assert metadata["recording"] == (render or "deferred")
-    assert metadata["frame_count"] == 4
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
-    [
-        ({"step_trigger": 5}, "InvalidArgument", "step_trigger must be a function"),
-        ({"step_trigger": lambda: True}, "InvalidArgument", "called with one argument"),
-        ({"keep": lambda a, b: [0]}, "InvalidArgument", "called with one argument"),
-        (
-            {"step_trigger": bool, "video_callable": bool},
-            *("InvalidArgument", "one of them"),
-        ),
-        ({"video_length": 0}, "InvalidArgument", "positive whole number"),
-        ({"video_length": True}, "InvalidArgument", "positive whole number"),
-        ({"video_length": 3, "render": "off"}, "InvalidArgument", 'render="off"'),
-        (
-            {"step_trigger": bool, "render": "deferred"},
-            *("PicturesDiffer", 'render="live"'),
-        ),
-    ],
-)
-def test_impossible_options_are_refused_before_anything_is_made(
-    options: dict[str, Any], error: str, words: str, tmp_path: Path
-) -> None:
-    """One error with the way out, and no directory."""
-    with pytest.raises(getattr(mjrec, error), match=words):
-        mjrec.Monitor(Counting(3), tmp_path / "run", **options)
-    assert not (tmp_path / "run").exists()

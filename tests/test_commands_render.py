@@ -128,6 +128,8 @@ def test_another_view_is_a_new_file_beside_the_original(
     assert status == 0
     assert f"{name}.mp4: 3 frames" in out
     after = content_of(tmp_path)
+    said = json.loads(after[f"{name}.meta.json"])
+    assert (said["camera"], said["quality"]) == ("top view", "draft")
     assert {key: after[key] for key in before} == before
     assert set(after) - set(before) == {
         f"{name}.{end}" for end in ("mp4", "framehash", "meta.json")
@@ -180,19 +182,14 @@ def test_out_names_the_file(
         (["--pending", "--camera", "side"], "--pending"),
         (["--size", "64"], "WIDTHxHEIGHT"),
         (["--size", "0x64"], "width"),
-        (["--max-fps", "0"], "fps"),
         (["--fps", "-1"], "fps"),
-        (["--workers", "0"], "workers"),
         (["--out", "x.mp4"], "several episodes"),
-        (["--out", f"{VIDEO}.mp4", "--episode", "0"], "name of a recorded video"),
         (["--out", f"{VIDEO}.mkv", "--episode", "0"], "name of a recorded video"),
         (["--out", "x.txt", "--episode", "0"], "ends in"),
         (["--out", "/no/such/directory/x.mp4", "--episode", "0"], "/no/such/directory"),
         (["--address", "auto"], "--engine ray"),
         (["--engine-option", "partition=gpu"], "--engine slurm"),
         (["--engine", "local", "--engine-option", "partition"], "KEY=VALUE"),
-        (["--engine", "local", "--workers", "0"], "workers"),
-        (["--episode", "4"], "It has those of 0, 1."),
     ],
 )
 def test_what_cannot_be_is_one_clear_error(

@@ -161,7 +161,6 @@ def test_pictures_are_those_that_were_drawn_live(
 @parametrize(
     ("make", "annotate"),
     [(reacher, False), (growing, False), (reacher, True), (growing, True)],
-    default=2,
 )
 def test_resets_that_change_or_compile_the_model_are_seen(
     make: Any, annotate: bool, tmp_path: Path

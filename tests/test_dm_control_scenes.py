@@ -69,23 +69,6 @@ def test_what_physics_cannot_draw_is_shown_as_it_is_live(tmp_path: Path) -> None
         assert (scene["fresh"], scene["max_geom"]) == (False, 10000)
 
 
-def test_free_camera_moves_with_the_model(tmp_path: Path) -> None:
-    """physics.render() places it anew for every picture."""
-    env = load()
-    scenes = dm_control_scenes(env)
-    assert scenes.states is not None
-    scenes.states.open(tmp_path)
-    env.reset()
-    kind = scenes.states.begin_episode().snapshot
-    assert kind is not None
-    row = np.empty(kind.itemsize // 8, np.uint64)
-    env.physics.model.vis.global_.azimuth += 30
-    changed = scenes.states.capture_snapshot(row)
-    assert changed is not None
-    assert changed["camera.azimuth"] == 120
-    scenes.states.close()
-
-
 def test_camera_is_checked_at_once() -> None:
     """Not at the first picture."""
     with pytest.raises(UnknownName, match="side"):

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import hashlib
 import json
 import math
 import os
@@ -12,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,22 +28,21 @@ from mjrec import (
     DifferentEvaluation,
     DirectoryInUse,
     InvalidArgument,
-    PicturesDiffer,
     PolicyError,
     UnknownName,
 )
-from mjrec.evaluation import evaluating
 from mjrec.evaluation.evaluating import evaluate
 from mjrec.evaluation.evaluation import Evaluation, EvaluationProgress
-from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
+from mjrec.evaluation.plan import EvaluationPlan
+from mjrec.evaluation.planning import chunks_of
 from mjrec.evaluation.results_files import read_results
-from mjrec.evaluation.splitting import batches_of
 from mjrec.evaluation.worker import EvaluationWorker
 from mjrec.formats.locks import try_lock
 from mjrec.formats.video_metadata import metadata_path
 
 PENDULUM = "InvertedPendulum-v5"
 DOUBLE = "InvertedDoublePendulum-v5"
+SIXTEEN: dict[str, Any] = {"seeds": [5], "num_seeds": None, "episodes": 16}
 
 
 def run(directory: Path, **options: Any) -> Evaluation:
@@ -68,9 +69,9 @@ def contents(directory: Path) -> dict[str, bytes]:
 
 
 def begun(directory: Path) -> int:
-    """Return how many episodes were begun in all, by the ledgers."""
-    ledgers = directory.glob("*/mjrec.evaluation.*.jsonl")
-    return sum(path.read_text().count('{"begun"') for path in ledgers)
+    """Return how many episodes were begun in all, by the journals."""
+    journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
+    return sum(path.read_text().count('{"begun"') for path in journals)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,7 @@ def test_every_episode_of_every_task_and_seed_is_there(reference: Path) -> None:
         for episode in (0, 1)
     ]
     assert all(each.failure is None and each.length <= 5 for each in results)
-    assert len(list(reference.glob("*/*.h5"))) == 8
+    assert len(list(reference.glob("*/*/*.h5"))) == 8
     assert begun(reference) == 8
 
 
@@ -121,34 +122,6 @@ def test_what_takes_long_begins_first(reference: Path) -> None:
     assert begun_at[DOUBLE] < begun_at[PENDULUM]
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("engine", [None, "local"])
-def test_workers_are_given_an_opengl_backend_that_works(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str | None
-) -> None:
-    """Where nobody has chosen one, for tasks that are drawn while they run.
-
-    Those of an engine choose for themselves, because they may be on other machines.
-    """
-    monkeypatch.delenv("MUJOCO_GL")
-
-    def push(_: Any) -> Any:
-        assert os.environ["MUJOCO_GL"] in ("egl", "osmesa")
-        return np.zeros(1)
-
-    if engine is not None:
-        monkeypatch.setattr(evaluating, "choose", lambda: 1 / 0)
-    evaluation = run(
-        tmp_path / "e",
-        policy=push,
-        keep="best",
-        episodes=1,
-        num_seeds=1,
-        engine=engine,
-    )
-    assert [each.failure for each in evaluation.results] == [None]
-
-
 def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
     """By rule, for each task; table, metadata and report of it agree."""
     evaluation = run(tmp_path / "e", keep="best,worst")
@@ -159,34 +132,33 @@ def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
     assert (best.role, worst.role) == ("best", "worst")
     assert best.seed * 2 + best.episode == returns.index(max(returns))
     assert worst.seed * 2 + worst.episode == returns.index(min(returns))
-    assert {path.name for path in evaluation.videos} == {
-        video.name for video in columns.videos.values()
-    }
     assert evaluation.pending == {}
-    for index, video in columns.videos.items():
-        path = read.folder(PENDULUM) / video.name
-        assert path.stat().st_size > 0
-        assert video.sha256 is not None
-        assert video.sha256 in metadata_path(path).read_text()
-        assert columns.video_prefix(index) == path.stem
+    assert {*evaluation.videos} == {
+        tmp_path / "e" / str(columns.video_path(index)) for index in columns.videos
+    }
+    for path in evaluation.videos:
+        said = json.loads(metadata_path(path).read_text())["selection"]
+        assert (said["rule"], said["scope"]) == ("best,worst", "evaluation")
+        assert (
+            hashlib.sha256(path.read_bytes()).hexdigest()
+            in metadata_path(path).read_text()
+        )
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("engine", ["local", mjrec.LocalEngine(2)])
-def test_an_engine_changes_nothing(tmp_path: Path, engine: Any) -> None:
-    """Results, trajectories and videos are those of a call without one."""
+# Takes more than five seconds: two evaluations with videos.
+@parametrize("engine", ["local", mjrec.LocalEngine(5)])
+def test_workers_and_engines_change_nothing(tmp_path: Path, engine: Any) -> None:
+    """Results, trajectories and videos are those of one worker."""
     options: dict[str, Any] = {"tasks": [PENDULUM, DOUBLE], "keep": "best,worst"}
     workers = 2 if engine == "local" else None
     there = run(tmp_path / "there", **options, engine=engine, workers=workers)
-    here = run(tmp_path / "here", **options)
+    here = run(tmp_path / "here", **options, workers=1)
     assert contents(there.directory) == contents(here.directory)
     assert there.pending == here.pending == {}
     assert recorded_in(there) == recorded_in(here)
     assert len(recorded_in(there)) == 8 + 4
-    for folder in there.directory.glob("*-v5"):
-        assert {path.name for path in folder.glob("*.mp4")} == {
-            video for video, _ in manifest_videos(folder)
-        }
+    listed = {video for folder in folders_of(there) for video in listed_in(folder)}
+    assert listed == {path.name for path in there.videos}
 
 
 class Wandering(Executor):
@@ -230,9 +202,13 @@ def test_machines_with_other_homes_draw_what_others_recorded(tmp_path: Path) -> 
         assert mjrec.load_trajectory(path).model().nv == 8
 
 
-def manifest_videos(folder: Path) -> list[list[str]]:
+def folders_of(evaluation: Evaluation) -> list[Path]:
+    return [path for path in evaluation.directory.glob("*/*") if path.is_dir()]
+
+
+def listed_in(folder: Path) -> list[str]:
     manifests = map(json.loads, map(Path.read_text, folder.glob("*.manifest.json")))
-    return [pair for manifest in manifests for pair in manifest["videos"]]
+    return [video for manifest in manifests for video, _ in manifest["videos"]]
 
 
 @pytest.mark.thorough
@@ -259,39 +235,10 @@ def videos_in(evaluation: Evaluation) -> dict[str, bytes]:
     """Return the videos by episode."""
     with (evaluation.directory / "timing.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    (folder,) = (path for path in evaluation.directory.iterdir() if path.is_dir())
-    return {row["episode"]: (folder / row["video"]).read_bytes() for row in rows}
-
-
-def test_what_is_drawn_live_has_an_environment_for_each_episode() -> None:
-    """Its pictures may depend on those before, and nobody can make them forget."""
-    tasks = (EvaluatedTask("live", "a"), EvaluatedTask("later", "b"))
-    plan = EvaluationPlan(tasks=tasks, policy="zero", seeds=(0,), episodes=16)
-    batches = batches_of(plan, {}, workers=2, alone={"live"})
-    sizes = [(batch.task, len(batch.episodes)) for batch in batches]
-    assert sizes == [("live", 1)] * 16 + [("later", 4)] * 4
-
-
-@pytest.mark.thorough
-def test_an_engine_draws_while_other_tasks_run(tmp_path: Path) -> None:
-    """A task's videos come as soon as its episodes are over."""
-    told: list[EvaluationProgress] = []
-    # What takes long begins first, and one worker does one job after the other.
-    options: dict[str, Any] = {"tasks": [PENDULUM, DOUBLE], "workers": None}
-    evaluation = run(
-        tmp_path / "e",
-        **options,
-        keep="all",
-        num_seeds=3,
-        engine=mjrec.LocalEngine(1),
-        on_progress=told.append,
-    )
-    assert len(evaluation.videos) == 12
-    assert (told[-1].videos_done, told[-1].videos) == (12, 12)
-    assert [each.videos_done for each in told] == sorted(
-        each.videos_done for each in told
-    )
-    assert any(0 < each.videos < 12 for each in told)
+    videos = {
+        r["episode"]: evaluation.directory / r["folder"] / r["video"] for r in rows
+    }
+    return {episode: path.read_bytes() for episode, path in videos.items()}
 
 
 @pytest.mark.thorough
@@ -307,7 +254,7 @@ def test_results_are_there_before_an_engine_has_drawn(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "e", **options, on_progress=interrupt)
     before = contents(tmp_path / "e")
-    drawn = list(tmp_path.glob("e/*/*.mp4"))
+    drawn = list(tmp_path.glob("e/*/*/*.mp4"))
     assert 1 <= len(drawn) < 4
     stamps = [path.stat().st_mtime_ns for path in drawn]
     evaluation = run(tmp_path / "e", **options, resume=True)
@@ -352,8 +299,11 @@ def test_without_opengl_videos_stay_pending(
     assert evaluation.videos == []
     (path,) = evaluation.pending
     assert f"mjrec render {path.parent}" in caplog.text
+    if engine is None:
+        # Before the first episode.
+        assert "No video can be drawn here" in caplog.messages[0]
     columns = read_results(tmp_path / "e").columns[PENDULUM]
-    assert [(v.name, v.sha256) for v in columns.videos.values()] == [(path.name, None)]
+    assert [*columns.videos.values()] == [path.name]
     monkeypatch.undo()
     # Whoever goes on draws what is left.
     again = run(tmp_path / "e", keep="best", resume=True, engine=engine)
@@ -419,17 +369,6 @@ def test_a_faulty_policy_fails_its_episodes_only(
     assert all(reason in str(each.failure).lower() for each in failed)
 
 
-@pytest.mark.thorough
-def test_a_policy_that_always_raises_leaves_results(tmp_path: Path) -> None:
-    """They say so; there is no mean."""
-    evaluation = run(tmp_path / "e", policy=local(raising), keep="best,failures:1")
-    assert all("out of ideas" in str(each.failure) for each in evaluation.results)
-    assert evaluation.summary(PENDULUM).mean is None
-    assert [each.failure for each in read_results(tmp_path / "e")] == [
-        each.failure for each in evaluation.results
-    ]
-
-
 class DiesOnce:
     """Kills its worker, the first time that anybody builds it twice."""
 
@@ -447,13 +386,32 @@ class DiesOnce:
         return np.zeros(self.shape)
 
 
-class DiesAlways(DiesOnce):
+class DiesAlways:
+    """Kills its worker in episode 3 of seed 5."""
+
+    def __init__(self, env: Any) -> None:
+        self.shape = env.action_space.shape
+        self.seed = 0
+
+    def reset(self, seed: int) -> None:
+        self.seed = seed
+
     def __call__(self, observation: Any) -> Any:
+        if self.seed == 580206707:
+            self.end()
+        return np.zeros(self.shape)
+
+    def end(self) -> None:
         import os
 
-        if observation[0] > 0:
-            os.kill(os.getpid(), 9)
-        return np.zeros(self.shape)
+        os.kill(os.getpid(), 9)
+
+
+class Hangs(DiesAlways):
+    def end(self) -> None:
+        import time
+
+        time.sleep(1000)
 
 
 @pytest.mark.thorough
@@ -470,14 +428,26 @@ def test_a_worker_that_dies_once_costs_nothing(
     assert len(died.videos) == len(lived.videos) == 1
 
 
-def test_an_episode_that_kills_its_workers_has_failed(tmp_path: Path) -> None:
-    """The rest is there, and the reason is told."""
-    evaluation = run(
-        tmp_path / "e", policy=local(DiesAlways), episodes=2, num_seeds=1, workers=1
-    )
-    assert evaluation.failed
-    assert any(each.failure is None for each in evaluation.results)
-    assert all("died" in str(each.failure) for each in evaluation.failed)
+# Takes more than five seconds: three workers die, one after the other.
+@parametrize("workers", [1, 2])
+@pytest.mark.parametrize("protocol", ["seeded", "suite"])
+def test_an_episode_that_kills_its_workers_fails_alone(
+    tmp_path: Path, workers: int, protocol: str
+) -> None:
+    """With any number of workers; the others of its chunk are completed."""
+    options: dict[str, Any] = {"policy": local(DiesAlways), "protocol": protocol}
+    evaluation = run(tmp_path / "e", **options, **SIXTEEN, workers=workers)
+    assert [(each.unit, each.failure) for each in evaluation.failed] == [
+        ((5, 3), "3 processes died in it")
+    ]
+    assert {each.unit for each in evaluation.results} == {(5, n) for n in range(16)}
+
+
+def test_an_episode_that_hangs_fails_after_its_time(tmp_path: Path) -> None:
+    """The others are completed."""
+    evaluation = run(tmp_path / "e", policy=local(Hangs), **SIXTEEN, episode_timeout=2)
+    [failed] = evaluation.failed
+    assert (failed.unit, failed.failure) == ((5, 3), "it took longer than 2 seconds")
 
 
 SCRIPT = """
@@ -514,8 +484,8 @@ def slow_run(place: Path, name: str, *arguments: str) -> subprocess.Popen[bytes]
 
 
 def ended(directory: Path) -> int:
-    ledgers = directory.glob("*/mjrec.evaluation.*.jsonl")
-    return sum(path.read_bytes().count(b'{"ended"') for path in ledgers)
+    journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
+    return sum(path.read_bytes().count(b'"evaluation": {') for path in journals)
 
 
 @pytest.fixture(scope="module")
@@ -562,7 +532,7 @@ def test_a_killed_evaluation_goes_on_where_it_was(
     # Each once; those that the two workers were at, once more.
     assert 24 <= begun(killed) <= 26
     assert ended(killed) == 24
-    assert len(list(killed.glob("*/*.mp4"))) == 2
+    assert len(list(killed.glob("*/*/*.mp4"))) == 2
 
 
 @pytest.mark.thorough
@@ -607,6 +577,7 @@ def test_nothing_is_run_when_all_is_done(reference: Path, tmp_path: Path) -> Non
         ({"policy": "zero"}, "policy was 'random' and is now 'zero'"),
         ({"max_steps": 6}, "max_steps was 5"),
         ({"episodes": 1}, "episodes was 2 and is now 1"),
+        ({"num_seeds": 1}, r"seeds was \(0, 1\) and is now \(0,\)"),
         ({"keep": "all"}, "keep was 'none'"),
         ({"protocol": "suite"}, "protocol"),
         ({"env_kwargs": {"reset_noise_scale": 0.1}}, "env_kwargs"),
@@ -710,11 +681,10 @@ gymnasium.register("FlatWorld-v0", FlatWorld)
 """
 
 
-@pytest.mark.thorough
-def test_pictures_that_are_live_cannot_be_chosen_by_returns(
+def test_of_what_is_drawn_live_all_is_recorded_and_the_losers_deleted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is known beforehand can, and is drawn while it runs."""
+    """By the rule, as of what is drawn later; each in an environment of its own."""
     (tmp_path / "flat_world.py").write_text(FLAT_WORLD)
     monkeypatch.chdir(tmp_path)
     live: dict[str, Any] = {
@@ -722,14 +692,160 @@ def test_pictures_that_are_live_cannot_be_chosen_by_returns(
         "height": None,
         "width": None,
         "num_seeds": 1,
+        "episodes": 4,
+        "keep": "best,worst",
     }
-    with pytest.raises(PicturesDiffer, match="keep='cubic'"):
-        run(tmp_path / "e", **live, keep="best")
-    assert not (tmp_path / "e").exists()
-    evaluation = run(tmp_path / "e", **live, keep="all")
-    assert evaluation.pending == {}
-    assert len(evaluation.videos) == 2
-    assert evaluation.plan.tasks[0].folder == "flat_world%3AFlatWorld-v0"
+    one = run(tmp_path / "one", **live, workers=1)
+    assert one.pending == {}
+    assert len(one.videos) == 2
+    assert {*(tmp_path / "one").rglob("*.mp4")} == {*one.videos}
+    listed = {video for folder in folders_of(one) for video in listed_in(folder)}
+    assert listed == {path.name for path in one.videos}
+    two = run(tmp_path / "two", **live)
+    assert [p.read_bytes() for p in two.videos] == [p.read_bytes() for p in one.videos]
+    assert one.plan.tasks[0].folder == "flat_world%3AFlatWorld-v0"
+
+
+def test_newly_chosen_videos_are_drawn_from_their_trajectories(tmp_path: Path) -> None:
+    """After more seeds were asked for; those of before stay."""
+    options: dict[str, Any] = {"keep": "median", "tasks": [DOUBLE], "episodes": 1}
+    before = run(tmp_path / "e", **options, num_seeds=2)
+    [first] = before.videos
+    stamps = {path: path.stat().st_mtime_ns for path in before.directory.rglob("*.mp4")}
+    for count in range(3, 9):
+        after = run(tmp_path / "e", **options, num_seeds=count, resume=True)
+        if after.videos != [first]:
+            break
+    assert after.pending == {}
+    [newly] = after.videos
+    assert newly != first
+    assert all(path.stat().st_mtime_ns == stamps[path] for path in stamps)
+    assert any(newly.name in listed_in(folder) for folder in folders_of(after))
+
+
+class Weighted:
+    """A policy with a weight."""
+
+    def __init__(self, weight: float) -> None:
+        self.weight = weight
+
+    def __call__(self, observation: Any) -> Any:
+        return np.full(1, self.weight)
+
+
+def test_another_policy_is_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other weights, other code of a module, another file that an argument names."""
+    place = tmp_path / "e"
+    run(place, policy=Weighted(0.0), seeds=[0], num_seeds=None)
+    options: dict[str, Any] = {"seeds": [0, 1], "num_seeds": None, "resume": True}
+    with pytest.raises(DifferentEvaluation, match=r"policy \(its content\) was '\w+"):
+        run(place, policy=Weighted(0.9), **options)
+    assert len(run(place, policy=Weighted(0.0), **options).results) == 4
+    monkeypatch.chdir(tmp_path)
+    module, weights = tmp_path / "own_policy.py", tmp_path / "weights.bin"
+    module.write_text("def make(env, weights):\n    return lambda o: [0.0]\n")
+    weights.write_bytes(b"1")
+    named: dict[str, Any] = {
+        "policy": "own_policy:make()",
+        "policy_kwargs": {"weights": str(weights)},
+    }
+    run(tmp_path / "named", **named)
+    module.write_text("def make(env, weights):\n    return lambda o: [1.0]\n")
+    weights.write_bytes(b"2")
+    with pytest.raises(
+        DifferentEvaluation, match=r"\(its code\).*its argument weights\)"
+    ):
+        run(tmp_path / "named", **named, resume=True)
+
+
+def test_going_on_needs_nothing_but_the_directory(
+    reference: Path, tmp_path: Path
+) -> None:
+    """The plan says the rest; what is to be more is given."""
+    run(tmp_path / "e", num_seeds=1)
+    same = evaluate(directory=tmp_path / "e", resume=True, workers=1)
+    assert [each.unit for each in same.results] == [(0, 0), (0, 1)]
+    evaluate(
+        [PENDULUM, DOUBLE],
+        directory=tmp_path / "e",
+        resume=True,
+        num_seeds=2,
+        workers=1,
+    )
+    assert contents(tmp_path / "e") == contents(reference)
+
+
+def test_force_deletes_the_evaluation_that_is_there(tmp_path: Path) -> None:
+    """And nothing else."""
+    run(tmp_path / "e", tasks=[PENDULUM, DOUBLE])
+    (tmp_path / "e" / DOUBLE / "notes.txt").touch()
+    run(tmp_path / "e", force=True, num_seeds=1)
+    assert {path.name for path in (tmp_path / "e" / DOUBLE).iterdir()} == {"notes.txt"}
+    assert len(list(read_results(tmp_path / "e"))) == 2
+
+
+class Counted:
+    """Writes down each time that it is built."""
+
+    def __init__(self, env: Any, place: str) -> None:
+        self.shape = env.action_space.shape
+        (Path(place) / f"{os.getpid()}-{random.random()}").touch()
+
+    def __call__(self, observation: Any) -> Any:
+        return np.zeros(self.shape)
+
+
+def test_a_policy_is_built_once_for_each_worker_and_task(tmp_path: Path) -> None:
+    """Whatever the number of chunks."""
+    (tmp_path / "built").mkdir()
+    counted: dict[str, Any] = {"policy": Counted, "num_seeds": 8}
+    run(
+        tmp_path / "e",
+        **counted,
+        policy_kwargs={"place": str(tmp_path / "built")},
+        workers=1,
+    )
+    assert len(list((tmp_path / "built").iterdir())) == 1
+
+
+@pytest.mark.dm_control
+def test_a_time_limit_of_the_environment_is_part_of_its_scale(tmp_path: Path) -> None:
+    """A task of 40 steps has returns from 0 to 40."""
+    pytest.importorskip("dm_control")
+    kwargs = {"task_kwargs": {"time_limit": 1}}
+    options: dict[str, Any] = {"num_seeds": 1, "env_kwargs": kwargs, "max_steps": None}
+    evaluation = run(tmp_path / "e", tasks=["dm_control/walker-walk"], **options)
+    assert [each.score_range for each in evaluation.summaries] == [(0.0, 40.0)]
+    assert {each.length for each in evaluation.results} == {40}
+
+
+@pytest.mark.parametrize(
+    ("seeds", "episodes", "protocol", "names"),
+    [
+        (range(100), 2, "seeded", ["seed-000-011", "seed-096-099"]),
+        ([3], 1, "seeded", ["seed-003", "seed-003"]),
+        ([1], 16, "seeded", ["seed-001-episode-000-001", "seed-001-episode-014-015"]),
+        ([1], 60, "suite", ["seed-001", "seed-001"]),
+    ],
+)
+def test_chunks_follow_from_the_plan(
+    seeds: Any, episodes: int, protocol: Any, names: list[str]
+) -> None:
+    """Consecutive seeds, or a part of one, each episode once; they grow by new ones."""
+    plan = EvaluationPlan(
+        tasks=(), policy="x", seeds=tuple(seeds), episodes=episodes, protocol=protocol
+    )
+    chunks = chunks_of(plan, ())
+    assert [chunks[0].folder, chunks[-1].folder] == names
+    assert sorted(unit for chunk in chunks for unit in chunk) == sorted(plan)
+    assert max(map(len, chunks)) <= (25 if protocol == "seeded" else 60)
+    more = replace(plan, seeds=(*plan.seeds, 1000), episodes=episodes + 2)
+    grown = chunks_of(more, chunks)
+    assert grown[: len(chunks)] == chunks
+    assert sorted(unit for chunk in grown for unit in chunk) == sorted(more)
+    assert len({chunk.folder for chunk in grown}) == len(grown)
 
 
 @pytest.mark.thorough

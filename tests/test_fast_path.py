@@ -76,10 +76,11 @@ def begin(monitor: Any) -> None:
 
 
 def recorded(
-    env: Any, directory: Path, count: int = 8, *, camera: Any = None, **steps: Any
+    *given: Any, camera: Any = None, max_fps: Any = None, **steps: Any
 ) -> mjrec.Trajectory:
     """Record the first steps of an episode and return its trajectory."""
-    with monitored(env, directory, camera=camera) as monitor:
+    env, directory, count = (*given, 8)[:3]
+    with monitored(env, directory, camera=camera, max_fps=max_fps) as monitor:
         begin(monitor)
         go(monitor, count, **steps)
     [trajectory] = trajectories(directory)
@@ -104,14 +105,28 @@ def cheetah() -> Iterator[Any]:
 # --- what is recorded ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", [HOPPER, PENDULUM])
-def test_usual_steps_are_recorded_as_others_are(env_id: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("env_id", "max_fps", "frames"),
+    [
+        (HOPPER, None, [0, 1, 2, 3, 4, 5]),
+        # At most 10 of 25 steps a second are every third one, and the last of all.
+        (PENDULUM, 10, [0, 3, 5]),
+    ],
+)
+def test_usual_steps_are_recorded_as_others_are(
+    env_id: str, max_fps: Any, frames: list[int], tmp_path: Path
+) -> None:
     """States, actions, rewards, ends and frames are the same, bit for bit."""
-    usual = recorded(make(env_id, max_episode_steps=5), tmp_path / "usual", 5)
-    env = make(env_id, max_episode_steps=5)
-    other = recorded(env, tmp_path / "other", 5, usual=False)
+    usual, other = (
+        recorded(
+            *(make(env_id, max_episode_steps=5), tmp_path / str(is_usual), 5),
+            usual=is_usual,
+            max_fps=max_fps,
+        )
+        for is_usual in (True, False)
+    )
     assert len(usual) == 5
-    assert usual.frame_steps.tolist() == list(range(6))
+    assert usual.frame_steps.tolist() == frames
     assert_same(usual, other)
 
 
@@ -142,20 +157,6 @@ def test_steps_are_usual_from_the_second_one_on(
                 go(monitor, 1)
             assert not is_fast(monitor)
     assert seen == 2 * [False, *7 * [True]]
-
-
-def test_frames_keep_to_the_rate(tmp_path: Path) -> None:
-    """At most 8 of 20 steps a second are every third one, and the last of all."""
-    env = make(max_episode_steps=10)
-    with monitored(env, tmp_path / "few", max_fps=8) as monitor:
-        begin(monitor)
-        go(monitor, 10)
-    [few] = trajectories(tmp_path / "few")
-    assert few.frame_steps.tolist() == [0, 3, 6, 9, 10]
-    all_of_them = recorded(make(max_episode_steps=10), tmp_path / "all", 10)
-    np.testing.assert_array_equal(few.states, all_of_them.states)
-    for name, values in all_of_them.snapshots.items():
-        np.testing.assert_array_equal(few.snapshots[name], values[few.frame_steps])
 
 
 # --- statistics ----------------------------------------------------------------------
@@ -253,24 +254,6 @@ def test_a_changed_model_is_noticed_at_the_very_step(
     alphas = [trajectory.model(step).geom_rgba[1, 3] for step in (3, 4, 6, 7, 8)]
     assert alphas == pytest.approx([1, 0.4, 0.4, 0.7, 0.7])
     assert trajectory.frame_steps.tolist() == list(range(9))
-
-
-def test_another_camera_is_noticed_at_the_very_step(
-    cheetah: Any, tmp_path: Path
-) -> None:
-    """The environment's renderer may be pointed elsewhere in mid-episode."""
-
-    def turn(number: int, monitor: Any) -> None:
-        if number == 4:
-            assert is_fast(monitor)
-            renderer = cheetah.unwrapped.mujoco_renderer
-            # Gymnasium 1.0 begins with the tracking one.
-            renderer.camera_id = 0 if renderer.camera_id == -1 else -1
-
-    recorded(cheetah, tmp_path, before=turn)
-    [(step, fields)] = changes_in(tmp_path).items()
-    assert step == 4
-    assert "camera.fixedcamid" in fields
 
 
 @pytest.mark.parametrize("is_own", [True, False])
@@ -423,12 +406,6 @@ def test_steps_after_the_close_go_to_the_environment(
     assert monitor.get_total_steps() == 4
     [trajectory] = trajectories(tmp_path)
     assert len(trajectory) == 4
-
-
-# --- with others ---------------------------------------------------------------------
-
-
-# --- faults --------------------------------------------------------------------------
 
 
 def test_a_monitor_may_be_closed_within_a_step(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -103,25 +103,3 @@ def test_the_free_camera_follows_the_model(tmp_path: Path) -> None:
     changed = changes_in(tmp_path)
     assert list(changed) == [4, 6]
     assert all("camera.azimuth" in fields for fields in changed.values())
-
-
-def test_time_steps_need_no_more_than_dm_envs_ends(tmp_path: Path) -> None:
-    """Of one's own kind they may have `first` and `last` and nothing else."""
-
-    class Bare(NamedTuple):
-        step_type: Any
-        reward: Any
-        discount: Any
-        observation: Any
-
-        def first(self) -> bool:
-            return bool(self.step_type == 0)
-
-        def last(self) -> bool:
-            return bool(self.step_type == 2)
-
-    env = load()
-    for name in ("reset", "step"):
-        method = getattr(env, name)
-        setattr(env, name, lambda *args, method=method: Bare(*method(*args)))
-    assert len(recorded(env, tmp_path)) == 8

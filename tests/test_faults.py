@@ -25,7 +25,7 @@ from recordings import (
 from waiting import wait_until
 
 import mjrec
-from mjrec import EncoderError, FileNotWritten, InvalidArgument, Monitor, RenderError
+from mjrec import EncoderError, FileNotWritten, Monitor, RenderError
 
 both_ways = pytest.mark.parametrize("on_error", ["raise", "warn"])
 
@@ -100,22 +100,6 @@ def faults_of(directory: Path) -> list[tuple[int | None, str]]:
     return [(fault["episode_id"], fault["what"]) for fault in found]
 
 
-@pytest.mark.parametrize("value", ["ignore", None, True])
-def test_on_error_is_one_of_two(value: Any, pendulum: Any) -> None:
-    """Nothing else, and the message says what there is."""
-    with pytest.raises(InvalidArgument, match='"raise", or "warn"'):
-        pendulum(on_error=value)
-
-
-def test_wrong_use_is_an_error_in_any_case(pendulum: Any, out: Path) -> None:
-    """A step before the first reset; a run without faults lists none."""
-    monitor = pendulum(render="off", on_error="warn")
-    with pytest.raises(mjrec.ResetNeeded):
-        monitor.step(0)
-    monitor.close()
-    assert faults_of(out) == []
-
-
 # --- live videos ---------------------------------------------------------------------
 
 
@@ -141,6 +125,21 @@ def test_a_schedule_that_raises_breaks_no_finished_video(
     assert [fault["reason"] for fault in details["faults"]] == ["no idea"]
 
 
+def test_a_trigger_that_raises_stops_no_simulation(pendulum: Any, out: Path) -> None:
+    """It is asked again at the next step."""
+
+    def trigger(steps: int) -> bool:
+        if steps == 2:
+            raise RuntimeError("no idea")
+        return steps == 4
+
+    options: dict[str, Any] = {"step_trigger": trigger, "video_length": 2}
+    with pendulum(None, on_error="warn", workers=1, **options) as monitor:
+        run(monitor)
+    assert [path.name[-14:] for path in out.glob("*.mp4")] == ["step000004.mp4"]
+    assert [f["reason"] for f in manifest_of(out)["mjrec"]["faults"]] == ["no idea"]
+
+
 def test_a_dead_encoder(
     pendulum: Any,
     out: Path,
@@ -151,7 +150,7 @@ def test_a_dead_encoder(
     monitor = pendulum(render="live")
     run(monitor, 4)
     assert kill_ffmpeg() == 1
-    with pytest.raises(EncoderError):
+    with pytest.raises(EncoderError, match="exit status: -9"):
         go_on(monitor, 4)
     monitor.close()
     monitor = pendulum(render="live", on_error="warn", force=True)
@@ -161,8 +160,11 @@ def test_a_dead_encoder(
     run(monitor)
     monitor.close()
     assert faults_of(out) == [(0, "video")]
-    assert metadata_of(out, 0)["broken"] is True
+    metadata, details = metadata_of(out, 0), manifest_of(out)
+    assert metadata["broken"] is True
+    assert "-9" in metadata["broken_reason"]
     assert len(frames_in(out, 1)) == 9
+    assert (len(details["videos"]), len(details["mjrec"]["broken"])) == (1, 1)
     assert stats_of(out)["episode_lengths"] == [8, 8]
     said = [r.levelno for r in caplog.records if "Not recorded whole" in r.message]
     assert said == [logging.WARNING]
@@ -254,7 +256,7 @@ def test_a_full_disk_while_an_episode_is_recorded(
 
 @both_ways
 def test_a_full_disk_at_the_journal(on_error: str, pendulum: Any, out: Path) -> None:
-    """The statistics come from memory at the close; the journal has whole lines."""
+    """What it lacks is written as soon as there is room again."""
     monitor = pendulum(render="off", trajectory_callable=False, on_error=on_error)
     run(monitor)
     [journal] = out.glob("*.jsonl")
@@ -264,12 +266,12 @@ def test_a_full_disk_at_the_journal(on_error: str, pendulum: Any, out: Path) -> 
     run(monitor)
     monitor.close()
     assert stats_of(out)["episode_lengths"] == [8, 8, 8]
-    assert [entry["episode_id"] for entry in journal_of(out)] == [0, 2]
+    assert [entry["episode_id"] for entry in journal_of(out)] == [0, 1, 2]
     assert on_error == "raise" or faults_of(out) == [(1, "journal")]
 
 
 def test_a_disk_without_any_room(pendulum: Any, out: Path) -> None:
-    """Nothing is pending of which nothing was written; results come later."""
+    """Nothing is pending of which nothing was written; results come later, and stay."""
     monitor = pendulum(workers=0, on_error="warn")
     with file_size_limit(0):
         run(monitor)
@@ -280,6 +282,9 @@ def test_a_disk_without_any_room(pendulum: Any, out: Path) -> None:
     assert (0, "trajectory") in faults_of(out)
     assert manifest_of(out)["mjrec"]["pending"] == []
     assert in_flight(out) == []
+    before = manifest_of(out)
+    mjrec.render_videos(out, workers=1)
+    assert manifest_of(out) == before
 
 
 # --- removed directories -------------------------------------------------------------

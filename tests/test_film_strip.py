@@ -70,13 +70,14 @@ def cells(strip: Any, rows: int, columns: int, size: tuple[int, int]) -> list[An
 def labels(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What is written under the pictures."""
     written: list[str] = []
-    original = module._written
+    labels_of = module._labels
 
-    def noting(label: str, letters: int, **options: Any) -> Any:
-        written.append(label)
-        return original(label, letters, **options)
+    def noting(seconds: Any) -> list[str]:
+        found = labels_of(seconds)
+        written.extend(found)
+        return found
 
-    monkeypatch.setattr(module, "_written", noting)
+    monkeypatch.setattr(module, "_labels", noting)
     return written
 
 

@@ -114,6 +114,7 @@ def test_a_grid_is_as_square_as_can_be() -> None:
         rows, columns = grid_shape(count)
         assert rows * columns >= count > (rows - 1) * columns
         assert rows <= columns <= rows + 1
+    assert [grid_shape(count) for count in (1, 4, 7)] == [(1, 1), (2, 2), (3, 3)]
     grid = grid_frame([plain(value) for value in (10, 20, 30)])
     assert grid[::2, ::3, 0].tolist() == [[10, 20], [30, 0]]
     assert (grid == grid[::2, ::3].repeat(2, axis=0).repeat(3, axis=1)).all()

@@ -101,26 +101,6 @@ def test_wrappers_that_draw_are_named(wrap: Any, name: str) -> None:
     assert obstacle.endswith(f"{name} overrides render()")
 
 
-def test_a_render_of_one_object_is_an_obstacle() -> None:
-    """On a wrapper, on the environment, and on its renderer."""
-    wrapped = PassesOn(make())
-    wrapped.render = lambda: None  # type: ignore[method-assign]  # what users do
-    assert "PassesOn overrides" in str(gymnasium_scenes(wrapped).obstacle)
-    env = make()
-    env.unwrapped.render = lambda: None
-    assert "InvertedPendulumEnv overrides" in str(gymnasium_scenes(env).obstacle)
-    env = make()
-    env.unwrapped.mujoco_renderer.render = lambda _: None
-    assert "is not Gymnasium's own" in str(gymnasium_scenes(env).obstacle)
-
-
-def test_an_environment_that_overrides_is_named() -> None:
-    """The class itself, not the one that it extends."""
-    env = DrawsMore(render_mode="rgb_array")
-    obstacle = gymnasium_scenes(env).obstacle
-    assert obstacle == f"the environment {__name__}.DrawsMore overrides render()"
-
-
 def test_a_patched_class_is_an_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
     """A function in the place of Gymnasium's, even if it copies all names."""
     original = MujocoEnv.render
@@ -140,12 +120,20 @@ def test_other_pictures_are_an_obstacle(mode: str) -> None:
     assert repr(mode) in str(gymnasium_scenes(env).obstacle)
 
 
-def test_a_foreign_renderer_is_an_obstacle() -> None:
-    """Also one that extends Gymnasium's."""
+def test_what_replaces_a_part_is_an_obstacle() -> None:
+    """A render of one object, a class that extends, a renderer, be it Gymnasium's."""
 
     class Renderer(MujocoRenderer):
         pass
 
+    wrapped = PassesOn(make())
+    wrapped.render = lambda: None  # type: ignore[method-assign]  # what users do
+    assert "PassesOn overrides" in str(gymnasium_scenes(wrapped).obstacle)
+    obstacle = gymnasium_scenes(DrawsMore(render_mode="rgb_array")).obstacle
+    assert obstacle == f"the environment {__name__}.DrawsMore overrides render()"
+    env = make()
+    env.unwrapped.mujoco_renderer.render = lambda _: None
+    assert "is not Gymnasium's own" in str(gymnasium_scenes(env).obstacle)
     env = make()
     old = env.unwrapped.mujoco_renderer
     env.unwrapped.mujoco_renderer = Renderer(old.model, old.data, None, 64, 48)
@@ -204,21 +192,6 @@ def test_random_state_is_told_and_not_made() -> None:
     assert again.random() == env.unwrapped.np_random.random()
 
 
-@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Pusher-v5", "Swimmer-v5"])
-def test_view_is_that_of_a_viewer_made_now(env_id: str) -> None:
-    """Camera, options, size and the number of geoms, without a viewer."""
-    env = make(env_id, max_geom=700, visual_options={0: True})
-    env.reset(seed=1)
-    view = scene_of(env)()
-    env.render()
-    viewer = env.unwrapped.mujoco_renderer.viewer
-    assert pose(view.camera) == pose(viewer.cam)
-    assert view.option.flags.tolist() == viewer.vopt.flags.tolist()
-    assert (view.height, view.width, view.fresh) == (48, 64, False)
-    assert view.max_geom == viewer.scn.maxgeom == 700
-    env.close()
-
-
 def test_camera_is_kept_from_the_first_picture_on() -> None:
     """As a viewer keeps its own, wherever the robot goes."""
     env = make("HalfCheetah-v5")
@@ -232,23 +205,6 @@ def test_camera_is_kept_from_the_first_picture_on() -> None:
     scene.at_picture(lambda: None)
     assert pose(scene().camera) == first
     assert pose(scene_of(env)().camera) != first
-
-
-def test_viewer_of_the_environment_counts_in_its_moment() -> None:
-    """What the user makes of it is in the next picture, in the same objects."""
-    env = make()
-    env.reset(seed=1)
-    scene = scene_of(env)
-    view = scene()
-    scene.at_picture(lambda: None)
-    env.render()
-    viewer = env.unwrapped.mujoco_renderer.viewer
-    viewer.cam.azimuth, viewer.cam.lookat[0] = 33, 5
-    viewer.vopt.label = int(mujoco.mjtLabel.mjLABEL_BODY)
-    scene.at_picture(lambda: None)
-    assert pose(view.camera) == pose(viewer.cam)
-    assert view.option.label == viewer.vopt.label
-    env.close()
 
 
 def test_camera_number_of_the_renderer_counts_in_its_moment() -> None:

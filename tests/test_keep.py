@@ -24,9 +24,10 @@ from recordings import (
     metadata_of,
     videos_in,
 )
+from waiting import wait_until
 
 import mjrec
-from conftest import Corridor
+from mjrec.formats import spans
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.keep_rules import UNDECIDED
 from mjrec.recorder.tracking import FinishedVideo, Tracker
@@ -187,37 +188,21 @@ def test_the_disk_holds_n_candidates_and_the_running_episode(
     assert h5_of(tmp_path) == sorted(worst)
 
 
-def test_failures_are_what_the_environment_calls_so(tmp_path: Path) -> None:
-    """Decided at the end of each; after N no frame is recorded any more."""
+@both_ways
+def test_failures_are_what_the_environment_calls_so(tmp_path: Path, way: Any) -> None:
+    """Drawn at the end of each; after N no frame is recorded any more."""
     made = pendulum(success=[True, False, True, False, False, True, False, False])
     with mjrec.Monitor(
-        made, tmp_path, keep="failures:2", mode="training", render="live"
+        made, tmp_path, keep="failures:2", mode="training", render=way, workers=1
     ) as env:
         run(env, 3)
-        assert videos_in(tmp_path) == [1]
+        wait_until(lambda: videos_in(tmp_path) == [1])
         run(env, 5)
         assert not env.video_recorder.enabled
     assert videos_in(tmp_path) == [1, 3]
     selection = {"rule": "failures:2", "decided": True, "finished": 2}
     assert metadata_of(tmp_path, 1)["selection"] == selection
     assert manifest_of(tmp_path)["mjrec"]["keep"]["chosen"] == [1, 3]
-
-
-def test_deferred_failures_are_handed_over_at_once(tmp_path: Path) -> None:
-    """Where nothing is said of success, a terminated episode has failed."""
-    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=4)
-    with mjrec.Monitor(env, tmp_path, keep="failures", workers=0) as env:
-        terminated = []
-        for seed in range(6):
-            env.reset(seed=seed)
-            flags = [False]
-            while not any(flags):
-                _, _, *flags, _ = env.step(env.action_space.high * (seed % 2))
-            terminated += [seed] * flags[0]
-            assert logs_of(tmp_path) == terminated
-    assert 0 < len(terminated) < 6
-    assert h5_of(tmp_path) == pending_in(tmp_path) == terminated
-    assert facts_of(tmp_path, terminated[0])["candidate"] is False
 
 
 def test_median_holds_all_states_and_says_so(
@@ -430,48 +415,23 @@ def test_a_killed_run_leaves_its_candidates(
     assert listed >= {"000001", "000003"}
 
 
-@pytest.mark.thorough
-def test_a_renderer_beside_an_open_monitor_leaves_candidates_alone(
-    tmp_path: Path,
-) -> None:
-    """What may still fall out belongs to its monitor."""
-    command = [sys.executable, "-m", "mjrec", "render", str(tmp_path)]
-    with mjrec.Monitor(pendulum(), tmp_path, keep="worst:2", workers=0) as env:
-        run(env, 3)
-        subprocess.run(command, check=True, capture_output=True)
-        assert logs_of(tmp_path) == [1, 2]
-        assert videos_in(tmp_path) == []
-        run(env, 5)
-    assert videos_in(tmp_path) == []
-    render(tmp_path)
-    assert videos_in(tmp_path) == [1, 3]
-
-
 # --- what cannot be ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "what"),
-    [
-        ({"keep": "wurst:3"}, "no keep rule 'wurst:3'. There are: best:N"),
-        ({"keep": "worst:0"}, "1 or more"),
-        ({"keep": 3}, "must be one of"),
-        ({"keep": "worst:3", "video_callable": False}, "video_callable before"),
-        ({"keep": "worst:3", "video_callable": lambda e: True}, "give one of them"),
-        ({"keep": "worst:3", "render": "off"}, "there are none"),
-        ({"keep": "worst:3", "video_length": 3}, "counted in steps"),
-        ({"keep": "worst:3", "step_trigger": lambda s: True}, "counted in steps"),
-    ],
-)
-def test_impossible_options_are_refused_before_anything_is_made(
-    tmp_path: Path, options: dict[str, Any], what: str
+def test_deciding_costs_each_candidate_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The directory is not even there; without frames there is nothing to keep."""
-    with pytest.raises(mjrec.InvalidArgument, match=what):
-        mjrec.Monitor(pendulum(), tmp_path / "run", **options)
-    with pytest.raises(mjrec.NoPictures):
-        mjrec.Monitor(Corridor(render_mode=None), tmp_path / "run", keep="worst:1")
-    assert not (tmp_path / "run").exists()
+    """No list is looked for among those of all the others."""
+    read: list[Path] = []
+    original = spans.read_list
+    monkeypatch.setattr(spans, "read_list", lambda p: read.append(p) or original(p))
+    monitor = mjrec.Monitor(
+        pendulum([1] * 20), tmp_path, keep="median", env_id="Pole-v0", workers=0
+    )
+    run(monitor, 20)
+    read.clear()
+    monitor.close(wait=False)
+    assert 0 < len(read) <= 3 * 20
 
 
 def test_nothing_was_finished(tmp_path: Path) -> None:

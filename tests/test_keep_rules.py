@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mjrec.errors import InvalidArgument, UnknownName
+from mjrec.errors import InvalidArgument
 from mjrec.recorder.keep_rules import (
     Selection,
     Standing,
@@ -158,36 +158,3 @@ def test_a_function_that_cannot_choose_is_named(
         selection.close()
     assert selection.chosen == []
     assert selection.undecided == 3
-
-
-@pytest.mark.parametrize(
-    ("keeps", "error", "what"),
-    [
-        (
-            ["wurst:3", "", "median:2", "best-3", ":3", "all", "undecided"],
-            UnknownName,
-            r"best:N, worst:N, failures.* median",
-        ),
-        (
-            [
-                "worst",
-                "worst:",
-                "worst:0",
-                "best:-1",
-                "best:x",
-                "failures:0",
-                "worst:1.5",
-            ],
-            InvalidArgument,
-            "1 or more",
-        ),
-        ([3, True, ["worst:3"], b"worst:3"], InvalidArgument, "must be one of best:N"),
-    ],
-)
-def test_what_is_no_rule_is_an_error(
-    keeps: list[Any], error: type[Exception], what: str
-) -> None:
-    """It lists the rules as they are to be written."""
-    for keep in keeps:
-        with pytest.raises(error, match=what):
-            selection_from(keep)

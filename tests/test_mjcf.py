@@ -14,6 +14,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import mjrec
+from mjrec.environments.gymnasium_scenes import gymnasium_scenes
 from mjrec.environments.mjcf_environments import MjcfEnvironment, make_mjcf
 from mjrec.environments.named_environment import EnvironmentOptions
 from mjrec.simulation.mjcf import load_mjcf
@@ -56,7 +57,7 @@ def write(tmp_path: Path) -> Write:
     return write_model
 
 
-@pytest.mark.parametrize("timestep", [0.002, 0.0033, 0.0166667, 0.0041667])
+@pytest.mark.parametrize("timestep", [0.0033, 0.0166667])
 def test_there_are_sixty_frames_to_the_second(write: Write, timestep: float) -> None:
     """No frame is more than half a timestep off, and nothing adds up; each episode."""
     env = MjcfEnvironment(write(timestep=timestep))
@@ -155,6 +156,29 @@ def test_episodes_end_after_max_steps(
     assert ends == [(False, False)] * (expected - 1) + [(False, True)]
     assert env.spec is not None
     assert env.spec.id == "mjcf/my_rail__2_"
+
+
+class Draws(MjcfEnvironment):
+    def render(self) -> Any:
+        return super().render()
+
+
+def test_pictures_follow_from_states(write: Write) -> None:
+    """Wrapped or not, unless something overrides; cameras are checked at once."""
+    path = write(cameras=FIXED)
+    limited = gymnasium.wrappers.TimeLimit(MjcfEnvironment(path), 3)
+    scenes = gymnasium_scenes(limited)
+    assert scenes.obstacle is None
+    assert scenes.environment == {
+        "framework": "mjcf",
+        "id": "mjcf/my_rail__2_",
+        "kwargs": {},
+        "wrappers": [],
+        "max_episode_steps": 3,
+    }
+    assert "Draws overrides render()" in str(gymnasium_scenes(Draws(path)).obstacle)
+    with pytest.raises(mjrec.UnknownName, match="fixed"):
+        gymnasium_scenes(limited, camera="forward")
 
 
 def test_frames_show_the_camera_that_follows_or_the_first(write: Write) -> None:

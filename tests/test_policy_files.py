@@ -105,21 +105,34 @@ def test_what_is_in_no_such_file_is_refused(tmp_path: Path) -> None:
         load_policy(str(tmp_path / "other.zip"), env)
 
 
+WEIGHTS = np.array([[2.0, 4.0]] * 3, np.float32)
+
+
 def exported(directory: Path, kind: str) -> Path:
     """Write the network that gives twice the sum of an observation, and its double."""
-    torch = pytest.importorskip("torch")
-    network = torch.nn.Linear(3, 2, bias=False)
-    with torch.no_grad():
-        network.weight[:] = torch.tensor([[2.0] * 3, [4.0] * 3])
     path = directory / f"network.{kind}"
     if kind == "onnx":
         pytest.importorskip("onnxruntime")
-        pytest.importorskip("onnx")
-        torch.onnx.export(network, torch.zeros(1, 3), path, dynamo=False)
-    elif kind == "pt2":
-        torch.export.save(torch.export.export(network, (torch.zeros(1, 3),)), path)
+        onnx = pytest.importorskip("onnx")
+        helper, single = onnx.helper, onnx.TensorProto.FLOAT
+        graph = helper.make_graph(
+            [helper.make_node("MatMul", ["seen", "weights"], ["action"])],
+            "network",
+            [helper.make_tensor_value_info("seen", single, [1, 3])],
+            [helper.make_tensor_value_info("action", single, [1, 2])],
+            [onnx.numpy_helper.from_array(WEIGHTS, "weights")],
+        )
+        opset = [helper.make_opsetid("", 17)]
+        onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=8), path)
+        return path
+    torch = pytest.importorskip("torch")
+    network, seen = torch.nn.Linear(3, 2, bias=False), torch.zeros(1, 3)
+    with torch.no_grad():
+        network.weight[:] = torch.from_numpy(WEIGHTS.T)
+    if kind == "pt2":
+        torch.export.save(torch.export.export(network, (seen,)), path)
     else:
-        torch.jit.trace(network, torch.zeros(1, 3)).save(str(path))
+        torch.jit.trace(network, seen).save(str(path))
     return path
 
 

@@ -26,6 +26,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 
 PENDULUM = "InvertedPendulum-v5"
 MOST_BYTES = 200 << 20
+BEGUN, ENDED = b'{"begun"', b'"evaluation": {'
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -109,20 +110,20 @@ def slow_run(place: Path, *arguments: str) -> subprocess.Popen[bytes]:
 
 
 def noted(directory: Path, what: bytes) -> int:
-    """Return how often ledgers say that an episode has begun, or ended."""
-    ledgers = directory.glob("*/mjrec.evaluation.*.jsonl")
-    return sum(path.read_bytes().count(b'{"' + what) for path in ledgers)
+    """Return how often journals say that an episode has begun, or ended."""
+    journals = directory.glob("*/*/openaigym.episodes.*.jsonl")
+    return sum(path.read_bytes().count(what) for path in journals)
 
 
 @pytest.mark.thorough
 def test_a_killed_driver_is_gone_on_with(tmp_path: Path) -> None:
     """With `resume`: what was finished is not repeated."""
     process = slow_run(tmp_path)
-    wait_until(lambda: noted(tmp_path / "e", b"ended") >= 4)
+    wait_until(lambda: noted(tmp_path / "e", ENDED) >= 4)
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not (tmp_path / "e" / "results.json").exists()
     assert slow_run(tmp_path, "resume").wait() == 0
-    assert noted(tmp_path / "e", b"ended") == 16
+    assert noted(tmp_path / "e", ENDED) == 16
     # Each once; those that the two workers were at, once more.
-    assert 16 <= noted(tmp_path / "e", b"begun") <= 18
+    assert 16 <= noted(tmp_path / "e", BEGUN) <= 18

@@ -116,6 +116,8 @@ WRONG = [
     ({"camera": 1.5}, InvalidArgument, "camera is a name"),
     ({"camera": {"distance": "far"}}, InvalidArgument, "distance is a number"),
     ({"width": 0}, InvalidArgument, "width must be"),
+    ({"height": 20000}, InvalidArgument, "height must be"),
+    ({"camera": 7}, InvalidArgument, "no camera number 7"),
     ({"quality": "low"}, UnknownName, "no quality 'low'"),
     ({"workers": 0}, InvalidArgument, "workers must be"),
 ]

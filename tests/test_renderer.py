@@ -375,28 +375,6 @@ def test_a_renderer_that_is_closed_or_forgotten(table: Simulation) -> None:
     assert context() is None
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"height": 0}, "height must be"),
-        ({"width": 20000}, "width must be"),
-        ({"camera": "abve"}, "no camera 'abve'"),
-        ({"camera": 7}, "no camera number 7"),
-        ({"quality": "high"}, "no quality 'high'"),
-    ],
-)
-def test_arguments_are_checked_before_a_context_is_made(
-    table: Simulation,
-    arguments: dict[str, Any],
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """One clear error each."""
-    monkeypatch.setattr(gl_context, "_make_context", pytest.fail)
-    with pytest.raises(InvalidArgument, match=message):
-        SceneRenderer(table[0], **{**SIZE, **arguments})
-
-
 def test_a_frame_beyond_the_driver_is_refused(
     table: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -191,18 +191,20 @@ def test_what_cannot_be_rendered_stops_nothing_else(
     write_finished(tmp_path, 0).write_bytes(b"not HDF5 at all")
     write_finished(tmp_path, 1, frames=False, refusal="a plugin draws")
     write_finished(tmp_path, 2)
-    write_finished(tmp_path, 3)
+    write_finished(tmp_path, 3, scene="all")
+    write_finished(tmp_path, 4)
     painter.breaks_at = lambda path, *_: [][1] if "000002" in path.name else None
     *failed, last = finish(tmp_path)
     assert last.videos
-    first, second, third = (
+    first, second, third, fourth = (
         reason for each in failed for reason in each.failures.values()
     )
     assert "Cannot read" in first
     assert "a plugin draws" in second
     assert third.startswith("IndexError: ")
+    assert "scene" in fourth
     assert "Traceback" in caplog.text
-    assert len(finish(tmp_path)) == 3
+    assert len(finish(tmp_path)) == 4
 
 
 # The manifest
@@ -315,17 +317,13 @@ def write_saying(directory: Path, **facts: Any) -> Path:
     ],
 )
 def test_a_fact_that_cannot_be_is_named(key: str, value: Any, tmp_path: Path) -> None:
-    """With its file, at once; and the next recording is rendered."""
+    """With its file, at once, before anything of it is drawn."""
     path = write_saying(tmp_path, **{key: value})
-    write_finished(tmp_path, 2)
     start = time.monotonic()
     with pytest.raises(UnreadableFile, match=key) as caught:
         open_for_rendering(path)
     assert caught.value.path == path
     assert time.monotonic() - start < 5
-    first, second = finish(tmp_path)
-    assert key in str(first.failures)
-    assert second.videos
 
 
 @pytest.mark.parametrize(

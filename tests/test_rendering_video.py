@@ -165,18 +165,6 @@ def test_max_fps_leaves_frames_out(
     assert rate_of(video) == fps
 
 
-def test_another_view_is_asked_of_the_workers_and_told(tmp_path: Path) -> None:
-    """The metadata has the camera and the quality that were asked for."""
-    painter, out = Painter(), tmp_path / "front.mp4"
-    view = View(camera="front", quality="draft")
-    variant = Variant(view=view)
-    assert render(write_finished(tmp_path), painter, variant=variant, out=out) == out
-    assert painter.asked[0][2] == view
-    metadata = metadata_of(out)
-    assert (metadata["camera"], metadata["quality"]) == ("front", "draft")
-    assert not (tmp_path / f"{STEM}.mp4").exists()
-
-
 @pytest.mark.parametrize(
     ("facts", "said"),
     [

@@ -121,40 +121,24 @@ def usual(page: Page, videos: Path) -> Page:
 
 
 def test_videos_play(usual: Page) -> None:
-    """Each at its size and for its time, and one at a time."""
-    expect(usual.locator("video")).to_have_count(0)
+    """Each at its size and for its time, one at a time, and by keyboard."""
+    players = usual.locator("video")
+    expect(players).to_have_count(0)
     buttons = usual.get_by_role("button", name="Play dm_control/")
     expect(buttons).to_have_count(4)
-    players = usual.locator("video")
-    for i in range(4):
-        buttons.first.click()
+    for i, start in enumerate(("click", "Enter", "Space", "click")):
+        button = buttons.first
+        button.click() if start == "click" else button.press(start)
+        player = players.nth(i)
+        expect(player).to_be_focused()
+        expect(player).to_have_accessible_name(re.compile(r"^dm_control/\S+, seed"))
         usual.wait_for_function(
             "i => document.querySelectorAll('video')[i].currentTime > 0.1", arg=i
         )
-        told = players.nth(i).evaluate(
-            "v => [v.readyState, v.videoWidth, v.videoHeight, v.duration, v.error]"
-        )
-        assert told[0] >= 2
-        assert told[1:3] == [64, 48]
-        assert told[3] == pytest.approx(_FRAMES / _FPS, abs=1 / _FPS)
-        assert told[4] is None
+        told = player.evaluate("v => [v.videoWidth, v.videoHeight, v.duration]")
+        assert told == [64, 48, pytest.approx(_FRAMES / _FPS, abs=1 / _FPS)]
     playing = "[...document.querySelectorAll('video')].filter(v => !v.paused).length"
     assert usual.evaluate(playing) <= 1
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("key", ["Enter", "Space"])
-def test_a_video_is_played_by_keyboard(usual: Page, key: str) -> None:
-    """Its player has the keyboard then, and the name of what it plays."""
-    button = usual.locator("#video-1").get_by_role("button", name="Play dm_control/")
-    button.press(key)
-    player = usual.locator("#video-1 video")
-    expect(player).to_be_focused()
-    expect(player).to_have_accessible_name(re.compile("^dm_control/walker-walk, seed"))
-    usual.wait_for_function("() => document.querySelector('video').currentTime > 0.1")
-    usual.keyboard.press("Space")
-    assert player.evaluate("v => v.paused")
-    expect(usual.locator("video")).to_have_count(1)
 
 
 @parametrize("single_file", [False, True])
@@ -171,7 +155,6 @@ def test_a_recordings_report_plays(
     page.goto(index.resolve().as_uri())
     expect(page.locator("#summary-table tbody tr")).to_have_count(1)
     expect(page.locator("#episodes-count")).to_have_text("Rows 1 to 3 of 3")
-    expect(page.locator("video")).to_have_count(0)
     page.get_by_role("button", name="Play").first.click()
     player = page.locator("video").first
     page.wait_for_function("() => document.querySelector('video').currentTime > 0.1")
@@ -180,47 +163,28 @@ def test_a_recordings_report_plays(
     assert player.evaluate("v => v.poster") != ""
 
 
-# --- Sorting ----------------------------------------------------------------------
-
-
-def names_of(page: Page) -> list[str]:
-    """Return the tasks in the summary, from the top."""
-    return page.locator("#summary-table tbody th").all_inner_texts()
+# --- Sorting and filtering --------------------------------------------------------
 
 
 @pytest.mark.thorough
-def test_the_summary_sorts_by_mouse_and_by_keyboard(usual: Page) -> None:
-    """Either way, and says which."""
-    mean = usual.locator("#summary-table th", has_text="Mean")
-    button = mean.get_by_role("button")
-    button.click()
-    expect(mean).to_have_attribute("aria-sort", "descending")
-    best_first = names_of(usual)
-    assert best_first[0] == "dm_control/walker-walk"
-    button.press("Enter")
-    expect(mean).to_have_attribute("aria-sort", "ascending")
-    assert names_of(usual) == best_first[::-1]
-    usual.keyboard.press("Space")
-    expect(mean).to_have_attribute("aria-sort", "descending")
-    expect(usual.locator("#said")).to_have_text("Sorted by Mean, descending")
-    assert usual.locator("[aria-sort]").count() == 1
-
-
-@pytest.mark.thorough
-def test_what_is_not_known_comes_last(page: Page, tmp_path: Path) -> None:
-    """Whichever way a table is sorted."""
+def test_tables_sort_by_mouse_and_by_keyboard(page: Page, tmp_path: Path) -> None:
+    """Either way, and say which; what is not known comes last whichever way."""
     named = {"a": [3.0, 3.0], "b": [1.0, 1.0], "c": [2.0]}
     tasks = [
         task(name, v, failures={0: "x"} if name == "c" else None)
         for name, v in named.items()
     ]
     open_report(page, tmp_path, contents(*tasks))
-    button = page.locator("#summary-table").get_by_role("button", name="Mean")
-    orders = []
-    for _ in range(2):
-        button.click()
-        orders.append(names_of(page))
-    assert orders == [["a", "b", "c"], ["b", "a", "c"]]
+    mean = page.locator("#summary-table th", has_text="Mean")
+    names = page.locator("#summary-table tbody th")
+    mean.get_by_role("button").click()
+    expect(mean).to_have_attribute("aria-sort", "descending")
+    assert names.all_inner_texts() == ["a", "b", "c"]
+    mean.get_by_role("button").press("Enter")
+    expect(mean).to_have_attribute("aria-sort", "ascending")
+    assert names.all_inner_texts() == ["b", "a", "c"]
+    expect(page.locator("#said")).to_have_text("Sorted by Mean, ascending")
+    assert page.locator("[aria-sort]").count() == 1
     rewards = page.locator("#episodes-table").get_by_role("button", name="Return")
     for shown in (["3.000", "3.000", "1.000", "1.000"], ["1.000", "1.000", "3.000"]):
         rewards.click()
@@ -229,30 +193,26 @@ def test_what_is_not_known_comes_last(page: Page, tmp_path: Path) -> None:
         assert cells[-1] == "\N{EN DASH}"
 
 
-# --- The gallery ------------------------------------------------------------------
-
-
-def shown_cards(page: Page) -> list[str]:
-    """Return the ids of the videos that are to be seen."""
-    cards = page.locator(".card:not([hidden])")
-    return [card.get_attribute("id") or "" for card in cards.all()]
-
-
 @pytest.mark.thorough
 def test_the_gallery_filters_by_mouse_and_by_keyboard(usual: Page) -> None:
-    """By task, by best or worst, and by both; and says how many are left."""
-    count = usual.locator("#gallery-count")
+    """By task, by best or worst, and by both; the table finds what it has hidden."""
+
+    def shown() -> list[str | None]:
+        cards = usual.locator(".card:not([hidden])").all()
+        return [card.get_attribute("id") for card in cards]
+
     usual.get_by_role("radio", name="Worst").click()
-    assert shown_cards(usual) == ["video-1", "video-3"]
-    expect(count).to_have_text("2 of 4 videos")
+    assert shown() == ["video-1", "video-3"]
+    expect(usual.locator("#gallery-count")).to_have_text("2 of 4 videos")
     usual.locator("#gallery-task").select_option(label="dm_control/cheetah-run")
-    assert shown_cards(usual) == ["video-3"]
+    assert shown() == ["video-3"]
     usual.get_by_role("radio", name="Worst").press("ArrowLeft")
     expect(usual.get_by_role("radio", name="Best")).to_be_checked()
-    assert shown_cards(usual) == ["video-2"]
-    usual.locator("#gallery-task").press("Home")
-    expect(usual.locator("#gallery-task")).to_have_value("")
-    assert shown_cards(usual) == ["video-0", "video-2"]
+    assert shown() == ["video-2"]
+    usual.locator("#episodes-table").get_by_role("button", name="Return").click()
+    usual.locator("#episodes-table tbody a").first.click()
+    expect(usual.locator("#video-0")).to_be_in_viewport()
+    assert usual.url.endswith("#video-0")
 
 
 @pytest.mark.thorough
@@ -274,76 +234,32 @@ def test_a_command_is_copied_or_selected(usual: Page) -> None:
     assert usual.evaluate("getSelection().toString()") == "0123456789abcdef" * 4
 
 
-# --- All episodes -----------------------------------------------------------------
-
-
 @pytest.mark.thorough
-def test_the_table_of_episodes_filters_sorts_and_turns_pages(
+def test_of_ten_thousand_episodes_a_hundred_are_laid_out(
     page: Page, tmp_path: Path
 ) -> None:
-    """No more than a hundred rows are there at once."""
-    long = task("long", np.arange(250.0))
-    open_report(page, tmp_path, contents(long, task("short", [5.0, 6.0])))
+    """Opening, sorting, filtering and turning pages cost no more than what is shown."""
+    shown = [video(i, file=f"{i}.mp4", poster=_PIXEL) for i in range(20)]
+    returns = np.arange(2000.0)
+    tasks = [
+        task(f"dm_control/task-{i}", returns, seeds=5, videos=shown) for i in range(5)
+    ]
+    open_report(page, tmp_path, contents(*tasks, task("short", np.arange(152.0))))
     count = page.locator("#episodes-count")
-    rows = page.locator("#episodes-table tbody tr")
-    expect(count).to_have_text("Rows 1 to 100 of 252")
+    rows = page.locator("#episodes tbody tr")
+    expect(count).to_have_text("Rows 1 to 100 of 10\u202f152")
     expect(rows).to_have_count(100)
-    page.locator("#episodes-next").press("Enter")
+    assert page.evaluate("document.querySelectorAll('*').length") < 10_000
+    page.locator("#episodes-task").select_option(label="short")
     page.locator("#episodes-next").click()
-    expect(count).to_have_text("Rows 201 to 252 of 252")
+    expect(count).to_have_text("Rows 101 to 152 of 152")
     expect(page.locator("#episodes-next")).to_have_attribute("aria-disabled", "true")
     page.locator("#episodes-next").press("Enter")
     expect(rows).to_have_count(52)
-    page.locator("#episodes-task").select_option(label="long")
-    page.locator("#episodes-table").get_by_role("button", name="Return").click()
-    expect(count).to_have_text("Rows 1 to 100 of 250")
-    assert rows.first.locator("td").all_inner_texts()[:5] == [
-        "long",
-        "truncated",
-        "0",
-        "249",
-        "249.0",
-    ]
-
-
-@pytest.mark.thorough
-def test_a_phone_shows_which_episodes_failed(browser: Browser, tmp_path: Path) -> None:
-    """And why, beside the task's name, without scrolling to the right."""
-    reason = "PolicyError: " + "it gave an action of the wrong shape " * 4
-    named = task("gymnasium/HalfCheetah-v5", [1.0] * 5, failures={0: reason})
-    size: Any = {"width": 360, "height": 800}
-    with browser.new_context(viewport=size) as context:
-        for page in watched(context.new_page()):
-            open_report(page, tmp_path, contents(named))
-            outcome = page.locator("#episodes-table tbody tr").first.locator(".bad")
-            expect(outcome).to_have_text(f"failed: {reason.strip()}")
-            box = outcome.bounding_box()
-            assert box is not None
-            assert box["x"] + box["width"] <= 360
-
-
-@pytest.mark.thorough
-def test_the_summary_fits_on_paper(browser: Browser, tmp_path: Path) -> None:
-    """With all of its columns, on A4 with margins of a centimetre."""
-    known = {"success_known": 50, "success_rate": 0.5, "warnings": {"BADQACC": 12}}
-    made = contents()
-    tasks = [replace(t, summary=replace(t.summary, **known)) for t in made.tasks]
-    with browser.new_context(viewport={"width": 718, "height": 900}) as context:
-        for page in watched(context.new_page()):
-            page.emulate_media(media="print")
-            open_report(page, tmp_path, replace(made, tasks=tasks))
-            assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
-
-
-@pytest.mark.thorough
-def test_an_episodes_video_is_one_click_away(usual: Page) -> None:
-    """Also where the gallery's filter has hidden it."""
-    usual.get_by_role("radio", name="Worst").click()
-    expect(usual.locator("#video-0")).to_be_hidden()
-    usual.locator("#episodes-table").get_by_role("button", name="Return").click()
-    usual.locator("#episodes-table tbody a").first.click()
-    expect(usual.locator("#video-0")).to_be_in_viewport()
-    assert usual.url.endswith("#video-0")
+    page.locator("[data-key=total_reward] button").click()
+    expect(count).to_have_text("Rows 1 to 100 of 152")
+    cells = rows.first.locator("td").all_inner_texts()
+    assert cells[:5] == ["short", "truncated", "0", "151", "151.0"]
 
 
 # --- For everybody ----------------------------------------------------------------
@@ -374,6 +290,44 @@ def test_nothing_keeps_people_out(
             assert bad == []
 
 
+@pytest.mark.thorough
+def test_a_phone_shows_which_episodes_failed(browser: Browser, tmp_path: Path) -> None:
+    """And why, beside the task's name, without scrolling to the right."""
+    reason = "PolicyError: " + "it gave an action of the wrong shape " * 4
+    named = task("gymnasium/HalfCheetah-v5", [1.0] * 5, failures={0: reason})
+    size: Any = {"width": 360, "height": 800}
+    with browser.new_context(viewport=size) as context:
+        for page in watched(context.new_page()):
+            open_report(page, tmp_path, contents(named))
+            outcome = page.locator("#episodes-table tbody tr").first.locator(".bad")
+            expect(outcome).to_have_text(f"failed: {reason.strip()}")
+            box = outcome.bounding_box()
+            assert box is not None
+            assert box["x"] + box["width"] <= 360
+
+
+@pytest.mark.thorough
+def test_paper_has_the_whole_summary_pictures_and_no_buttons(
+    browser: Browser, videos: Path
+) -> None:
+    """On A4 with margins of a centimetre."""
+    known = {"success_known": 50, "success_rate": 0.5, "warnings": {"BADQACC": 12}}
+    made = usual_report()
+    for each in made.tasks:
+        each.summary = replace(each.summary, **known)
+    with browser.new_context(viewport={"width": 718, "height": 900}) as context:
+        for page in watched(context.new_page()):
+            page.emulate_media(media="print")
+            open_report(page, videos, made)
+            assert page.evaluate("document.scrollingElement.scrollWidth") <= 718
+            expect(page.locator("#gallery-filter")).to_be_hidden()
+            expect(page.locator("nav")).to_be_hidden()
+            picture = page.locator(".play").first
+            expect(picture).to_be_visible()
+            signs = "['::before', '::after'].map(p => getComputedStyle(e, p).display)"
+            assert picture.evaluate(f"e => {signs}") == ["none", "none"]
+
+
 def test_what_a_stranger_wrote_stays_text(page: Page, videos: Path) -> None:
     """Markup is read, not run."""
     open_report(page, videos, hostile_report())
@@ -398,9 +352,6 @@ def test_the_policy_stops_what_is_not_the_pages_own(
                 const script = document.createElement("script");
                 script.textContent = "window.hasRun = true";
                 document.body.append(script);
-                const image = document.createElement("img");
-                image.src = "http://127.0.0.1:9/x.png";
-                document.body.append(image);
             }"""
         )
         assert page.evaluate("window.hasRun") is None
@@ -432,37 +383,6 @@ def test_without_scripts_everything_but_the_tools_is_there(
         expect(page.locator("noscript")).to_be_visible()
         expect(page.locator("#gallery-filter")).to_be_hidden()
         expect(page.locator("#episodes-tools")).to_be_hidden()
-
-
-@pytest.mark.thorough
-def test_paper_has_pictures_and_no_buttons(usual: Page) -> None:
-    """The gallery is printed, the tools are not."""
-    usual.emulate_media(media="print")
-    expect(usual.locator("#gallery-filter")).to_be_hidden()
-    expect(usual.locator("nav")).to_be_hidden()
-    picture = usual.locator(".play").first
-    expect(picture).to_be_visible()
-    sign = "e => [getComputedStyle(e, '::before'), getComputedStyle(e, '::after')]"
-    shown = picture.evaluate(f"e => ({sign})(e).map(s => s.display)")
-    assert shown == ["none", "none"]
-
-
-@pytest.mark.thorough
-def test_of_ten_thousand_episodes_a_hundred_are_laid_out(
-    page: Page, tmp_path: Path
-) -> None:
-    """Opening and sorting the page cost no more than what is shown."""
-    returns = np.random.default_rng(0).normal(500, 200, 2000).tolist()
-    shown = [video(i, file=f"{i}.mp4", poster=_PIXEL) for i in range(20)]
-    tasks = [
-        task(f"dm_control/task-{i}", returns, seeds=5, videos=shown) for i in range(5)
-    ]
-    open_report(page, tmp_path, contents(*tasks))
-    expect(page.locator("#episodes-count")).to_have_text("Rows 1 to 100 of 10\u202f000")
-    expect(page.locator("#episodes tbody tr")).to_have_count(100)
-    page.locator("[data-key=total_reward] button").click()
-    expect(page.locator("#episodes tbody tr")).to_have_count(100)
-    assert page.evaluate("document.querySelectorAll('*').length") < 10_000
 
 
 _PIXEL = (

@@ -13,7 +13,6 @@ import pytest
 from mjrec import UnreadableFile
 from mjrec.evaluation.episode_results import EpisodeResult
 from mjrec.evaluation.plan import EvaluatedTask, EvaluationPlan
-from mjrec.evaluation.result_columns import ResultVideo
 from mjrec.evaluation.result_tables import EpisodeFiles
 from mjrec.evaluation.results_files import (
     ChosenEpisode,
@@ -24,7 +23,6 @@ from mjrec.evaluation.results_files import (
 from mjrec.evaluation.statistics import Bootstrap, Interval
 from mjrec.evaluation.summaries import AcrossTasks, Profile, TaskSummary
 
-SHA = "ab" * 32
 VIDEO = "openaigym.video.0.w.video000000.mp4"
 SUMMARY = TaskSummary(
     task="a,b-v0",
@@ -94,7 +92,7 @@ def files(result: EpisodeResult) -> EpisodeFiles:
     if result.monitor is None:
         return EpisodeFiles()
     return EpisodeFiles(
-        "openaigym.trajectory.0.w.episode000000.h5", ResultVideo(VIDEO, SHA)
+        "a,b-v0/seed-007", "openaigym.trajectory.0.w.episode000000.h5", VIDEO
     )
 
 
@@ -115,9 +113,8 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert failed.failure == 'it said "no", and went =1+1 \\udc80'
     assert infinite == RESULTS[3]
     columns = read.columns["a,b-v0"]
-    assert columns.videos == {0: ResultVideo(VIDEO, SHA)}
-    assert columns.trajectory_prefix(0) == "openaigym.trajectory.0.w.episode000000"
-    assert columns.trajectory_prefix(1) is None
+    assert columns.videos == {0: VIDEO}
+    assert columns.places == {("a,b-v0/seed-007", "0.w"): 0}
     assert columns.failed.tolist() == [False, False, True, False]
 
 
@@ -180,7 +177,7 @@ DAMAGE = {
     "a NUL": ("results.csv", b"said", b"\0"),
     "a path as a video": ("timing.csv", VIDEO.encode(), b"../../etc/passwd.mp4"),
     "a video of another": ("timing.csv", b"video000000", b"video000001"),
-    "no digest": ("timing.csv", SHA.encode(), b"<script>"),
+    "a path as a folder": ("timing.csv", b"/seed-007", b"/../seed-007"),
     "a bad infix": ("timing.csv", b",0.w,", b",../0.w,"),
     "another version": ("results.json", b'"format_version": 1', b'"format_version": 2'),
     "no JSON": ("results.json", b"{", b"["),
@@ -230,7 +227,8 @@ def test_many_episodes_need_little_memory(tmp_path: Path) -> None:
     rows = {
         "results": [f"T-v0,0,{n},{n / 7!r},1000,false,true,,\n" for n in range(count)],
         "timing": [
-            f"T-v0,0,{n},1790000000.{n},0.5,0.worker,{n},,,\n" for n in range(count)
+            f"T-v0,0,{n},1790000000.{n},0.5,T/seed-000,0.worker,{n},,\n"
+            for n in range(count)
         ],
     }
     for name, lines in rows.items():

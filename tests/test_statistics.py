@@ -67,12 +67,6 @@ def ends(interval: Interval | None) -> list[float]:
     return [interval.low, interval.high]
 
 
-@pytest.fixture
-def large_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take the large-sample intervals of whatever is asked."""
-    monkeypatch.setattr(statistics, "MOST_RESAMPLED", 0)
-
-
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
@@ -269,22 +263,6 @@ def test_same_seed_same_interval() -> None:
     assert interquartile_mean([values]).interval(other) != first
 
 
-def test_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However little memory is used."""
-    (whole,) = statistics._resamples([20], QUICK)
-    monkeypatch.setattr(statistics, "_BLOCK", 600)
-    blocks = [counts for (counts,) in statistics._resamples([20], QUICK)]
-    assert len(blocks) > 9
-    assert np.array_equal(np.concatenate(blocks), whole[0])
-
-
-def test_draws_are_even() -> None:
-    """Each of seven episodes is drawn a seventh of the time; a row has seven."""
-    ((counts,),) = statistics._resamples([7], USUAL)
-    assert counts.sum(axis=0) == pytest.approx(np.full(7, 10_000), rel=0.04)
-    assert (counts.sum(axis=1) == 7).all()
-
-
 def test_a_single_value_has_no_interval() -> None:
     """One of no width would say that all is known."""
     for figure in (mean(array(1)), improvement(array(1, 2), array(3))):
@@ -317,12 +295,6 @@ SIMULATED: dict[str, tuple[Callable[[int], Figure], float]] = {
         500,
     ),
 }
-
-
-@pytest.mark.parametrize("name", ["mean", "improvement"])
-def test_intervals_hold_the_true_value_as_often_as_they_say(name: str) -> None:
-    """Of 300 samples of 30, about 95 of 100; the bootstrap is known to be a bit low."""
-    assert 0.90 <= covered(*SIMULATED[name], times=300) <= 0.985
 
 
 @pytest.mark.thorough

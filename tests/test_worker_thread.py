@@ -1,76 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bounded worker thread."""
+"""The bounded worker thread; what else it promises is seen in `test_video_writer`."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-import threading
-from typing import Any
 
 import pytest
 
-from mjrec.errors import ClosedError
 from mjrec.worker_thread import WorkerThread
-
-
-def held() -> tuple[WorkerThread[Any], threading.Event, threading.Event, list[Any]]:
-    """Return a worker, whether it has an item, what lets it go on, and what it took."""
-    in_hand, gate = threading.Event(), threading.Event()
-    seen: list[Any] = []
-
-    def consume(item: Any) -> None:
-        in_hand.set()
-        assert gate.wait(30)
-        seen.append(item)
-        if isinstance(item, BaseException):
-            raise item
-
-    worker = WorkerThread[Any](
-        consume, capacity=1, name="w", finish=lambda: seen.append("end")
-    )
-    return worker, in_hand, gate, seen
-
-
-def test_items_are_consumed_in_order_on_one_other_thread() -> None:
-    """Every item, then the finish, while `put` waits; after `abort` that in hand."""
-    worker, in_hand, gate, seen = held()
-    worker.put(1)
-    assert in_hand.wait(30)
-    worker.put(2)
-    putter = threading.Thread(target=lambda: worker.put(3))
-    putter.start()
-    putter.join(0.05)
-    assert putter.is_alive()
-    gate.set()
-    putter.join(30)
-    worker.close()
-    worker.close()
-    assert seen == [1, 2, 3, "end"]
-    with pytest.raises(ClosedError, match="w is closed"):
-        worker.put(1)
-    worker, in_hand, gate, seen = held()
-    worker.put(1)
-    assert in_hand.wait(30)
-    worker.put(2)
-    threading.Timer(0.05, gate.set).start()
-    worker.abort()
-    assert seen == [1]
-
-
-def test_the_consumers_own_error_comes_home() -> None:
-    """Whatever it is: a put that waits raises it, and so does each later one."""
-    worker, in_hand, gate, _ = held()
-    error = SystemExit()
-    worker.put(error)
-    assert in_hand.wait(30)
-    worker.put(1)
-    threading.Timer(0.05, gate.set).start()
-    for item in (2, 3):
-        with pytest.raises(SystemExit) as caught:
-            worker.put(item)
-        assert caught.value is error
-    worker.close()
 
 
 @pytest.mark.parametrize("call", ["close", "abort"])

@@ -102,8 +102,8 @@ def _results_of(directory: Path) -> ReadResults | None:
 def _fields_of_results(results: ReadResults) -> Iterator[dict[str, Any]]:
     for task, columns in results.columns.items():
         for index, result in enumerate(columns):
-            video = columns.videos.get(index)
-            path = None if video is None else results.folder(task) / video.name
+            video = columns.video_path(index)
+            path = None if video is None else results.directory / video
             yield {
                 "task": task,
                 "seed": result.seed,

@@ -31,7 +31,6 @@ _TRANSPARENT = frozenset(
 )
 # Where dm_env's wrappers, dm_control's and ours, keep what they wrap.
 _INSIDE = ("_env", "_environment", "environment")
-_MISSING = object()
 
 
 def around_gymnasium(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
@@ -62,10 +61,10 @@ def around_dm_env(env: Any) -> dict[str, Any]:
     layers: list[Any] = []
     while not _is_innermost(env):
         layers.append(env)
-        inner = _inside(env)
-        if inner is None:
+        inside = (_own(env, name) for name in _INSIDE)
+        env = next((each for each in inside if each is not None), None)
+        if env is None:
             break
-        env = inner
     return _facts(layers, map(_dm_env_limit, [*layers, env]))
 
 
@@ -93,22 +92,12 @@ def _is_innermost(env: Any) -> bool:
     )
 
 
-def _inside(env: Any) -> Any:
-    found = (_own(env, name, _MISSING) for name in _INSIDE)
-    return next((inner for inner in found if inner is not _MISSING), None)
-
-
 def _own(env: Any, name: str, default: Any = None) -> Any:
-    """Return an attribute that an object has itself, without asking what it wraps.
+    """Return an attribute that an object has, without asking what it wraps.
 
     Not by its `__dict__`, for the reason that `has_own_method` gives.
     """
-    kinds = type(env).__mro__
-    of_class = next((vars(k)[name] for k in kinds if name in vars(k)), _MISSING)
-    if hasattr(of_class, "__get__"):
-        return default
     try:
-        found = object.__getattribute__(env, name)
+        return object.__getattribute__(env, name)
     except AttributeError:
         return default
-    return default if found is of_class else found

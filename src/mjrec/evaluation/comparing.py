@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import InvalidArgument, MissingDependency
 from . import statistics
 from .plan import SEEDED
-from .result_columns import ResultColumns
+from .result_tables import ResultColumns
 from .results_files import ReadResults, read_results
 from .statistics import Bootstrap, Estimate, FloatArray
 from .summaries import scaled

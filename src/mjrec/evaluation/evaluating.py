@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluating a policy: the one who hands out the work, and writes down what came of it.
+"""Evaluating a policy: `evaluate` hands out the work, and writes down the results.
 
-The unit of work is an episode, told by task, seed and number; with the protocol
-`"suite"` all episodes of a task and seed. Workers write down each as it ends, in the
-task's folder. This process simulates nothing and, until videos are drawn, needs no
-OpenGL: it may be killed at any time, and whoever goes on repeats nothing.
+Workers record the episodes, chunk by chunk. This process simulates nothing and, until
+videos are drawn, needs no OpenGL: it may be killed at any time, and what goes on with
+the evaluation repeats nothing that is finished.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import inspect
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -26,29 +27,28 @@ from ..errors import (
     DirectoryNotWritable,
     GLError,
     InvalidArgument,
+    PolicyError,
 )
 from ..formats.locks import try_lock
+from ..formats.monitor_directory import names_in
 from ..gl.choice import choose
 from ..provenance import versions
 from ..rendering.engine_jobs import environ_for_drawing
+from ..results import clear_monitor_files
 from ..simulation.model_trust import stored_models
-from .chosen_videos import ChosenVideos, drawn_by_workers, render_chosen
 from .dataclass_json import to_json
 from .episode_results import EpisodeResult
 from .evaluation import Evaluation, EvaluationProgress
-from .following import TaskRun, check_tasks, run_tasks
+from .following import Runner, TaskRun, check_tasks
 from .kept_episodes import keep_rule
-from .ledger import read_ledgers
 from .plan import SEEDED, EvaluationPlan
 from .plan_file import check_continues, read_plan, write_plan
 from .planning import check_score_ranges, plan_from
 from .policy_objects import SentPolicy, sent_policy
-from .recorded_files import RecordedFiles
-from .results_files import PLAN_NAME, ChosenEpisode, write_results
+from .result_tables import EpisodeFiles
+from .results_files import PLAN_NAME, RESULT_NAMES, ChosenEpisode, write_results
 from .statistics import Bootstrap
 from .summaries import (
-    AcrossTasks,
-    TaskSummary,
     default_score_range,
     summarize_across,
     summarize_results,
@@ -69,9 +69,9 @@ _Tell = Callable[[EvaluationProgress], object]
 
 
 def evaluate(
-    tasks: str | Sequence[str],
+    tasks: str | Sequence[str] = (),
     *,
-    policy: Any,
+    policy: Any = None,
     directory: str | os.PathLike[str],
     episodes: int = 10,
     seeds: Iterable[int] | None = None,
@@ -80,24 +80,32 @@ def evaluate(
     keep: str = "best,median,worst",
     protocol: str = SEEDED,
     resume: bool = False,
+    force: bool = False,
     max_steps: int | None = None,
+    episode_timeout: float | None = None,
     camera: str | int | None = None,
     height: int | None = None,
     width: int | None = None,
     max_fps: float | None = 60,
     quality: str = "full",
     env_kwargs: Mapping[str, Any] | None = None,
+    policy_kwargs: Mapping[str, Any] | None = None,
     score_ranges: Mapping[str, tuple[float, float]] | None = None,
     confidence: float = 0.95,
     on_progress: _Tell | None = None,
     engine: Executor | str | None = None,
 ) -> Evaluation:
-    """Run so many episodes of each task, and write down what came of them.
+    """Run N episodes of each task and seed, and write down their results.
 
     Every episode keeps its trajectory, so that any of them can be drawn later. An
     episode in which the policy raises, or gives NaN or the wrong shape, or the
     environment raises, has failed; the others go on. An episode whose worker dies is
     begun again, and has failed when three workers have died of it.
+
+    Each worker makes environment and policy once for each task, and resets them for
+    each episode. Only an environment that draws its model when it is made (`lqr` of
+    dm_control) is made anew for each seed, and one whose frames are drawn while it
+    runs for each episode.
 
     Ctrl-C and other exceptions end the workers; what was finished stays, and the same
     call with `resume=True` goes on.
@@ -110,7 +118,7 @@ def evaluate(
             `module:name()`); or a function of the observation, an object with
             `predict`, or a class that is built with each environment, which is
             pickled and sent to each worker.
-        directory: of the evaluation; empty or new, unless `resume`.
+        directory: of the evaluation; empty or new, unless `resume` or `force`.
         episodes: how many of each task and seed.
         seeds: of the runs.
         num_seeds: how many, from 0 on, instead; 5 if neither is given.
@@ -123,29 +131,34 @@ def evaluate(
         protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
             `"suite"`: each task and seed has one random stream, seeded with s, that
             goes on from episode to episode.
-        resume: go on with the evaluation in the directory. Other tasks and seeds, and
-            more episodes, may be asked for (with the protocol `"suite"` not episodes);
-            what is done already is not repeated. An episode whose worker had died is.
+        resume: go on with the evaluation in the directory. What is not given is as it
+            was. Other tasks, more seeds and more episodes may be asked for (with the
+            protocol `"suite"` not episodes), everything else must be as it was, the
+            policy's code and weights too. What is done already is not repeated.
+        force: delete the evaluation that is in the directory.
         max_steps: ends an episode as truncated; None is the environment's own limit,
             and 1000 where it has none.
+        episode_timeout: an episode that takes more seconds has failed, and its worker
+            is ended.
         camera: of the videos; None is the model's tracking camera where there is one.
         height: of the videos, in pixels; None is the environment's own.
         width: likewise.
         max_fps: the most frames per second of simulated time; None is every step.
         quality: `"full"` or `"draft"`.
         env_kwargs: more arguments for each environment.
+        policy_kwargs: more arguments for the policy.
         score_ranges: the returns that count as 0 and as 1, by task, for what is said
             over all tasks. Those of the dm_control suite have theirs.
         confidence: the share of intervals that hold the true value.
         on_progress: called several times a second with how far it is.
-        engine: where the work runs, instead of processes of this one: an engine, or
+        engine: where the work runs, instead of processes of this one: an executor, or
             `"local"`, `"ray"` or `"slurm"`. Its workers draw the videos, too, those of
             a task as soon as its episodes are over. All of them see the directory
             under the same name. The results do not depend on it.
 
     Returns:
-        What came of it, which stands in the directory too: `results.json`,
-        `results.csv` and `timing.csv`.
+        The results, which stand in the directory too: `results.json`, `results.csv`
+        and `timing.csv`.
 
     Raises:
         MissingDependency: the framework of a task, or what the engine needs, is not
@@ -153,65 +166,68 @@ def evaluate(
         DifferentEvaluation: what is resumed was begun in another way.
         DirectoryInUse: another evaluation writes into the directory.
         PolicyError: the policy cannot be built, or not be sent to other processes.
-        Error: an argument, a task or the policy cannot be. All of these are told
+        Error: an argument, a task or the policy cannot be. All of these are raised
             before anything is run or written.
     """
     how = Bootstrap(confidence=confidence)
+    options: dict[str, Any] = {
+        "episodes": episodes,
+        "keep": keep,
+        "protocol": protocol,
+        "max_steps": max_steps,
+        "episode_timeout": episode_timeout,
+        "camera": camera,
+        "height": height,
+        "width": width,
+        "max_fps": max_fps,
+        "quality": quality,
+        "env_kwargs": env_kwargs,
+        "policy_kwargs": policy_kwargs,
+    }
     given = given_engine(engine, workers)
     local = LocalEngine(workers)
     place = Path(directory)
-    begun = _begun(place, resume=resume)
-    sent = sent_policy(policy)
+    begun = _begun(place, resume=resume, force=force)
+    if begun is not None:
+        options = _as_begun(options, begun)
+        policy = _policy_as_begun(begun) if policy is None else policy
+    if policy is None:
+        raise PolicyError(
+            "An evaluation needs a policy: random, zero, module:name, or an object."
+        )
+    sent = sent_policy(policy, options["policy_kwargs"] or {})
     plan = plan_from(
-        tasks,
-        policy=sent.name,
-        is_object=sent.is_object,
-        episodes=episodes,
-        seeds=seeds,
-        num_seeds=num_seeds,
-        protocol=protocol,
-        keep=keep,
-        max_steps=max_steps,
-        camera=camera,
-        height=height,
-        width=width,
-        max_fps=max_fps,
-        quality=quality,
-        env_kwargs=env_kwargs,
-        folders={} if begun is None else _folders(begun),
+        tasks, sent, seeds=seeds, num_seeds=num_seeds, begun=begun, **options
     )
     ranges = check_score_ranges(score_ranges, [task.name for task in plan.tasks])
     if begun is not None:
         check_continues(place, begun, plan)
-    tell = on_progress or (lambda _: None)
-    results = _Results(plan, place, ranges=ranges, bootstrap=how)
+    results: list[Evaluation] = []
+
+    def take(plan: EvaluationPlan, tasks: Sequence[TaskRun]) -> None:
+        """Write the results, before videos are drawn: that takes long."""
+        found = _evaluation_of(plan, tasks, place, ranges, how)
+        _write(found)
+        results.append(found)
+
     with contextlib.ExitStack() as stack:
-        runs = _run(
+        runner = _run(
             given or local,
             plan,
             sent,
             place,
             is_begun=begun is not None,
             draws=given is not None,
-            # Before the videos, which take long, and may not be possible here.
-            on_results=results.take,
-            tell=tell,
+            on_results=take,
+            tell=on_progress or (lambda _: None),
             stack=stack,
         )
-        videos = ChosenVideos()
-        if any(of.chosen for of in runs):
-            videos = (
-                render_chosen(
-                    place, runs, workers=local.workers, over=results.over, tell=tell
-                )
-                if given is None
-                else drawn_by_workers(place, runs)
-            )
-            results.write()
-        return results.evaluation(videos)
+        if given is None:
+            runner.draw(workers=local.workers)
+    return replace(results[-1], **_videos_of(runner))
 
 
-def _begun(directory: Path, *, resume: bool) -> EvaluationPlan | None:
+def _begun(directory: Path, *, resume: bool, force: bool) -> EvaluationPlan | None:
     """Return the plan of the evaluation that goes on; None where a new one begins.
 
     Raises:
@@ -219,19 +235,19 @@ def _begun(directory: Path, *, resume: bool) -> EvaluationPlan | None:
             is no evaluation.
     """
     there = (directory / PLAN_NAME).exists()
-    if resume and there:
+    if there and resume and not force:
         return read_plan(directory)
-    if not directory.exists():
+    if not directory.exists() or (there and force):
         return None
     if not directory.is_dir():
         raise InvalidArgument(f"{directory} is a file: an evaluation is a directory.")
     if there:
         raise InvalidArgument(
             f"{directory} holds an evaluation already. To go on with it, or to ask for "
-            "more seeds or episodes: resume=True (--resume). For another one, use a "
-            "directory of its own."
+            "more seeds or episodes: resume=True (--resume). To delete it: force=True "
+            "(--force). For another one, use a directory of its own."
         )
-    names = {path.name for path in directory.iterdir()} - {_LOCK_NAME, WORK_FOLDER}
+    names = {*names_in(directory)} - {_LOCK_NAME, WORK_FOLDER}
     if names:
         raise InvalidArgument(
             f"{directory} holds something that is no evaluation ({min(names)} "
@@ -241,8 +257,22 @@ def _begun(directory: Path, *, resume: bool) -> EvaluationPlan | None:
     return None
 
 
-def _folders(plan: EvaluationPlan) -> dict[str, str]:
-    return {task.name: task.folder for task in plan.tasks}
+def _as_begun(options: Mapping[str, Any], begun: EvaluationPlan) -> dict[str, Any]:
+    """Return options, those that were not given as they were when it was begun."""
+    defaults = inspect.signature(evaluate).parameters
+    return {
+        name: getattr(begun, name) if value == defaults[name].default else value
+        for name, value in options.items()
+    }
+
+
+def _policy_as_begun(begun: EvaluationPlan) -> str:
+    if begun.is_object:
+        raise PolicyError(
+            f"The evaluation was begun with an object, {begun.policy}, as its policy: "
+            "give it again, policy=..., to go on."
+        )
+    return begun.policy
 
 
 def _run(
@@ -253,10 +283,10 @@ def _run(
     *,
     is_begun: bool,
     draws: bool,
-    on_results: Callable[[Sequence[TaskRun]], object],
+    on_results: Callable[[EvaluationPlan, Sequence[TaskRun]], object],
     tell: _Tell,
     stack: contextlib.ExitStack,
-) -> list[TaskRun]:
+) -> Runner:
     """Run all tasks; the directory is held until `stack` ends.
 
     Args:
@@ -266,62 +296,90 @@ def _run(
         directory: of the evaluation.
         is_begun: whether it goes on with what is there.
         draws: whether the workers draw, too.
-        on_results: as of `run_tasks`.
-        tell: likewise.
+        on_results: called with the plan and the tasks, when all episodes are over.
+        tell: called with how far it is.
         stack: see above.
     """
     if is_begun:
         stack.enter_context(_held(directory))
-    done = _done(plan, directory, is_begun=is_begun)
-    work = Work(
-        entry=_WORKER,
-        settings={
-            "directory": str(directory.absolute()),
-            "plan": to_json(plan),
-            # What works here may not work where an engine has its workers.
-            "chooses_gl": draws,
-            # Of what was recorded before; their homes may be others.
-            "models": stored_models(
-                directory / task.folder for task in plan.tasks if is_begun and draws
-            ),
-        },
-        payload=sent.payload,
-        environ=_environ_of_workers(plan, draws=draws),
-        shared_directory=directory.absolute(),
+    folders = (
+        directory / task.folder / chunk.folder
+        for task in plan.tasks
+        for chunk in plan.chunks
     )
+    environ = _environ_of_workers(plan, draws=draws)
     is_here = isinstance(engine, LocalEngine)
-    # What is quick is done here: nothing has to wait in a cluster's queue.
-    with Run(engine if is_here else LocalEngine(1), work) as home:
-        left = [task for task in plan.tasks if _is_left(plan, done[task.name])]
-        checked = check_tasks(home, plan, left)
+    with contextlib.ExitStack() as working:
+        policy = working.enter_context(_stored_policy(sent, directory))
+        work = Work(
+            entry=_WORKER,
+            settings={
+                "directory": str(directory.absolute()),
+                # Each job brings its own chunk.
+                "plan": to_json(replace(plan, chunks=())),
+                "policy": policy,
+                # What works here may not work where an engine has its workers.
+                "chooses_gl": draws,
+                # Of what was recorded before; their homes may be others.
+                "models": stored_models(folders) if is_begun and draws else [],
+            },
+            environ=environ,
+            shared_directory=directory.absolute(),
+        )
+        # What is quick is done here: nothing has to wait in a cluster's queue.
+        home = working.enter_context(Run(engine if is_here else LocalEngine(1), work))
+        unknown = [task for task in plan.tasks if task.step_limit is None]
+        checked = check_tasks(home, plan, unknown)
+        limits = {name: said["step_limit"] for name, said in checked.items()}
+        plan = replace(
+            plan,
+            tasks=tuple(
+                replace(task, step_limit=limits.get(task.name, task.step_limit))
+                for task in plan.tasks
+            ),
+        )
         if not is_begun:
             _make(directory)
             stack.enter_context(_held(directory))
+            _clear(directory)
         write_plan(directory, plan)
-        run = home if is_here else stack.enter_context(Run(engine, work))
-        # Once more: workers of a driver that was killed have gone on until now.
-        done = _done(plan, directory, is_begun=is_begun)
-        return run_tasks(
+        run = home if is_here else working.enter_context(Run(engine, work))
+        runner = Runner(
             run,
-            home,
             plan,
             directory,
-            done=done,
-            checked=checked,
             draws=draws,
-            on_results=on_results,
+            on_results=lambda tasks: on_results(plan, tasks),
             tell=tell,
         )
+        runner.run({name: said["velocities"] for name, said in checked.items()})
+        return runner
 
 
-def _done(
-    plan: EvaluationPlan, directory: Path, *, is_begun: bool
-) -> dict[str, dict[tuple[int, int], EpisodeResult]]:
-    """Return the results of the episodes that are over, by task."""
-    return {
-        task.name: read_ledgers(directory / task.folder) if is_begun else {}
-        for task in plan.tasks
-    }
+@contextlib.contextmanager
+def _stored_policy(sent: SentPolicy, directory: Path) -> Iterator[str | None]:
+    """Store an object once for all workers, by its digest, while the run lasts."""
+    if sent.payload is None:
+        yield None
+        return
+    folder = directory.absolute() / WORK_FOLDER
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    path = folder / f"policy-{hashlib.sha256(sent.payload).hexdigest()[:16]}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # Only its owner reads it.
+        path.touch(mode=0o600)
+        path.write_bytes(sent.payload)
+    except OSError as error:
+        raise DirectoryNotWritable(directory, error.strerror) from error
+    try:
+        yield str(path)
+    finally:
+        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+            for each in missing[1:]:
+                each.rmdir()
 
 
 def _environ_of_workers(plan: EvaluationPlan, *, draws: bool) -> dict[str, str]:
@@ -331,19 +389,17 @@ def _environ_of_workers(plan: EvaluationPlan, *, draws: bool) -> dict[str, str]:
             **{name: os.environ.get(name, value) for name, value in wanted.items()},
             **environ_for_drawing(),
         }
-    if not keep_rule(plan.keep).keeps_none and _GL not in os.environ:
-        # A task that is drawn live needs a backend that works.
-        with contextlib.suppress(GLError):
+    if not keep_rule(plan.keep).keeps_none:
+        # Now, and not after hours. A task that is drawn live needs it in its worker.
+        try:
             wanted[_GL] = choose().backend
+        except GLError as error:
+            logger.warning(
+                "No video can be drawn here, and those that are chosen will stay "
+                "pending (--keep none wants none): %s",
+                error,
+            )
     return {name: value for name, value in wanted.items() if name not in os.environ}
-
-
-def _is_left(plan: EvaluationPlan, done: Mapping[tuple[int, int], object]) -> bool:
-    return any(
-        (seed, number) not in done
-        for seed in plan.seeds
-        for number in range(plan.episodes)
-    )
 
 
 def _make(directory: Path) -> None:
@@ -351,6 +407,26 @@ def _make(directory: Path) -> None:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DirectoryNotWritable(directory, error.strerror) from error
+
+
+def _clear(directory: Path) -> None:
+    """Delete the evaluation in a directory, if there is one, and nothing else.
+
+    Raises:
+        DirectoryInUse: a monitor of it is open.
+    """
+    if not (directory / PLAN_NAME).exists():
+        return
+    plan = read_plan(directory)
+    for task in plan.tasks:
+        folders = [directory / task.folder / chunk.folder for chunk in plan.chunks]
+        for folder in folders:
+            clear_monitor_files(folder)
+        for folder in (*folders, directory / task.folder):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+    for name in RESULT_NAMES:
+        (directory / name).unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -371,101 +447,16 @@ def _held(directory: Path) -> Iterator[None]:
         lock.release()
 
 
-class _Results:
-    """What an evaluation comes to, in its directory.
-
-    Args:
-        plan: what is evaluated.
-        directory: of the evaluation.
-        ranges: the returns that count as 0 and as 1, by task.
-        bootstrap: how intervals are made.
-    """
-
-    def __init__(
-        self,
-        plan: EvaluationPlan,
-        directory: Path,
-        *,
-        ranges: Mapping[str, tuple[float, float]],
-        bootstrap: Bootstrap,
-    ) -> None:
-        self._plan = plan
-        self._directory = directory
-        self._ranges = ranges
-        self._bootstrap = bootstrap
-        self._evaluation: Evaluation | None = None
-
-    def take(self, runs: Sequence[TaskRun]) -> None:
-        """Take in what came of the tasks, which are settled, and write it down."""
-        summaries, across = _summarized(self._plan, runs, self._ranges, self._bootstrap)
-        selection = {
-            of.task.name: [
-                ChosenEpisode(result.seed, result.episode, role)
-                for result, role in of.chosen
-            ]
-            for of in runs
-        }
-        self._evaluation = Evaluation(
-            directory=self._directory,
-            plan=self._plan,
-            results=[result for of in runs for result in of.results],
-            summaries=summaries,
-            across=across,
-            bootstrap=self._bootstrap,
-            selection=selection,
-        )
-        self.write()
-
-    @property
-    def over(self) -> EvaluationProgress:
-        """How far an evaluation is of which only videos are left."""
-        results = self._known.results
-        return EvaluationProgress(
-            done=len(results), failed=len(self._known.failed), total=len(results)
-        )
-
-    def evaluation(self, videos: ChosenVideos) -> Evaluation:
-        """Return all of it."""
-        return replace(self._known, videos=videos.there, pending=videos.pending)
-
-    def write(self) -> None:
-        """Write it down, with the files that are there now."""
-        known = self._known
-        files = {
-            task.name: RecordedFiles(
-                self._directory / task.folder,
-                {(each.seed, each.episode) for each in known.selection[task.name]},
-            )
-            for task in self._plan.tasks
-        }
-        write_results(
-            self._directory,
-            plan=self._plan,
-            results=known.results,
-            summaries=known.summaries,
-            across=known.across,
-            bootstrap=self._bootstrap,
-            selection=known.selection,
-            versions=versions(),
-            files=lambda result: files[result.task].of(result),
-        )
-
-    @property
-    def _known(self) -> Evaluation:
-        # `run_tasks` ends when all tasks have been taken in.
-        assert self._evaluation is not None
-        return self._evaluation
-
-
-def _summarized(
+def _evaluation_of(
     plan: EvaluationPlan,
-    runs: Sequence[TaskRun],
+    tasks: Sequence[TaskRun],
+    directory: Path,
     ranges: Mapping[str, tuple[float, float]],
     bootstrap: Bootstrap,
-) -> tuple[list[TaskSummary], AcrossTasks]:
+) -> Evaluation:
     scales = {
         task.name: ranges.get(task.name)
-        or default_score_range(task.name, plan.max_steps)
+        or default_score_range(task.name, task.step_limit)
         for task in plan.tasks
     }
     summaries = [
@@ -475,12 +466,64 @@ def _summarized(
             score_range=scales[of.task.name],
             bootstrap=bootstrap,
         )
-        for of in runs
+        for of in tasks
     ]
     returns = {
         of.task.name: [
             each.total_reward for each in of.results if each.total_reward is not None
         ]
-        for of in runs
+        for of in tasks
     }
-    return summaries, summarize_across(returns, scales, bootstrap=bootstrap)
+    return Evaluation(
+        directory=directory,
+        plan=plan,
+        results=[result for of in tasks for result in of.results],
+        summaries=summaries,
+        across=summarize_across(returns, scales, bootstrap=bootstrap),
+        bootstrap=bootstrap,
+        selection={
+            of.task.name: [
+                ChosenEpisode(result.seed, result.episode, role)
+                for result, role in of.chosen
+            ]
+            for of in tasks
+        },
+    )
+
+
+def _write(evaluation: Evaluation) -> None:
+    names: dict[Path, set[str]] = {}
+
+    def files(result: EpisodeResult) -> EpisodeFiles:
+        folder = evaluation.folder_of(result)
+        if folder not in names:
+            names.clear()
+            names[folder] = {*names_in(folder)} if folder.is_dir() else set()
+        return evaluation.files_of(result, names[folder])
+
+    write_results(
+        evaluation.directory,
+        plan=evaluation.plan,
+        results=evaluation.results,
+        summaries=evaluation.summaries,
+        across=evaluation.across,
+        bootstrap=evaluation.bootstrap,
+        selection=evaluation.selection,
+        versions=versions(),
+        files=files,
+    )
+
+
+def _videos_of(runner: Runner) -> dict[str, Any]:
+    """Return the videos that are there, and why others are not, by their paths."""
+    videos, pending = [], {}
+    for video in (video for of in runner.tasks for video in of.videos):
+        if video.path.exists():
+            videos.append(video.path)
+        else:
+            why = runner.not_drawn.get(video.path, "Its frames were not recorded.")
+            pending[video.path] = f"{why} To try again: mjrec render {video.folder}"
+    for reason in dict.fromkeys(pending.values()):
+        names = [str(path) for path in pending if pending[path] == reason]
+        logger.warning("%s: %s", ", ".join(names), reason)
+    return {"videos": videos, "pending": pending}

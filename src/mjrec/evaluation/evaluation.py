@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+import math
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
+from .result_tables import EpisodeFiles
 from .results_files import ChosenEpisode
 from .statistics import Bootstrap
 from .summaries import AcrossTasks, TaskSummary
@@ -25,8 +29,8 @@ class EvaluationProgress:
         total: how many there are.
         videos_done: how many videos are over.
         videos: how many there are, as far as is known.
-        frames_done: how many frames of the present task's videos are drawn; 0 where
-            the workers of an engine draw.
+        frames_done: how many frames of these videos are drawn; 0 where the workers of
+            an engine draw.
         frames: how many frames these videos have; likewise.
     """
 
@@ -69,6 +73,60 @@ class Evaluation:
     def failed(self) -> Sequence[EpisodeResult]:
         """The episodes that could not be completed."""
         return [each for each in self.results if each.failure is not None]
+
+    @property
+    def not_finite(self) -> Sequence[EpisodeResult]:
+        """The completed episodes whose return is NaN or infinite."""
+        returns = ((each, each.total_reward) for each in self.results)
+        return [each for each, r in returns if r is not None and not math.isfinite(r)]
+
+    def folder_of(self, result: EpisodeResult) -> Path:
+        """Return the monitor directory that an episode was recorded into."""
+        (folder,) = (t.folder for t in self.plan.tasks if t.name == result.task)
+        chunk = self.plan.chunk_of(result.unit)
+        return self.directory / folder / ("" if chunk is None else chunk.folder)
+
+    def file_of(self, result: EpisodeResult) -> Path | None:
+        """Return the video of an episode, or its trajectory where there is none."""
+        names = self.files_of(result, None)
+        folder = self.folder_of(result)
+        paths = [folder / each for each in (names.video, names.trajectory) if each]
+        return next((path for path in paths if path.exists()), None)
+
+    def files_of(
+        self, result: EpisodeResult, names: Container[str] | None
+    ) -> EpisodeFiles:
+        """Return which files are an episode's.
+
+        Args:
+            result: the episode.
+            names: of all files in its folder; None is any that it may have.
+        """
+        infix = Infix.parse(result.monitor or "")
+        if infix is None or result.episode_id is None:
+            return EpisodeFiles()
+        trajectory = f"{trajectory_prefix(infix, result.episode_id)}.h5"
+        prefix = video_prefix(infix, result.episode_id)
+        chosen = self._chosen.get(result.task, ())
+        video = f"{prefix}.mp4"
+        if names is not None:
+            # Text is recorded as such.
+            text = f"{prefix}.json"
+            is_chosen = result.unit in chosen
+            video = text if text in names else video if is_chosen else ""
+            trajectory = trajectory if trajectory in names else ""
+        return EpisodeFiles(
+            folder=self.folder_of(result).relative_to(self.directory).as_posix(),
+            trajectory=trajectory or None,
+            video=video or None,
+        )
+
+    @functools.cached_property
+    def _chosen(self) -> Mapping[str, set[tuple[int, int]]]:
+        return {
+            task: {(each.seed, each.episode) for each in chosen}
+            for task, chosen in self.selection.items()
+        }
 
     def summary(self, task: str) -> TaskSummary:
         """Return what is said of one task.

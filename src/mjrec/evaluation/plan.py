@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is to be evaluated, and the pieces that it is handed out in."""
+"""What is evaluated, and the chunks in which it is run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -14,6 +15,9 @@ Protocol: TypeAlias = Literal["seeded", "suite"]
 SEEDED: Protocol = "seeded"
 SUITE: Protocol = "suite"
 
+Unit: TypeAlias = tuple[int, int]
+"""Seed and number, which tell an episode from the others of its task."""
+
 _Positive: TypeAlias = Annotated[int, positive]
 
 
@@ -23,32 +27,64 @@ class EvaluatedTask:
 
     Attributes:
         name: as `environments.names.parse_environment_name` takes it.
-        folder: the base name of its monitor directory, inside that of the evaluation.
+        folder: the base name of its folder in the evaluation's directory.
+        step_limit: after how many steps its episodes end; None where it was not made.
     """
 
     name: str
     folder: Annotated[str, base_name]
+    step_limit: _Positive | None = None
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Episodes that one job runs, into a monitor directory of their own.
+
+    Attributes:
+        folder: the base name of that directory, in the folder of each task.
+        seeds: of the episodes, rising.
+        first: the number of each seed's first episode.
+        stop: the number after its last.
+    """
+
+    folder: Annotated[str, base_name]
+    seeds: tuple[int, ...]
+    first: int
+    stop: int
+
+    def __iter__(self) -> Iterator[Unit]:
+        """Yield the episodes in the order in which they are run."""
+        for seed in self.seeds:
+            for number in range(self.first, self.stop):
+                yield seed, number
+
+    def __len__(self) -> int:
+        return len(self.seeds) * (self.stop - self.first)
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationPlan:
-    """What is to be evaluated, checked. It stands in `evaluation.json`.
+    """What is evaluated, checked. It stands in `evaluation.json`.
 
     What it means (whether there are such tasks, such a rule) is not checked when it is
     read back.
 
     Attributes:
         tasks: in the order of the results.
-        policy: `random`, `zero`, `module:name`, or what an object is called whose
-            bytes travel beside the plan (`is_object`).
+        policy: a text as in `mjrec record`, or what an object is called whose bytes
+            travel beside the plan (`is_object`).
         is_object: whether the policy is such an object.
+        policy_kwargs: more arguments for it.
+        policy_digests: SHA-256 of the policy's parts, by what they are.
         seeds: in the order of the results.
         episodes: of each task and seed.
         protocol: `"seeded"`: episode i of seed s starts from `SeedSequence([s, i])`.
             `"suite"`: the environment has one random stream for each task and seed.
+        chunks: in which the episodes of each task are run.
         keep: which episodes get a video, as `evaluation.kept_episodes` reads it.
         max_steps: ends an episode as truncated; None is the environment's own limit,
             and 1000 where it has none.
+        episode_timeout: seconds after which an episode has failed; None is never.
         camera: of the videos; None is the model's tracking camera where there is one.
         height: of the videos; None is the environment's own.
         width: likewise.
@@ -60,11 +96,15 @@ class EvaluationPlan:
     tasks: tuple[EvaluatedTask, ...]
     policy: str
     is_object: bool = False
+    policy_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    policy_digests: Mapping[str, str] = field(default_factory=dict)
     seeds: tuple[int, ...]
     episodes: _Positive
     protocol: Protocol = SEEDED
+    chunks: tuple[Chunk, ...] = ()
     keep: str = "best,median,worst"
     max_steps: _Positive | None = None
+    episode_timeout: float | None = None
     camera: str | int | None = None
     height: _Positive | None = None
     width: _Positive | None = None
@@ -72,22 +112,22 @@ class EvaluationPlan:
     quality: Annotated[str, one_of(*QUALITIES)] = "full"
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
 
+    def chunk_of(self, unit: Unit) -> Chunk | None:
+        """Return the chunk that an episode is in."""
+        seed, number = unit
+        chunks = self._chunks_by_seed.get(seed, ())
+        return next((each for each in chunks if each.first <= number < each.stop), None)
 
-@dataclass(frozen=True, kw_only=True)
-class Batch:
-    """Episodes of one task and seed that one worker runs, one after the other.
+    @functools.cached_property
+    def _chunks_by_seed(self) -> Mapping[int, list[Chunk]]:
+        chunks: dict[int, list[Chunk]] = {}
+        for chunk in self.chunks:
+            for seed in chunk.seeds:
+                chunks.setdefault(seed, []).append(chunk)
+        return chunks
 
-    With the protocol `"suite"` it is all episodes of the task and seed, and done as a
-    whole or not at all; else any of them, each done by itself.
-
-    Attributes:
-        task: its name.
-        folder: its monitor directory's base name.
-        seed: of the run.
-        episodes: their numbers, rising.
-    """
-
-    task: str
-    folder: str
-    seed: int
-    episodes: tuple[int, ...]
+    def __iter__(self) -> Iterator[Unit]:
+        """Yield the episodes of each task in the order of the results."""
+        for seed in self.seeds:
+            for number in range(self.episodes):
+                yield seed, number

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from .. import atomic_files
 from ..errors import DifferentEvaluation, UnreadableFile
@@ -14,8 +13,8 @@ from .dataclass_json import from_json, to_json
 from .plan import SUITE, EvaluationPlan
 from .results_files import FORMAT_VERSION, PLAN_NAME
 
-# What may be asked for anew: each task, seed and episode stands for itself.
-_MAY_DIFFER = ("tasks", "seeds")
+# What may be asked for anew, and what follows from it or changes no result.
+_MAY_DIFFER = ("tasks", "chunks", "episode_timeout")
 
 
 def write_plan(directory: Path, plan: EvaluationPlan) -> None:
@@ -52,32 +51,27 @@ def check_continues(
 ) -> None:
     """Check that what is asked for goes on with what was begun.
 
-    Other tasks and seeds may be asked for, and more episodes; with the protocol
+    Other tasks and more seeds may be asked for, and more episodes; with the protocol
     `"suite"` not those, whose number belongs to the unit of work. All else makes other
-    results, or other videos; and whoever leaves episodes out has seen their returns.
+    results, or other videos; and those who leave episodes out have seen their returns.
 
     Raises:
         DifferentEvaluation: it does not.
     """
     was, now = to_json(begun), to_json(asked)
+    for plan in (was, now):
+        plan["policy"] = "an object" if plan.pop("is_object") else plan["policy"]
+        for part, digest in plan.pop("policy_digests").items():
+            plan[f"policy ({part})"] = f"{digest[:12]}..."
+    may_differ = [*_MAY_DIFFER]
+    if set(begun.seeds) <= set(asked.seeds):
+        may_differ.append("seeds")
+    if asked.protocol != SUITE and asked.episodes > begun.episodes:
+        may_differ.append("episodes")
     differences = {
-        name: (was[name], now[name])
-        for name in now
-        if was[name] != now[name] and not _may_differ(name, begun, asked)
+        name: (was.get(name), now.get(name))
+        for name in was | now
+        if was.get(name) != now.get(name) and name not in may_differ
     }
     if differences:
-        raise DifferentEvaluation(directory, _named(differences))
-
-
-def _may_differ(name: str, begun: EvaluationPlan, asked: EvaluationPlan) -> bool:
-    if name == "episodes":
-        return asked.protocol != SUITE and asked.episodes > begun.episodes
-    return name in _MAY_DIFFER
-
-
-def _named(differences: dict[str, Any]) -> dict[str, Any]:
-    if "is_object" in differences:
-        policies = ("named by a text", "an object")
-        was, now = differences.pop("is_object")
-        differences.setdefault("policy", (policies[was], policies[now]))
-    return differences
+        raise DifferentEvaluation(directory, differences)

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what a person asks for to a plan, checked without making an environment."""
+"""From what is asked for to a plan, checked without making an environment."""
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -18,7 +21,8 @@ from ..frames import check_quality
 from ..json_text import loads
 from ..rates import to_rate
 from .kept_episodes import keep_rule
-from .plan import SEEDED, SUITE, EvaluatedTask, EvaluationPlan
+from .plan import SEEDED, SUITE, Chunk, EvaluatedTask, EvaluationPlan
+from .policy_objects import SentPolicy
 from .task_sets import tasks_from
 
 DEFAULT_SEEDS = 5
@@ -28,69 +32,102 @@ _MOST_UNITS = 4_000_000
 _OUTSIDE = re.compile(r"[^A-Za-z0-9._-]")
 _LONGEST_FOLDER = 100
 
+# A chunk costs about a tenth of a second and six files. So many processes have work
+# for one task, and larger chunks would save little.
+_USUAL_CHUNKS = 8
+_MOST_EPISODES_OF_CHUNK = 25
+
 
 def plan_from(
     tasks: str | Sequence[str],
+    sent: SentPolicy,
     *,
-    policy: str,
-    is_object: bool,
-    episodes: int,
     seeds: Iterable[int] | None,
     num_seeds: int | None,
-    protocol: str,
-    keep: str,
-    max_steps: int | None,
-    camera: str | int | None,
-    height: int | None,
-    width: int | None,
-    max_fps: float | None,
-    quality: str,
-    env_kwargs: Mapping[str, Any] | None,
-    folders: Mapping[str, str] | None = None,
+    begun: EvaluationPlan | None = None,
+    **options: Any,
 ) -> EvaluationPlan:
-    """Return the plan of an evaluation; `mjrec.evaluate` says what each means.
+    """Return the plan of an evaluation; `mjrec.evaluate` says what each option means.
 
-    `folders` are those that tasks have already, in an evaluation that is resumed.
+    Args:
+        tasks: as of `evaluate`; those of `begun`, if empty.
+        sent: the policy.
+        seeds: as of `evaluate`; those of `begun`, if neither they nor their number
+            is given.
+        num_seeds: likewise.
+        begun: the plan that is gone on with: folders and chunks stay.
+        **options: fields of the plan, all but `tasks`, `seeds` and what follows.
 
     Raises:
         UnknownName, InvalidArgument: something cannot be.
         MissingDependency, EnvironmentNotMade: see `tasks_from`.
     """
     # What is quick to check comes first: sets of tasks start a process.
-    if protocol not in _PROTOCOLS:
-        raise UnknownName("protocol", protocol, _PROTOCOLS)
-    checked_seeds = _seeds(seeds, num_seeds)
-    count = _positive("episodes", episodes)
-    episode_seeds(checked_seeds[0], count - 1)
-    rule = keep_rule(keep)
-    EnvironmentOptions(max_steps=max_steps, height=height, width=width)
-    if max_fps is not None:
-        to_rate(max_fps, name="max_fps")
-    check_quality(quality)
-    kwargs = _json_of(env_kwargs or {})
-    names = tasks_from(tasks)
-    units = len(names) * len(checked_seeds) * count
+    if options["protocol"] not in _PROTOCOLS:
+        raise UnknownName("protocol", options["protocol"], _PROTOCOLS)
+    is_same = begun is not None and seeds is None and num_seeds is None
+    checked_seeds = begun.seeds if begun and is_same else _seeds(seeds, num_seeds)
+    options["episodes"] = _positive("episodes", options["episodes"])
+    episode_seeds(checked_seeds[0], options["episodes"] - 1)
+    options["keep"] = keep_rule(options["keep"]).name
+    for name in ("max_steps", "height", "width"):
+        if options[name] is not None:
+            options[name] = _positive(name, options[name])
+    EnvironmentOptions(**{name: options[name] for name in ("height", "width")})
+    if options["max_fps"] is not None:
+        to_rate(options["max_fps"], name="max_fps")
+        options["max_fps"] = float(options["max_fps"])
+    if (timeout := options["episode_timeout"]) is not None and not 0 < timeout < 1e9:
+        raise InvalidArgument(f"episode_timeout is in seconds, got {timeout!r}.")
+    check_quality(options["quality"])
+    for name in ("env_kwargs", "policy_kwargs"):
+        options[name] = _json_of(name, options[name] or {})
+    known = begun.tasks if begun else ()
+    names = tasks_from(tasks) if tasks or not known else [each.name for each in known]
+    units = len(names) * len(checked_seeds) * options["episodes"]
     if units > _MOST_UNITS:
         raise InvalidArgument(
-            f"{len(names)} tasks, {len(checked_seeds)} seeds and {count} episodes are "
-            f"{units} episodes; an evaluation has at most {_MOST_UNITS}."
+            f"{len(names)} tasks, {len(checked_seeds)} seeds and "
+            f"{options['episodes']} episodes are {units} episodes; an evaluation has "
+            f"at most {_MOST_UNITS}."
         )
-    return EvaluationPlan(
-        tasks=_with_folders(names, folders or {}),
-        policy=policy,
-        is_object=is_object,
+    plan = EvaluationPlan(
+        tasks=_with_folders(names, known),
+        policy=sent.name,
+        is_object=sent.is_object,
+        policy_digests=sent.digests,
         seeds=checked_seeds,
-        episodes=count,
-        protocol=SUITE if protocol == SUITE else SEEDED,
-        keep=rule.name,
-        max_steps=None if max_steps is None else int(max_steps),
-        camera=camera,
-        height=None if height is None else int(height),
-        width=None if width is None else int(width),
-        max_fps=None if max_fps is None else float(max_fps),
-        quality=quality,
-        env_kwargs=kwargs,
+        **options,
     )
+    chunks = chunks_of(plan, begun.chunks if begun else ())
+    return dataclasses.replace(plan, chunks=chunks)
+
+
+def chunks_of(plan: EvaluationPlan, known: Sequence[Chunk]) -> tuple[Chunk, ...]:
+    """Return the chunks of a plan: those that are known, and those of what is left.
+
+    A chunk is one seed or consecutive seeds; with the protocol `"seeded"`, where each
+    episode stands for itself, a seed with many episodes is cut.
+    """
+    stops = {seed: chunk.stop for chunk in known for seed in chunk.seeds}
+    left: dict[int, list[int]] = {}
+    for seed in sorted(plan.seeds):
+        if (first := stops.get(seed, 0)) < plan.episodes:
+            left.setdefault(first, []).append(seed)
+    total = sum((plan.episodes - first) * len(seeds) for first, seeds in left.items())
+    most = min(_MOST_EPISODES_OF_CHUNK, math.ceil(total / _USUAL_CHUNKS))
+    chunks = list(known)
+    for first, seeds in left.items():
+        count = plan.episodes - first
+        parts = 1 if plan.protocol == SUITE else math.ceil(count / most)
+        cuts = [first + count * part // parts for part in range(parts + 1)]
+        at_once = max(1, most // count)
+        for index in range(0, len(seeds), at_once):
+            group = tuple(seeds[index : index + at_once])
+            for start, stop in itertools.pairwise(cuts):
+                name = _chunk_name(group, start, stop, plan.episodes)
+                chunks.append(Chunk(name, group, start, stop))
+    return tuple(chunks)
 
 
 def check_score_ranges(
@@ -109,6 +146,16 @@ def check_score_ranges(
             raise UnknownName("task with a score range in this evaluation", task, names)
         checked[task] = _score_range(task, given)
     return checked
+
+
+def _chunk_name(seeds: Sequence[int], first: int, stop: int, episodes: int) -> str:
+    name = f"seed-{seeds[0]:03d}"
+    if len(seeds) > 1:
+        name += f"-{seeds[-1]:03d}"
+    if (first, stop) != (0, episodes):
+        name += f"-episode-{first:03d}"
+        name += f"-{stop - 1:03d}" if stop - first > 1 else ""
+    return name
 
 
 def _score_range(task: str, given: Any) -> tuple[float, float]:
@@ -152,15 +199,15 @@ def _positive(name: str, value: object) -> int:
     return int(value)  # type: ignore[call-overload, no-any-return]  # it is a number
 
 
-def _json_of(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+def _json_of(what: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Return arguments as they come out of JSON, which is how they reach a worker."""
     kwargs = {}
-    for name, value in env_kwargs.items():
+    for name, value in given.items():
         try:
             kwargs[name] = loads(json.dumps(value, allow_nan=False))
         except (TypeError, ValueError, RecursionError) as error:
             raise InvalidArgument(
-                "env_kwargs go to other processes, and into a file, as JSON (texts, "
+                f"{what} go to other processes, and into a file, as JSON (texts, "
                 f"numbers, lists and objects of them), and {name!r} cannot, which is "
                 f"{value!r}: {error}."
             ) from error
@@ -168,21 +215,22 @@ def _json_of(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _with_folders(
-    names: Sequence[str], known: Mapping[str, str]
+    names: Sequence[str], known: Sequence[EvaluatedTask]
 ) -> tuple[EvaluatedTask, ...]:
-    folders = dict(known)
+    tasks = {task.name: task for task in known}
     for name in names:
-        if name not in folders:
-            folders[name] = _folder(name, set(folders.values()))
-    return tuple(EvaluatedTask(name, folders[name]) for name in names)
+        if name not in tasks:
+            taken = {task.folder for task in tasks.values()}
+            tasks[name] = EvaluatedTask(name, _folder(name, taken))
+    return tuple(tasks[name] for name in names)
 
 
 def _folder(name: str, taken: set[str]) -> str:
     parsed = parse_environment_name(name)
-    # Where a file lies is nobody's business who is shown the results.
+    # Where a file lies is not told to those who are shown the results.
     text = parsed.path.name if isinstance(parsed, MjcfName) else name
     base = _OUTSIDE.sub(_encoded, text.replace("/", "-"))[:_LONGEST_FOLDER]
-    # It is no hidden one, and none that leads elsewhere.
+    # Not a hidden one, nor one that leads elsewhere.
     base = f"-{base}" if base.startswith(".") else base
     folder, number = base, 1
     while folder in taken:

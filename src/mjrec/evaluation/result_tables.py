@@ -12,10 +12,10 @@ Truth is `true`, `false`, or empty where nothing is known; numbers are as Python
 `timing.csv` holds what is different in every run: wall times, and which files an
 episode is in. Its rows are those of the same episodes, in the same order::
 
-    task,seed,episode,start,seconds,monitor,episode_id,trajectory,video,video_sha256
+    task,seed,episode,start,seconds,folder,monitor,episode_id,trajectory,video
 
-What is read may have been written by anybody: everything is checked, no row can be
-longer than `_LONGEST_LINE`, and rows go into columns, never into objects.
+What is read may have been written by anybody: all that is used of it is checked, no row
+can be longer than `_LONGEST_LINE`, and rows go into columns, never into objects.
 """
 
 from __future__ import annotations
@@ -24,40 +24,43 @@ import csv
 import io
 import math
 import re
-from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TextIO
+from typing import Final, TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..formats.json_fields import unreadable
-from ..formats.monitor_directory import Infix, trajectory_prefix, video_prefix
+from ..formats.monitor_directory import Infix, video_prefix
 from ..formats.regular_files import open_regular
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
-from .result_columns import ResultColumns, ResultVideo
 
-_RESULTS = (
-    *("task", "seed", "episode", "return", "length"),
+_UNIT: Final = ("task", "seed", "episode")
+_RESULTS: Final = (
+    *(*_UNIT, "return", "length"),
     *("terminated", "truncated", "success", "failure"),
 )
-_TIMING = (
-    *("task", "seed", "episode", "start", "seconds", "monitor", "episode_id"),
-    *("trajectory", "video", "video_sha256"),
+_TIMING: Final = (
+    *(*_UNIT, "start", "seconds", "folder", "monitor"),
+    *("episode_id", "trajectory", "video"),
 )
 
 # A name, a few numbers and one line of an error; csv's own limit for a field is twice
 # as much.
-_LONGEST_LINE = 1 << 16
-_LONGEST_FAILURE = 2000
-_MOST_ROWS = 4_000_000
+_LONGEST_LINE: Final = 1 << 16
+_LONGEST_FAILURE: Final = 2000
+_MOST_ROWS: Final = 4_000_000
 
-_WHOLE = re.compile(r"[0-9]{1,18}", re.ASCII)
-_NUMBER = re.compile(r"-?([0-9]{1,40}(\.[0-9]{1,40})?(e[+-]?[0-9]{1,4})?|inf)|nan")
-_SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
-_TRUTH = {"true": 1, "false": 0, "": -1}
+_WHOLE: Final = re.compile(r"[0-9]{1,18}", re.ASCII)
+_NUMBER: Final = re.compile(
+    r"-?([0-9]{1,40}(\.[0-9]{1,40})?(e[+-]?[0-9]{1,4})?|inf)|nan"
+)
+_FOLDER: Final = re.compile(r"(?!\.)[^/\0]{1,255}(/(?!\.)[^/\0]{1,255})?")
+_TRUTH: Final = {"true": 1, "false": 0, "": -1}
+_MEANING: Final = {1: True, 0: False, -1: None}
 
 
 @dataclass(frozen=True)
@@ -65,12 +68,101 @@ class EpisodeFiles:
     """The files of an episode.
 
     Attributes:
+        folder: its monitor directory, in that of the evaluation; None where it has no
+            files.
         trajectory: the base name of its trajectory, None where it has none.
-        video: its video, finished or pending; None where it gets none.
+        video: that of its video, finished or pending; None where it gets none.
     """
 
+    folder: str | None = None
     trajectory: str | None = None
-    video: ResultVideo | None = None
+    video: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultColumns:
+    """The episodes of one task, in the order of the plan: by seed, then by number.
+
+    A million of them take 70 MB. Where -1 stands, nothing is known.
+
+    Attributes:
+        task: the environment's name.
+        seed: `(n,) int64`.
+        episode: `(n,) int64`, the number in its run.
+        total_reward: `(n,) float64`; NaN where it failed, and where that is the return.
+        length: `(n,) int64`, steps.
+        terminated: `(n,) int8`: 1, 0 or -1.
+        truncated: `(n,) int8`, likewise.
+        success: `(n,) int8`, likewise.
+        start_time: `(n,) float64`, wall clock in seconds; NaN where it is not known.
+        seconds: `(n,) float64`, how long it took, likewise.
+        monitor: `(n,) int32`, index into `monitors`, or -1.
+        episode_id: `(n,) int64`, the number in that monitor, or -1.
+        failures: why, by index, of those that failed.
+        places: the indices of the monitors that recorded them, by monitor directory, in
+            that of the evaluation, and infix.
+        videos: by index, the base names of the videos of those that get one.
+    """
+
+    task: str
+    seed: NDArray[np.int64]
+    episode: NDArray[np.int64]
+    total_reward: NDArray[np.float64]
+    length: NDArray[np.int64]
+    terminated: NDArray[np.int8]
+    truncated: NDArray[np.int8]
+    success: NDArray[np.int8]
+    start_time: NDArray[np.float64]
+    seconds: NDArray[np.float64]
+    monitor: NDArray[np.int32]
+    episode_id: NDArray[np.int64]
+    failures: dict[int, str] = field(default_factory=dict)
+    places: dict[tuple[str, str], int] = field(default_factory=dict)
+    videos: dict[int, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.seed)
+
+    @property
+    def failed(self) -> NDArray[np.bool_]:
+        """`(n,) bool`: which ones failed."""
+        failed = np.zeros(len(self), dtype=np.bool_)
+        failed[list(self.failures)] = True
+        return failed
+
+    @property
+    def monitors(self) -> list[str]:
+        """The infixes of the monitors that recorded them."""
+        return [infix for _, infix in self.places]
+
+    def video_path(self, index: int) -> str | None:
+        """Return the path of an episode's video in the evaluation's directory."""
+        if index not in self.videos:
+            return None
+        folder, _ = list(self.places)[self.monitor[index]]
+        return f"{folder}/{self.videos[index]}"
+
+    def __iter__(self) -> Iterator[EpisodeResult]:
+        """Yield each episode as a result; its warnings are not in the columns."""
+        monitors = self.monitors
+        for index in range(len(self)):
+            failure = self.failures.get(index)
+            monitor = int(self.monitor[index])
+            yield EpisodeResult(
+                task=self.task,
+                seed=int(self.seed[index]),
+                episode=int(self.episode[index]),
+                total_reward=None if failure else float(self.total_reward[index]),
+                length=int(self.length[index]),
+                terminated=_MEANING[int(self.terminated[index])],
+                truncated=_MEANING[int(self.truncated[index])],
+                success=_MEANING[int(self.success[index])],
+                failure=failure,
+                monitor=None if monitor < 0 else monitors[monitor],
+                episode_id=None if monitor < 0 else int(self.episode_id[index]),
+                start_time=_known(self.start_time[index]),
+                seconds=_known(self.seconds[index]),
+            )
 
 
 def write_results_table(file: TextIO, results: Iterable[EpisodeResult]) -> None:
@@ -82,7 +174,17 @@ def write_results_table(file: TextIO, results: Iterable[EpisodeResult]) -> None:
     """
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_RESULTS)
-    writer.writerows(map(_results_row, results))
+    for each in results:
+        failure = each.failure
+        writer.writerow(
+            [
+                *_unit(each),
+                "" if failure is not None else _shown(each.total_reward),
+                str(each.length),
+                *map(_truth_text, (each.terminated, each.truncated, each.success)),
+                "" if failure is None else _one_line(failure),
+            ]
+        )
 
 
 def write_timing_table(
@@ -93,7 +195,18 @@ def write_timing_table(
     """Write `timing.csv`; `files` tells of an episode which ones are its own."""
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_TIMING)
-    writer.writerows(_timing_row(each, files(each)) for each in results)
+    for each in results:
+        of = files(each)
+        recorded = (of.folder, each.monitor, each.episode_id) if of.folder else ()
+        writer.writerow(
+            [
+                *_unit(each),
+                *map(_shown, (each.start_time, each.seconds)),
+                *(recorded or ("", "", "")),
+                of.trajectory or "",
+                of.video or "",
+            ]
+        )
 
 
 def read_tables(
@@ -111,139 +224,111 @@ def read_tables(
     Raises:
         UnreadableFile: a table is damaged or missing, or is that of another plan.
     """
-    episodes = len(plan.seeds) * plan.episodes
-    columns = {task.name: _Columns() for task in plan.tasks}
     with unreadable(results):
-        if episodes * len(columns) > _MOST_ROWS:
+        if len(plan.seeds) * plan.episodes * len(plan.tasks) > _MOST_ROWS:
             raise ValueError(f"its plan has more than {_MOST_ROWS} episodes")
-        _read_rows(results, _RESULTS, plan, columns, _Columns.add_result)
-    with_timing = needs_timing or timing.is_file()
-    if with_timing:
+        columns = {task.name: _nothing_known(task.name, plan) for task in plan.tasks}
+        _read_rows(results, _RESULTS, columns, _read_result)
+    if needs_timing or timing.is_file():
         with unreadable(timing):
-            _read_rows(timing, _TIMING, plan, columns, _Columns.add_timing)
-    return {
-        task: each.finished(task, plan, with_timing=with_timing)
-        for task, each in columns.items()
-    }
+            _read_rows(timing, _TIMING, columns, _read_timing)
+    return columns
 
 
-class _Columns:
-    """The columns of a task while they are read."""
-
-    def __init__(self) -> None:
-        self.total_reward = array("d")
-        self.length = array("q")
-        self.terminated = array("b")
-        self.truncated = array("b")
-        self.success = array("b")
-        self.failures: dict[int, str] = {}
-        self.start_time = array("d")
-        self.seconds = array("d")
-        self.monitor = array("i")
-        self.monitors: dict[str, int] = {}
-        self.episode_id = array("q")
-        self.has_trajectory = array("b")
-        self.videos: dict[int, ResultVideo] = {}
-
-    def add_result(self, values: Sequence[str]) -> None:
-        total_reward, length, terminated, truncated, success, failure = values
-        if bool(failure) == bool(total_reward):
-            raise ValueError("an episode has either a return or a failure")
-        if failure:
-            self.failures[len(self.length)] = _printable(failure)
-        self.total_reward.append(_number(total_reward))
-        self.length.append(_whole(length))
-        self.terminated.append(_truth(terminated))
-        self.truncated.append(_truth(truncated))
-        self.success.append(_truth(success))
-
-    def add_timing(self, values: Sequence[str]) -> None:
-        start, seconds, monitor, episode_id, trajectory, video, sha256 = values
-        index = len(self.start_time)
-        self.start_time.append(_number(start))
-        self.seconds.append(_number(seconds))
-        self.monitor.append(self._monitor(monitor))
-        self.episode_id.append(_whole(episode_id) if episode_id else -1)
-        if not monitor:
-            if episode_id or trajectory or video or sha256:
-                raise ValueError("an episode without a monitor has files")
-            self.has_trajectory.append(False)
-            return
-        infix = Infix.parse(monitor)
-        assert infix is not None
-        number = self.episode_id[-1]
-        if number < 0:
-            raise ValueError("an episode of a monitor has no number")
-        self.has_trajectory.append(
-            _is_of(trajectory, trajectory_prefix(infix, number), (".h5",))
-        )
-        if _is_of(video, video_prefix(infix, number), (".mp4", ".json", ".avi")):
-            self.videos[index] = ResultVideo(video, _sha256(sha256))
-
-    def finished(
-        self, task: str, plan: EvaluationPlan, *, with_timing: bool
-    ) -> ResultColumns:
-        count = len(self.length)
-        if not with_timing:
-            self._add_nothing_known(count)
-        return ResultColumns(
-            task=task,
-            seed=np.repeat(np.array(plan.seeds, dtype=np.int64), plan.episodes),
-            episode=np.tile(np.arange(plan.episodes, dtype=np.int64), len(plan.seeds)),
-            total_reward=np.frombuffer(self.total_reward, dtype=np.float64),
-            length=np.frombuffer(self.length, dtype=np.int64),
-            terminated=np.frombuffer(self.terminated, dtype=np.int8),
-            truncated=np.frombuffer(self.truncated, dtype=np.int8),
-            success=np.frombuffer(self.success, dtype=np.int8),
-            failures=self.failures,
-            start_time=np.frombuffer(self.start_time, dtype=np.float64),
-            seconds=np.frombuffer(self.seconds, dtype=np.float64),
-            monitor=np.frombuffer(self.monitor, dtype=np.int32),
-            monitors=tuple(self.monitors),
-            episode_id=np.frombuffer(self.episode_id, dtype=np.int64),
-            has_trajectory=np.frombuffer(self.has_trajectory, dtype=np.bool_),
-            videos=self.videos,
-        )
-
-    def _add_nothing_known(self, count: int) -> None:
-        self.start_time = array("d", [math.nan]) * count
-        self.seconds = array("d", [math.nan]) * count
-        self.monitor = array("i", [-1]) * count
-        self.episode_id = array("q", [-1]) * count
-        self.has_trajectory = array("b", [0]) * count
-
-    def _monitor(self, text: str) -> int:
-        if not text:
-            return -1
-        if text not in self.monitors and Infix.parse(text) is None:
-            raise ValueError(f"{text!r:.80} is not the infix of a monitor")
-        return self.monitors.setdefault(text, len(self.monitors))
+def _nothing_known(task: str, plan: EvaluationPlan) -> ResultColumns:
+    count = len(plan.seeds) * plan.episodes
+    return ResultColumns(
+        task=task,
+        seed=np.repeat(np.array(plan.seeds, np.int64), plan.episodes),
+        episode=np.tile(np.arange(plan.episodes, dtype=np.int64), len(plan.seeds)),
+        total_reward=np.full(count, np.nan),
+        length=np.zeros(count, np.int64),
+        terminated=np.full(count, -1, np.int8),
+        truncated=np.full(count, -1, np.int8),
+        success=np.full(count, -1, np.int8),
+        start_time=np.full(count, np.nan),
+        seconds=np.full(count, np.nan),
+        monitor=np.full(count, -1, np.int32),
+        episode_id=np.full(count, -1, np.int64),
+    )
 
 
-def _results_row(result: EpisodeResult) -> list[str]:
-    return [
-        *_unit(result),
-        "" if result.failure is not None else _shown(result.total_reward),
-        str(result.length),
-        _truth_text(result.terminated),
-        _truth_text(result.truncated),
-        _truth_text(result.success),
-        "" if result.failure is None else _one_line(result.failure),
-    ]
+def _read_result(columns: ResultColumns, index: int, values: Sequence[str]) -> None:
+    total_reward, length, terminated, truncated, success, failure = values
+    if failure:
+        if total_reward:
+            raise ValueError("an episode that failed has no return")
+        if not failure.isprintable() or len(failure) > _LONGEST_FAILURE:
+            raise ValueError(f"{failure!r:.80} is not one line")
+        columns.failures[index] = failure
+    columns.total_reward[index] = _number(total_reward)
+    columns.length[index] = _whole(length)
+    columns.terminated[index] = _truth(terminated)
+    columns.truncated[index] = _truth(truncated)
+    columns.success[index] = _truth(success)
 
 
-def _timing_row(result: EpisodeResult, files: EpisodeFiles) -> list[str]:
-    video = files.video
-    return [
-        *_unit(result),
-        _shown(result.start_time),
-        _shown(result.seconds),
-        result.monitor or "",
-        "" if result.episode_id is None else str(result.episode_id),
-        files.trajectory or "",
-        "" if video is None else video.name,
-        "" if video is None else video.sha256 or "",
-    ]
+def _read_timing(columns: ResultColumns, index: int, values: Sequence[str]) -> None:
+    start, seconds, folder, monitor, episode_id, _, video = values
+    columns.start_time[index] = _number(start)
+    columns.seconds[index] = _number(seconds)
+    if not folder:
+        if any(values[2:]):
+            raise ValueError("an episode without a folder has files")
+        return
+    place = folder, monitor
+    infix = Infix.parse(monitor)
+    if infix is None or not _FOLDER.fullmatch(folder):
+        raise ValueError(f"{folder!r:.80}, {monitor!r:.80} is no monitor")
+    columns.monitor[index] = columns.places.setdefault(place, len(columns.places))
+    columns.episode_id[index] = number = _whole(episode_id)
+    if video:
+        prefix = video_prefix(infix, number)
+        if video not in (f"{prefix}{end}" for end in (".mp4", ".json", ".avi")):
+            raise ValueError(f"{video!r:.200} is no video of its episode")
+        columns.videos[index] = video
+
+
+def _read_rows(
+    path: Path,
+    header: Sequence[str],
+    columns: Mapping[str, ResultColumns],
+    read: Callable[[ResultColumns, int, Sequence[str]], None],
+) -> None:
+    """Read a table whose rows must be exactly those of the columns."""
+    with open_regular(path) as binary:
+        file = io.TextIOWrapper(binary, encoding="utf-8", newline="")
+        reader = csv.reader(_lines(file), strict=True)
+        line = 0
+        try:
+            if tuple(next(reader, ())) != tuple(header):
+                raise ValueError(f"its first line is not {','.join(header)}")
+            units = ((of, index) for of in columns.values() for index in range(len(of)))
+            for line, (of, index) in enumerate(units, start=2):
+                row = next(reader, [])
+                if len(row) != len(header) or reader.line_num != line:
+                    raise ValueError(f"it has not one row of {len(header)} values")
+                unit = [of.task, str(of.seed[index]), str(of.episode[index])]
+                if row[:3] != unit:
+                    raise ValueError(
+                        f"the episode {', '.join(unit)} belongs there, not "
+                        f"{', '.join(row[:3]):.80}"
+                    )
+                read(of, index, row[3:])
+            if next(reader, None) is not None:
+                line += 1
+                raise ValueError("it has more episodes than the plan")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"after line {line} it is not UTF-8 text") from error
+        except (csv.Error, ValueError) as error:
+            raise ValueError(f"line {line or 1}: {error}") from error
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    while line := file.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise ValueError("it is longer than any line of a table")
+        yield line
 
 
 def _unit(result: EpisodeResult) -> tuple[str, str, str]:
@@ -252,6 +337,10 @@ def _unit(result: EpisodeResult) -> tuple[str, str, str]:
 
 def _shown(value: float | None) -> str:
     return "" if value is None else repr(float(value))
+
+
+def _known(value: np.float64) -> float | None:
+    return None if np.isnan(value) else float(value)
 
 
 def _truth_text(value: bool | None) -> str:
@@ -266,61 +355,6 @@ def _one_line(text: str) -> str:
 
 def _encodable(text: str) -> str:
     return text.encode(errors="backslashreplace").decode()
-
-
-def _read_rows(
-    path: Path,
-    header: Sequence[str],
-    plan: EvaluationPlan,
-    columns: Mapping[str, _Columns],
-    add: Callable[[_Columns, Sequence[str]], None],
-) -> None:
-    """Read a table whose rows must be exactly those of the plan."""
-    with open_regular(path) as binary:
-        file = io.TextIOWrapper(binary, encoding="utf-8", newline="")
-        reader = csv.reader(_lines(file), strict=True)
-        line = 0
-        try:
-            if tuple(next(reader, ())) != tuple(header):
-                raise ValueError(f"its first line is not {','.join(header)}")
-            for line, unit in enumerate(_units(plan), start=2):
-                row = next(reader, None)
-                if row is None:
-                    raise ValueError(f"it ends before the episode {_told(unit)}")
-                if len(row) != len(header) or reader.line_num != line:
-                    raise ValueError(f"it has not one row of {len(header)} values")
-                if tuple(row[:3]) != unit:
-                    raise ValueError(
-                        f"the episode {_told(unit)} belongs there, not {_told(row[:3])}"
-                    )
-                add(columns[unit[0]], row[3:])
-            if next(reader, None) is not None:
-                line += 1
-                raise ValueError("it has more episodes than the plan")
-        except csv.Error as error:
-            raise ValueError(f"line {line}: {error}") from error
-        except UnicodeDecodeError as error:
-            raise ValueError(f"after line {line} it is not UTF-8 text") from error
-        except ValueError as error:
-            raise ValueError(f"line {line or 1}: {error}") from error
-
-
-def _units(plan: EvaluationPlan) -> Iterator[tuple[str, str, str]]:
-    for task in plan.tasks:
-        for seed in plan.seeds:
-            for episode in range(plan.episodes):
-                yield task.name, str(seed), str(episode)
-
-
-def _told(unit: Sequence[str]) -> str:
-    return ", ".join(f"{value:.80}" for value in unit)
-
-
-def _lines(file: TextIO) -> Iterator[str]:
-    while line := file.readline(_LONGEST_LINE):
-        if len(line) == _LONGEST_LINE:
-            raise ValueError("it is longer than any line of a table")
-        yield line
 
 
 def _whole(text: str) -> int:
@@ -341,22 +375,3 @@ def _truth(text: str) -> int:
     if text not in _TRUTH:
         raise ValueError(f"{text!r:.80} is neither true nor false")
     return _TRUTH[text]
-
-
-def _printable(text: str) -> str:
-    if not text.isprintable() or len(text) > _LONGEST_FAILURE:
-        raise ValueError(f"{text!r:.80} is not one line")
-    return text
-
-
-def _sha256(text: str) -> str | None:
-    if text and not _SHA256.fullmatch(text):
-        raise ValueError(f"{text!r:.80} is no SHA-256")
-    return text or None
-
-
-def _is_of(name: str, prefix: str, suffixes: Sequence[str]) -> bool:
-    """Tell whether a file is named; it must be the one of its episode."""
-    if name and not any(name == prefix + suffix for suffix in suffixes):
-        raise ValueError(f"{name!r:.200} is no file of its episode")
-    return bool(name)

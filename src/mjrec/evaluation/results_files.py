@@ -8,7 +8,7 @@
     ├── results.json        plan, choice of videos, summaries, versions: written last
     ├── results.csv         one row for each episode
     ├── timing.csv          wall times and files of the same episodes
-    └── <folder>/           a monitor directory for each task
+    └── <task>/<chunk>/     monitor directories, for each task a few
 
 `results.json` and `results.csv` follow from the plan and from what is installed: they
 are the same, byte for byte, whatever the number of workers, and however often the
@@ -39,9 +39,9 @@ from ..json_text import dumps
 from .dataclass_json import from_json, to_json
 from .episode_results import EpisodeResult
 from .plan import EvaluationPlan
-from .result_columns import ResultColumns
 from .result_tables import (
     EpisodeFiles,
+    ResultColumns,
     read_tables,
     write_results_table,
     write_timing_table,
@@ -54,6 +54,7 @@ PLAN_NAME = "evaluation.json"
 RESULTS_NAME = "results.json"
 _TABLE_NAME = "results.csv"
 _TIMING_NAME = "timing.csv"
+RESULT_NAMES = (RESULTS_NAME, _TABLE_NAME, _TIMING_NAME, PLAN_NAME)
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class ReadResults:
     columns: Mapping[str, ResultColumns]
 
     def folder(self, task: str) -> Path:
-        """Return a task's monitor directory."""
+        """Return the folder with a task's monitor directories."""
         (name,) = (each.folder for each in self.plan.tasks if each.name == task)
         return self.directory / name
 
@@ -144,7 +145,8 @@ def write_results(
     """
     value = {
         "format_version": FORMAT_VERSION,
-        "plan": to_json(plan),
+        # How it was cut tells when more was asked for, which changes no result.
+        "plan": to_json(replace(plan, chunks=())),
         "selection": {
             "rule": plan.keep,
             "by_task": {

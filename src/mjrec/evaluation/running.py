@@ -1,23 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running a batch of episodes: one environment, policy and monitor for all of them.
+"""Running the missing episodes of a chunk.
 
-Where an episode fails, all three are closed and made anew for the rest: nobody knows
-what state an environment is in that has raised.
+Environment and policy stay from chunk to chunk of a task. They are made anew after an
+episode that failed, whose environment may be in any state; for each seed where the
+environment draws its model from the seed when it is made (`lqr` of dm_control); and for
+each episode that is drawn live, because its frames depend on those before.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
+import functools
+import logging
+import os
 import pickle
 import sys
+import threading
 import time
-import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
+from ..engines.jobs import TRIES
 from ..environments.episode_seeds import (
     EpisodeSeeds,
     episode_seeds,
@@ -30,365 +35,366 @@ from ..environments.policies import Policy, load_policy, policy_file, policy_fro
 from ..errors import Error, InvalidArgument, PolicyError
 from ..monitors import Monitor
 from ..monitors.base import rendering_choice
-from ..recorder.keep_rules import UNDECIDED
-from ..recorder.opening import JOIN
-from ..recorder.options import DEFERRED, RenderingChoice
-from ..recorder.tracking import FinishedEpisode, Run, Tracker
-from ..schedules import schedule_from_text
+from ..recorder.options import LIVE
+from ..schedules import record_all
 from ..signals import Terminated
 from ..simulation.find_simulation import simulation_in
-from .episode_results import EpisodeResult
+from .chunk_results import read_chunk
 from .kept_episodes import keep_rule
-from .ledger import Ledger, ledger_name, read_ledgers
-from .plan import SUITE, Batch, EvaluationPlan
+from .plan import SUITE, Chunk, EvaluationPlan, Unit
 
 if TYPE_CHECKING:
     from ..monitors.dm_env_monitor import DmEnvMonitor
     from ..monitors.gymnasium_monitor import GymnasiumMonitor
 
+    _Monitor: TypeAlias = GymnasiumMonitor | DmEnvMonitor
+
+logger = logging.getLogger(__name__)
+
 _OF_EPISODES = (PolicyError, InvalidArgument)
+_LONGEST_FAILURE = 2000
 
-_Begin: TypeAlias = Callable[[Any, EpisodeSeeds], Any]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluation:
-    """What a worker knows of the evaluation that it works for.
-
-    Attributes:
-        directory: of the evaluation.
-        plan: what is evaluated.
-        policy: the pickled policy, where it is an object; else None.
-    """
-
-    directory: Path
-    plan: EvaluationPlan
-    policy: bytes | None = None
-
-    @property
-    def draws(self) -> bool:
-        """Whether any episode may get a video."""
-        return not keep_rule(self.plan.keep).keeps_none
+_Begin: TypeAlias = Callable[[NamedEnvironment, Any, EpisodeSeeds], Any]
 
 
 @dataclass(frozen=True)
 class Acting:
-    """An environment and who acts in it."""
+    """An environment and what acts in it.
 
+    Attributes:
+        task: the environment's name.
+        seed: that it was made with.
+        named: the environment.
+        policy: acts.
+        is_drawn_live: its frames are drawn while it is stepped.
+    """
+
+    task: str
+    seed: int
     named: NamedEnvironment
     policy: Policy
+    is_drawn_live: bool
 
 
-def make_acting(evaluation: Evaluation, task: str, seed: int) -> Acting:
-    """Return an environment and who acts in it; the environment is to be closed.
+class Evaluator:
+    """Runs chunks, one after the other.
 
     Args:
-        evaluation: what is evaluated.
-        task: the environment's name.
-        seed: of the run.
-
-    Raises:
-        Error: of `environment_from_name`, `load_policy` or `policy_from`.
+        plan: what is evaluated.
+        policy: the pickled policy, where it is an object; else None.
     """
-    plan = evaluation.plan
-    named = environment_from_name(
-        task,
-        EnvironmentOptions(
+
+    def __init__(self, plan: EvaluationPlan, policy: bytes | None) -> None:
+        self._plan = plan
+        self._policy = policy
+        self._acting: Acting | None = None
+
+    @property
+    def draws(self) -> bool:
+        """Whether any episode may get a video."""
+        return not keep_rule(self._plan.keep).keeps_none
+
+    def fits(self, task: str, seed: int, *, continues: bool) -> bool:
+        """Tell whether environment and policy of before are those of an episode.
+
+        Args:
+            task: its environment's name.
+            seed: of its run.
+            continues: it goes on with the random stream of the episode before.
+        """
+        known = self._acting
+        if known is None or known.task != task:
+            return False
+        is_of_seed = not known.named.draws_when_made or (
+            known.seed == seed and self._plan.protocol != SUITE
+        )
+        return continues or (is_of_seed and not known.is_drawn_live)
+
+    def acting(self, task: str, seed: int, *, continues: bool = False) -> Acting:
+        """Return an environment and what acts in it, those of before where they fit.
+
+        Raises:
+            Error: of `environment_from_name`, `load_policy` or `policy_from`.
+        """
+        if not self.fits(task, seed, continues=continues):
+            self.close()
+            self._acting = self._make(task, seed)
+        assert self._acting is not None
+        return self._acting
+
+    def close(self) -> None:
+        """Close the environment. Idempotent."""
+        acting, self._acting = self._acting, None
+        if acting is not None:
+            acting.named.environment.close()
+
+    def complete(self, task: str, folder: Path, chunk: Chunk) -> None:
+        """Run those episodes of a chunk that have not ended.
+
+        Args:
+            task: the environment's name.
+            folder: the chunk's monitor directory, which no other process writes into,
+                and in which what killed ones left is in order.
+            chunk: which episodes.
+
+        Raises:
+            Error: something cannot be made or recorded. What was done is in the
+                journal.
+        """
+        try:
+            _ChunkRun(self, self._plan, task, folder, chunk).run()
+        except BaseException:
+            # It may be in the midst of a step.
+            self.close()
+            raise
+
+    def _make(self, task: str, seed: int) -> Acting:
+        plan = self._plan
+        options = EnvironmentOptions(
             camera=plan.camera,
             height=plan.height,
             width=plan.width,
             max_steps=plan.max_steps,
-            pictures=evaluation.draws,
+            pictures=self.draws,
             seed=seed,
             kwargs=plan.env_kwargs,
-        ),
-    )
-    if "mujoco" in sys.modules:
-        # Not at the top, because it loads MuJoCo, which not every task has.
-        from ..simulation.warnings import log_mujoco_warnings
-
-        log_mujoco_warnings()
-    with _closing_on_error(named.environment):
-        return Acting(named, _policy(evaluation, named.environment))
-
-
-def rendering_of(named: NamedEnvironment) -> RenderingChoice:
-    """Return when a monitor will draw the pictures of an environment, and why."""
-    return rendering_choice(None, named.scenes(), named.env_id)
-
-
-def run_batch(evaluation: Evaluation, batch: Batch, *, again: bool) -> int:
-    """Run the episodes of a batch, and return how many they were.
-
-    Args:
-        evaluation: what is evaluated.
-        batch: of which none is in any ledger, unless it is begun again.
-        again: whether somebody has begun it before: then those that are in a ledger
-            are left out. Looking for that takes the longer the more have recorded.
-
-    Raises:
-        Error: something could not be recorded; what was done is in the ledger.
-    """
-    whole = evaluation.plan.protocol == SUITE
-    done = read_ledgers(evaluation.directory / batch.folder) if again else {}
-    left = [n for n in batch.episodes if (batch.seed, n) not in done]
-    if left:
-        left_of_it = dataclasses.replace(batch, episodes=tuple(left))
-        _BatchRun(evaluation, left_of_it, whole=whole).run()
-    return len(left)
-
-
-class _LastEpisode(Tracker):
-    """Keeps what a monitor says of its last complete episode."""
-
-    finished: FinishedEpisode
-
-    def episode(self, run: Run, episode: FinishedEpisode) -> None:
-        """Keep it."""
-        self.finished = episode
-
-
-class _Running:
-    """An episode that has begun, as far as its result is known.
-
-    Args:
-        known: what is.
-    """
-
-    def __init__(self, known: EpisodeResult) -> None:
-        self.known = known
-        self._start = time.monotonic()
-
-    def seconds(self) -> float:
-        """Return for how long it has been running."""
-        return time.monotonic() - self._start
-
-    def failed(
-        self, monitor: GymnasiumMonitor | DmEnvMonitor, error: BaseException
-    ) -> EpisodeResult:
-        """Return its result where it failed, in whatever: the reset, too."""
-        failed = dataclasses.replace(
-            self.known, failure=_in_one_line(error), seconds=self.seconds()
         )
-        if monitor.episode_id == self.known.episode_id:
-            # The monitor was never told of it.
-            return dataclasses.replace(failed, monitor=None, episode_id=None)
-        return dataclasses.replace(failed, length=monitor.stats_recorder.steps or 0)
+        named = environment_from_name(task, options)
+        if "mujoco" in sys.modules:
+            # Not at the top, because it loads MuJoCo, which not every task has.
+            from ..simulation.warnings import log_mujoco_warnings
+
+            log_mujoco_warnings()
+        try:
+            policy = self._make_policy(named.environment)
+            choice = rendering_choice(None, named.scenes(), named.env_id)
+        except BaseException:
+            named.environment.close()
+            raise
+        return Acting(task, seed, named, policy, self.draws and choice.mode == LIVE)
+
+    def _make_policy(self, environment: Any) -> Policy:
+        name = self._plan.policy
+        if self._policy is None:
+            return load_policy(name, environment, self._plan.policy_kwargs)
+        try:
+            with working_directory_importable():
+                # Through our own pipe, from the process that evaluates.
+                chosen = pickle.loads(self._policy)
+        except Exception as error:
+            raise PolicyError(
+                f"The policy {name} could not be made again in a worker process: "
+                f"{_in_one_line(error)}. Give its name instead, policy='module:name'."
+            ) from error
+        return policy_from(chosen, name, environment, self._plan.policy_kwargs)
 
 
-@dataclass(frozen=True)
-class _Recorded:
-    """What runs episodes, and what records them.
+class _ChunkRun:
+    """A chunk that is run, and the monitor around its environment."""
 
-    Attributes:
-        acting: the environment and who acts in it.
-        monitor: around the environment.
-        last: what the monitor says of its last complete episode.
-        is_left_open: whether videos are chosen later, among candidates.
-    """
-
-    acting: Acting
-    monitor: GymnasiumMonitor | DmEnvMonitor
-    last: _LastEpisode
-    is_left_open: bool
-
-
-class _BatchRun:
-    """A batch that is run."""
-
-    def __init__(self, evaluation: Evaluation, batch: Batch, *, whole: bool) -> None:
-        self._evaluation = evaluation
-        self._batch = batch
-        self._whole = whole
-        self._folder = evaluation.directory / batch.folder
-        self._ledger: Ledger | None = None
-        # The number of the episode that is run, also before it has begun.
-        self._episode = 0
-        self._running: _Running | None = None
+    def __init__(
+        self,
+        evaluator: Evaluator,
+        plan: EvaluationPlan,
+        task: str,
+        folder: Path,
+        chunk: Chunk,
+    ) -> None:
+        self._evaluator = evaluator
+        self._plan = plan
+        self._task = task
+        self._folder = folder
+        self._chunk = chunk
+        self._known = read_chunk(folder, task)
+        self._monitor: _Monitor | None = None
+        self._open = contextlib.ExitStack()
 
     def run(self) -> None:
-        """Run its episodes, however each of them ends."""
-        left = list(self._batch.episodes)
-        is_first = True
-        try:
-            while left:
-                try:
-                    acting = make_acting(
-                        self._evaluation, self._batch.task, self._batch.seed
+        results, deaths = self._known.results, self._known.deaths
+        missing = [unit for unit in self._chunk if unit not in results]
+        with self._open:
+            for unit in missing:
+                if deaths[unit] >= TRIES:
+                    why = f"{TRIES} processes died in it"
+                    self._monitored(unit).recorder.note_event(
+                        "failed", _failed(unit, why)
                     )
-                except Error as error:
-                    self._fail(left, error)
-                    return
-                with _closing_on_error(acting.named.environment):
-                    recorded = self._recorded(acting)
-                self._run_with(recorded, left, is_first=is_first)
-                is_first = False
-        finally:
-            if self._ledger is not None:
-                self._ledger.close()
+            missing = [unit for unit in missing if deaths[unit] < TRIES]
+            if self._plan.protocol == SUITE:
+                for seed in dict.fromkeys(seed for seed, _ in missing):
+                    self._run_stream(seed, {n for s, n in missing if s == seed})
+            else:
+                for unit in missing:
+                    self._run(unit, _begin_episode)
 
-    def _recorded(self, acting: Acting) -> _Recorded:
-        plan, named = self._evaluation.plan, acting.named
-        last, chosen = _LastEpisode(), self._videos(named)
-        recorded = Monitor(
-            named.environment,
-            self._folder,
-            resume=JOIN,
-            mode="evaluation",
-            max_fps=plan.max_fps,
-            quality=plan.quality,
-            workers=0,
-            trackers=last,
-            env_id=named.env_id,
-            policy_file=None if plan.is_object else policy_file(plan.policy),
-            **chosen,
-            **named.view,
-        )
-        # A name is that of one environment, never of a vector environment.
-        monitor = cast("GymnasiumMonitor | DmEnvMonitor", recorded)
-        return _Recorded(acting, monitor, last, is_left_open="keep" in chosen)
+    def _run_stream(self, seed: int, missing: set[int]) -> None:
+        """Run the missing episodes of a seed's random stream.
 
-    def _videos(self, named: NamedEnvironment) -> dict[str, Any]:
-        """Return what the monitor is told of videos."""
-        evaluation = self._evaluation
-        if not evaluation.draws:
-            return {"video_callable": False}
-        if rendering_of(named).mode == DEFERRED:
-            return {"keep": UNDECIDED}
-        if keep_rule(evaluation.plan.keep).needs_returns:
-            raise InvalidArgument(
-                f"keep={evaluation.plan.keep!r} chooses when all episodes are over, "
-                f"and the pictures of {named.env_id} cannot be drawn later: "
-                f"{rendering_of(named).reason}. Use keep='all', 'cubic' or 'none'."
-            )
-        return {"video_callable": self._is_scheduled}
+        Those before them that are done are run again without being recorded: each
+        begins where the one before it has ended. After one that failed, another
+        stream begins.
+        """
+        stream: int | None = seed
+        for number in range(self._chunk.first, max(missing) + 1):
+            unit, continues = (seed, number), number > self._chunk.first
+            begin = functools.partial(_begin_in_stream, stream)
+            known = self._known.results.get(unit)
+            if number in missing:
+                is_complete = self._run(unit, begin, continues=continues)
+            elif is_complete := known is not None and known.failure is None:
+                self._renew_unless_it_fits(seed, continues=continues)
+                acting = self._evaluator.acting(self._task, seed, continues=continues)
+                _play(acting, acting.named.environment, episode_seeds(*unit), begin)
+            else:
+                self._renew()
+            following = episode_seeds(seed, number + 1)
+            stream = None if is_complete else following.environment
 
-    def _is_scheduled(self, _: int) -> bool:
-        """Tell whether the running episode gets a video that is drawn live."""
-        plan = self._evaluation.plan
-        number = plan.seeds.index(self._batch.seed) * plan.episodes + self._episode
-        return bool(schedule_from_text(plan.keep)(number))
+    def _run(self, unit: Unit, begin: _Begin, *, continues: bool = False) -> bool:
+        """Run an episode, and return whether it was completed.
 
-    def _run_with(
-        self, recorded: _Recorded, left: list[int], *, is_first: bool
-    ) -> None:
-        """Run episodes until one fails; those that are over are left no more."""
-        monitor = recorded.monitor
-        begins = self._begins(recorded.acting.named, is_first=is_first)
+        Raises:
+            Error: it could not be recorded.
+        """
+        monitor = self._monitored(unit, continues=continues)
+        # What was shown before it does not count: other chunks have other episodes.
+        monitor.forget_pictures()
+        episode_id, start = monitor.episode_id, time.time()
+        seed, number = unit
+        monitor.recorder.note_event("begun", {"seed": seed, "episode": number})
+
+        def failed(why: str) -> dict[str, Any]:
+            facts = _failed(unit, why, start_time=start, seconds=time.time() - start)
+            if monitor.episode_id > episode_id:
+                # Else the monitor was never told of it.
+                length = monitor.stats_recorder.steps or 0
+                facts.update(episode_id=episode_id, length=length)
+            return facts
+
+        def expire() -> None:
+            why = f"it took longer than {self._plan.episode_timeout:g} seconds"
+            monitor.recorder.note_event("failed", failed(why))
+            logger.warning("The episode %d of seed %d: %s.", number, seed, why)
+            os._exit(1)
+
+        acting = self._evaluator.acting(self._task, seed, continues=True)
         try:
-            with monitor:
-                while left:
-                    self._episode = left.pop(0)
-                    ledger = self._open_ledger(monitor.infix)
-                    ledger.end(self._run_episode(recorded, next(begins)))
-                    self._running = None
+            with _time_limit(self._plan.episode_timeout, expire):
+                self._play_recorded(acting, monitor, unit, begin)
         except Terminated:
             raise
         # A policy may call sys.exit(), or an environment's library.
         except (Exception, SystemExit) as error:
-            if self._running is None or not _is_of_episode(error):
+            # Errors of ours are of the recording, such as a full disk, unless they
+            # speak of an action, or a reward, that is none.
+            if isinstance(error, Error) and not isinstance(error, _OF_EPISODES):
                 raise
-            failed = self._running.failed(monitor, error)
-            self._open_ledger(monitor.infix).end(failed)
-            self._running = None
-            if not recorded.is_left_open:
-                # Who leaves a monitor by an exception leaves logs.
-                _finish_logs(self._folder, monitor.infix)
+            monitor.recorder.note_error(error)
+            monitor.recorder.note_event("failed", failed(_in_one_line(error)))
+            self._renew()
+            return False
+        return True
 
-    def _begins(self, named: NamedEnvironment, *, is_first: bool) -> Iterator[_Begin]:
-        """Yield for one episode after the other what begins it."""
-        if self._whole:
-            # After an episode that failed nobody knows how far the stream had come.
-            yield lambda env, seeds: named.begin_stream(
-                env, self._batch.seed if is_first else seeds.environment, seeds
+    def _play_recorded(
+        self, acting: Acting, monitor: _Monitor, unit: Unit, begin: _Begin
+    ) -> None:
+        before: dict[str, int] = {}
+
+        def begin_counting(
+            named: NamedEnvironment, env: Any, seeds: EpisodeSeeds
+        ) -> Any:
+            first = begin(named, env, seeds)
+            # Not every reset sets them to zero.
+            before.update(_warnings(named.environment))
+            return first
+
+        def facts() -> Mapping[str, Any]:
+            after = _warnings(acting.named.environment)
+            # An unstable simulation may be set back, and its counts with it.
+            counts = {name: n - before.get(name, 0) for name, n in after.items()}
+            counts = {name: n if n >= 0 else after[name] for name, n in counts.items()}
+            warnings = {name: n for name, n in counts.items() if n}
+            return {"seed": unit[0], "episode": unit[1], "warnings": warnings}
+
+        monitor.recorder.evaluation_facts = facts
+        _play(acting, monitor, episode_seeds(*unit), begin_counting)
+
+    def _monitored(self, unit: Unit, *, continues: bool = False) -> _Monitor:
+        """Return the monitor for an episode, that of before where it fits."""
+        self._renew_unless_it_fits(unit[0], continues=continues)
+        if self._monitor is None:
+            acting = self._evaluator.acting(self._task, unit[0], continues=continues)
+            plan, named = self._plan, acting.named
+            monitor = Monitor(
+                named.environment,
+                self._folder,
+                # Those that cannot be drawn later are all drawn, and the others' videos
+                # removed when the choice is made.
+                record_all if acting.is_drawn_live else False,
+                resume=True,
+                uid=self._chunk.folder,
+                mode="evaluation",
+                max_fps=plan.max_fps,
+                quality=plan.quality,
+                workers=0,
+                env_id=named.env_id,
+                policy_file=None if plan.is_object else policy_file(plan.policy),
+                **named.view,
             )
-            while True:
-                yield named.next_episode
-        while True:
-            yield named.begin_episode
+            # A name is that of one environment, never of a vector environment.
+            self._monitor = cast("_Monitor", monitor)
+            self._monitor.leave_environment_open()
+            self._open.enter_context(self._monitor)
+        return self._monitor
 
-    def _run_episode(self, recorded: _Recorded, begin: _Begin) -> EpisodeResult:
-        monitor = recorded.monitor
-        # Whatever came before it in this batch: other batches have other episodes.
-        monitor.forget_pictures()
-        running = _Running(
-            EpisodeResult(
-                task=self._batch.task,
-                seed=self._batch.seed,
-                episode=self._episode,
-                total_reward=None,
-                length=0,
-                terminated=None,
-                truncated=None,
-                monitor=monitor.infix,
-                episode_id=monitor.episode_id,
-                start_time=time.time(),
-            )
-        )
-        known = running.known
-        self._open_ledger(monitor.infix).begin(
-            known.unit, monitor=monitor.infix, episode_id=monitor.episode_id
-        )
-        self._running = running
-        warnings = _run_episode(
-            recorded.acting, monitor, episode_seeds(*known.unit), begin
-        )
-        finished = recorded.last.finished
-        return dataclasses.replace(
-            known,
-            total_reward=finished.reward,
-            length=finished.length,
-            terminated=finished.terminated,
-            truncated=finished.truncated,
-            success=finished.success,
-            warnings=warnings,
-            seconds=running.seconds(),
-        )
+    def _renew_unless_it_fits(self, seed: int, *, continues: bool) -> None:
+        if not self._evaluator.fits(self._task, seed, continues=continues):
+            self._renew()
 
-    def _fail(self, episodes: Sequence[int], error: Error) -> None:
-        """Note of episodes that nothing could be made to run them with."""
-        ledger = self._open_ledger(f"unmade-{uuid.uuid4().hex}")
-        for episode in episodes:
-            ledger.end(
-                EpisodeResult(
-                    task=self._batch.task,
-                    seed=self._batch.seed,
-                    episode=episode,
-                    total_reward=None,
-                    length=0,
-                    terminated=None,
-                    truncated=None,
-                    failure=_in_one_line(error),
-                )
-            )
-
-    def _open_ledger(self, name: str) -> Ledger:
-        if self._ledger is None:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            self._ledger = Ledger(
-                self._folder / ledger_name(name), self._batch, whole=self._whole
-            )
-        return self._ledger
+    def _renew(self) -> None:
+        """Close monitor and environment: the next episode gets others."""
+        self._monitor = None
+        self._open.close()
+        self._evaluator.close()
 
 
-def _run_episode(
-    acting: Acting, monitor: Any, seeds: EpisodeSeeds, begin: _Begin
-) -> dict[str, int]:
-    """Run an episode, and return how often MuJoCo warned in it."""
+def _begin_episode(named: NamedEnvironment, env: Any, seeds: EpisodeSeeds) -> Any:
+    return named.begin_episode(env, seeds)
+
+
+def _begin_in_stream(
+    stream: int | None, named: NamedEnvironment, env: Any, seeds: EpisodeSeeds
+) -> Any:
+    """Begin an episode; `stream` seeds a new stream, None goes on with the last one."""
+    if stream is None:
+        return named.next_episode(env, seeds)
+    return named.begin_stream(env, stream, seeds)
+
+
+def _play(acting: Acting, env: Any, seeds: EpisodeSeeds, begin: _Begin) -> None:
+    """Run an episode in an environment, or in the monitor around it."""
     named, policy = acting.named, acting.policy
     with working_directory_importable():
         seed_global_generators(seeds.policy)
         policy.reset(seeds)
-        observation = begin(monitor, seeds)
-        before = _warnings(named.environment)
-        done = False
+        observation, done = begin(named, env, seeds), False
         while not done:
-            observation, _, *ends = named.step(monitor, policy(observation))
+            observation, _, *ends = named.step(env, policy(observation))
             done = any(ends)
-    after = _warnings(named.environment)
-    # Not every reset sets them to zero; and an unstable simulation may be set back.
-    counts = {name: n - before.get(name, 0) for name, n in after.items()}
-    return {name: n if n >= 0 else after[name] for name, n in counts.items() if n}
+
+
+@contextlib.contextmanager
+def _time_limit(seconds: float | None, expire: Callable[[], object]) -> Iterator[None]:
+    if seconds is None:
+        yield
+        return
+    timer = threading.Timer(seconds, expire)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _warnings(environment: Any) -> dict[str, int]:
@@ -401,45 +407,17 @@ def _warnings(environment: Any) -> dict[str, int]:
     return warning_counts(simulation)
 
 
-def _finish_logs(folder: Path, monitor: str) -> None:
-    # Not at the top: it loads HDF5, which stepping has no use for.
-    from .settling import finish_logs
-
-    finish_logs(folder, monitor)
-
-
-def _policy(evaluation: Evaluation, environment: Any) -> Policy:
-    name = evaluation.plan.policy
-    if evaluation.policy is None:
-        return load_policy(name, environment)
-    try:
-        with working_directory_importable():
-            # Through our own pipe, from the process that evaluates.
-            chosen = pickle.loads(evaluation.policy)
-    except Exception as error:
-        raise PolicyError(
-            f"The policy {name} could not be made again in a worker process: "
-            f"{_in_one_line(error)}. Give its name instead, policy='module:name'."
-        ) from error
-    return policy_from(chosen, name, environment)
-
-
-@contextlib.contextmanager
-def _closing_on_error(environment: Any) -> Iterator[None]:
-    try:
-        yield
-    except BaseException:
-        environment.close()
-        raise
-
-
-def _is_of_episode(error: BaseException) -> bool:
-    """Tell whether what was raised is the policy's fault, or the environment's.
-
-    Errors of ours are of the recording, such as a full disk, unless they speak of an
-    action, or a reward, that is none.
-    """
-    return not isinstance(error, Error) or isinstance(error, _OF_EPISODES)
+def _failed(unit: Unit, why: str, **facts: Any) -> dict[str, Any]:
+    return {
+        "seed": unit[0],
+        "episode": unit[1],
+        "episode_id": None,
+        "failure": why[:_LONGEST_FAILURE],
+        "length": 0,
+        "start_time": None,
+        "seconds": None,
+        **facts,
+    }
 
 
 def _in_one_line(error: BaseException) -> str:

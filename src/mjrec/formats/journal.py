@@ -11,8 +11,9 @@ episode is a line::
      "success": null, "chosen": true, "recording": "deferred"}
 
 `chosen` is there where the schedule chose the episode, `recording` (`"live"` or
-`"deferred"`) where it has a video of its own. Every other line is an event, an object
-of one key: its kind, one of `EVENTS`. The first line is the `run`'s.
+`"deferred"`) where it has a video of its own, `evaluation` (seed, number and MuJoCo's
+warnings) where the episode is one of an evaluation. Every other line is an event, an
+object of one key: its kind, one of `EVENTS`. The first line is the `run`'s.
 
 Times are seconds since the epoch. Keys that this version does not know are ignored.
 
@@ -40,6 +41,7 @@ from .json_fields import (
     field,
     integer,
     json_object,
+    mapping,
     number,
     optional,
     text,
@@ -59,11 +61,11 @@ MOST_EPISODES = 10**15
 # In their order: what the run is; its machine, packages and code; an episode that is
 # no part of the statistics; a clip that is over; an action that does not fit into rows;
 # an episode whose video falls out while its trajectory stays; what could not be
-# recorded; which videos were kept; the end; and that another process has put the
-# directory in order.
+# recorded; which videos were kept; the end; that another process has put the directory
+# in order; and of an evaluation's episodes, that one begins, or has failed.
 EVENTS = (
     *("run", "surroundings", "cut", "clip", "action", "dropped"),
-    *("fault", "keep", "closed", "recovered"),
+    *("fault", "keep", "closed", "recovered", "begun", "failed"),
 )
 
 # The reason of an episode that ended with its process.
@@ -93,6 +95,7 @@ class JournalEntry:
         success: what the environment said of it; None where it said nothing.
         chosen: the schedule chose it.
         recording: `"live"` or `"deferred"`; None where it has no video of its own.
+        evaluation: `seed`, `episode` and `warnings` of an evaluation's episode.
     """
 
     episode_id: int
@@ -108,13 +111,15 @@ class JournalEntry:
     success: bool | None = None
     chosen: bool = False
     recording: str | None = None
+    evaluation: Mapping[str, Any] | None = None
 
 
 class JournalWriter:
     """Appends episodes and other events to a journal.
 
     The file is made by the first of them. Each is one `write` of whole lines, so that
-    a reader at any moment, and a process killed at any moment, has whole lines.
+    a reader at any moment, and a process killed at any moment, has whole lines. What
+    could not be written, because the disk was full, is written before the next one.
 
     Args:
         path: the file.
@@ -127,6 +132,7 @@ class JournalWriter:
         self._file: io.FileIO | None = None
         # Of the whole lines; beyond it is what a failed write has left.
         self._size = 0
+        self._unwritten = b""
         self._closed = False
 
     def append(self, entry: JournalEntry) -> None:
@@ -137,11 +143,12 @@ class JournalWriter:
 
         Raises:
             ClosedError: after `close`.
-            OSError: it cannot be written (a full disk); the journal is then as it
-                was before. Or it was removed.
+            OSError: it cannot be written now (a full disk); the journal is then as
+                it was before. Or it was removed.
         """
         # Not `asdict`, which would copy the options deeply; they may not allow it.
-        left_out = [key for key in ("chosen", "recording") if not vars(entry)[key]]
+        optional_keys = ("chosen", "recording", "evaluation")
+        left_out = [key for key in optional_keys if not vars(entry)[key]]
         values = {k: v for k, v in vars(entry).items() if k not in left_out}
         line = dumps(values)
         if len(line) >= _LONGEST_LINE:
@@ -178,9 +185,12 @@ class JournalWriter:
             if self._size and os.pread(self._file.fileno(), 1, self._size - 1) != b"\n":
                 # Its writer was killed in the middle of a line.
                 line = b"\n" + line
+        self._unwritten += line
+        first = b""
         if self._size == 0 and self._run is not None:
-            line = f"{dumps({'run': self._run})}\n".encode() + line
-        self._write(self._file, line)
+            first = f"{dumps({'run': self._run})}\n".encode()
+        self._write(self._file, first + self._unwritten)
+        self._unwritten = b""
 
     def _write(self, file: io.FileIO, line: bytes) -> None:
         status = os.fstat(file.fileno())
@@ -339,6 +349,7 @@ def entry_of(values: Mapping[str, Any]) -> JournalEntry:
         success=field(values, "success", optional(boolean), default=None),
         chosen=field(values, "chosen", boolean, default=False),
         recording=field(values, "recording", optional(text), default=None),
+        evaluation=field(values, "evaluation", optional(mapping), default=None),
     )
 
 

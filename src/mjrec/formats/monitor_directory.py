@@ -284,20 +284,26 @@ def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Pat
 
 
 def monitor_directories_in(directory: Path) -> list[Path]:
-    """Return the folders of a directory that hold monitor files, sorted by name."""
-    return [
-        path
-        for path in sorted(directory.iterdir())
-        if path.is_dir() and any(iter_monitor_files(path))
-    ]
+    """Return the directories below one that hold monitor files, sorted by name.
+
+    Two levels are looked at: an evaluation has a folder for each task, and in it some.
+    """
+    found: list[Path] = []
+    for path in sorted(directory.iterdir()):
+        if not path.is_dir() or path.is_symlink() or path.name.startswith("."):
+            continue
+        inner = [path, *sorted(each for each in path.iterdir() if each.is_dir())]
+        found += [each for each in inner if any(iter_monitor_files(each))]
+    return found
 
 
 def where_recordings_are(directory: Path) -> str:
     """Return what to tell whoever looks for recordings in a directory without any.
 
-    Its own folders are looked at, because an evaluation has one for each task.
+    What is below it is looked at, because an evaluation has its recordings there.
     """
-    folders = [path.name for path in monitor_directories_in(directory)]
+    below = monitor_directories_in(directory)
+    folders = [str(path.relative_to(directory)) for path in below]
     if not folders:
         return f"`mjrec record ENV --out {shlex.quote(str(directory))}` makes some."
     rest = len(folders) - _SHOWN

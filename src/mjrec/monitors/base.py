@@ -90,7 +90,10 @@ class MonitorBase:
             RenderError: videos could not be rendered; all else is done, and their
                 trajectories are kept.
             FileNotWritten: the disk is full; the next call tries again.
+            Error: in a process forked from the one that made the monitor.
         """
+        for recorder in self._recorders:
+            recorder.check_process()
         try:
             if wait:
                 with render_progress() as on_progress:
@@ -155,6 +158,17 @@ class EnvironmentMonitor(MonitorBase):
     """The part of one environment's monitor that does not depend on the framework."""
 
     _recorder: Recorder
+    # Closed with the monitor; empty where its user closes it.
+    _environments: list[Any]
+
+    @property
+    def recorder(self) -> Recorder:
+        """What writes the files."""
+        return self._recorder
+
+    def leave_environment_open(self) -> None:
+        """Let `close` end the recording only: the environment is used again."""
+        self._environments.clear()
 
     @property
     def infix(self) -> str:
@@ -268,11 +282,12 @@ class EnvironmentMonitor(MonitorBase):
         )
         self._recorders = [self._recorder]
         states = [each for each in (known.states, clip_states) if each is not None]
+        environments = self._environments = [env]
         self._guard_by(
             [
                 self._recorder.close,
                 *(each.close for each in states),
-                functools.partial(close_environment, env),
+                functools.partial(_close_each, close_environment, environments),
             ]
         )
 
@@ -332,6 +347,11 @@ def call_all(calls: Iterable[Callable[[], object]]) -> None:
             first = first or error
     if first is not None:
         raise first
+
+
+def _close_each(close: Callable[[Any], None], environments: Iterable[Any]) -> None:
+    for environment in environments:
+        close(environment)
 
 
 def _note_last_error(recorders: Sequence[Recorder]) -> None:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.result_columns import ResultColumns
+from ..evaluation.result_tables import ResultColumns
 from ..evaluation.statistics import Bootstrap
 from ..evaluation.summaries import TaskSummary, default_score_range, summarize_task
 from ..results.episodes import Episode

@@ -19,7 +19,6 @@ from typing import Any, Final
 
 import numpy as np
 from imageio.v3 import imwrite
-from numpy.typing import NDArray
 
 from ..annotation import check_annotation
 from ..atomic_files import replacing
@@ -44,13 +43,14 @@ _DOTS_PER_INCH: Final = 300
 # Pixels of a whole strip; Pillow calls twice as many an attack.
 _MOST_PIXELS: Final = 1 << 27
 
-_PAPER: Final = 255
-_INK: Final = 32
+_INK: Final = (32, 32, 32)
 # Of the smaller side of a picture.
 _GAP: Final = 0.03
 _LETTERS: Final = 0.09
 _SMALLEST_LETTERS: Final = 9
 _LARGEST_LETTERS: Final = 96
+# Of the letters' size.
+_LINE: Final = 1.25
 
 
 def film_strip(
@@ -211,41 +211,38 @@ def _laid_out(
     pictures: Iterator[Frame], times: Sequence[float | None], columns: int
 ) -> Frame:
     """Return pictures in rows on white paper, the time of each under it."""
-    count = len(times)
+    # Here, because it is an extra.
+    from PIL import Image, ImageDraw, ImageFont
+
     first = next(pictures)
     height, width = first.shape[:2]
-    columns = min(columns, count)
-    rows = math.ceil(count / columns)
+    columns = min(columns, len(times))
+    rows = math.ceil(len(times) / columns)
     gap = max(2, round(_GAP * min(height, width)))
+    labels = _labels(times)
     letters = round(_LETTERS * min(height, width))
     letters = max(_SMALLEST_LETTERS, min(_LARGEST_LETTERS, letters))
-    labels = _labels(times)
-    written = [_written(label, letters, most_width=width) for label in labels]
-    line = max(label.shape[0] for label in written)
-    cell_height = height + (gap // 2 + line if line else 0)
-    shape = gap + rows * (cell_height + gap), gap + columns * (width + gap), 3
-    if shape[0] * shape[1] > _MOST_PIXELS:
+    font = ImageFont.load_default(size=letters)
+    while max(map(font.getlength, labels)) > width and letters > 1:
+        letters -= 1
+        font = ImageFont.load_default(size=letters)
+    below = gap // 2 + math.ceil(_LINE * letters) if any(labels) else 0
+    size = gap + columns * (width + gap), gap + rows * (height + below + gap)
+    if size[0] * size[1] > _MOST_PIXELS:
         raise InvalidArgument(
-            f"The strip would have {shape[1]}x{shape[0]} pixels. Ask for fewer or "
+            f"The strip would have {size[0]}x{size[1]} pixels. Ask for fewer or "
             "smaller pictures (frames, size)."
         )
-    paper = np.full(shape, _PAPER, np.uint8)
-    for number, picture in enumerate(itertools.chain([first], pictures)):
+    paper = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(paper)
+    shown = itertools.chain([first], pictures)
+    for number, (picture, label) in enumerate(zip(shown, labels, strict=True)):
         row, column = divmod(number, columns)
-        top, left = gap + row * (cell_height + gap), gap + column * (width + gap)
-        paper[top : top + height, left : left + width] = picture
-        if written[number].size:
-            _put(paper, written[number], top + height + gap // 2, left, width)
-    return paper
-
-
-def _put(
-    paper: Frame, label: NDArray[np.uint8], top: int, left: int, width: int
-) -> None:
-    """Put what is written in the middle under a picture."""
-    left += (width - label.shape[1]) // 2
-    part = paper[top : top + label.shape[0], left : left + label.shape[1]]
-    part[:] = label[:, :, None]
+        left, top = gap + column * (width + gap), gap + row * (height + below + gap)
+        paper.paste(Image.fromarray(picture), (left, top))
+        middle = left + width / 2, top + height + gap // 2
+        draw.text(middle, label, fill=_INK, font=font, anchor="ma")
+    return np.array(paper)
 
 
 def _labels(seconds: Sequence[float | None]) -> list[str]:
@@ -256,23 +253,3 @@ def _labels(seconds: Sequence[float | None]) -> list[str]:
     while digits < 6 and steps and min(steps) < 2 * 10.0**-digits:
         digits += 1
     return ["" if time is None else f"{time:.{digits}f} s" for time in seconds]
-
-
-def _written(label: str, letters: int, *, most_width: int) -> NDArray[np.uint8]:
-    """Return a text, dark on white, no wider than that; nothing where it is empty."""
-    # Here, because it is an extra.
-    from PIL import Image, ImageDraw, ImageFont
-
-    if not label:
-        return np.zeros((0, 0), np.uint8)
-    font = ImageFont.load_default(size=letters)
-    while font.getlength(label) > most_width and letters > 1:
-        letters -= 1
-        font = ImageFont.load_default(size=letters)
-    # Pillow's bitmap font, which it has without FreeType, has no metrics.
-    assert isinstance(font, ImageFont.FreeTypeFont)
-    ascent, descent = font.getmetrics()
-    size = (min(most_width, math.ceil(font.getlength(label))), ascent + descent)
-    image = Image.new("L", size, _PAPER)
-    ImageDraw.Draw(image).text((0, ascent), label, fill=_INK, font=font, anchor="ls")
-    return np.asarray(image).copy()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,8 @@ class Episode:
             there yet: `load_trajectory` reads what a log has of it so far.
         pending: its video is promised and not there; `mjrec render` makes it.
         success: what the environment said of it.
+        evaluation: of an evaluation's episode its `seed` and `episode` there, and
+            MuJoCo's `warnings`.
     """
 
     episode_id: int
@@ -61,6 +63,7 @@ class Episode:
     trajectory: Path | None = None
     pending: bool = False
     success: bool | None = None
+    evaluation: Mapping[str, Any] | None = None
 
 
 def iter_episodes(directory: str | os.PathLike[str]) -> Iterator[Episode]:

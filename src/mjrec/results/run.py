@@ -19,6 +19,9 @@ from ..formats.json_fields import base_name
 from ..formats.manifest import Manifest
 from ..formats.monitor_directory import episode_of
 
+# `scope` of a choice that was made among the episodes of several monitors.
+EVALUATION = "evaluation"
+
 
 @dataclass
 class Run:
@@ -140,6 +143,10 @@ class Run:
                 self.faults.append(facts)
             case "keep", dict():
                 self.keep = facts
+                if facts.get("scope") == EVALUATION:
+                    # Each was chosen when it had ended, and promised nothing before.
+                    for number in facts.get("recorded") or ():
+                        self._add(number, None, facts.get("recording"))
             case "closed", {"next_episode_id": int(following)}:
                 self._add(following - 1, False, None)
             case "recovered", _:

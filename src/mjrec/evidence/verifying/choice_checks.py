@@ -18,6 +18,7 @@ from ...formats.monitor_directory import Infix, video_prefix
 from ...formats.trajectory_file import open_trajectory
 from ...recorder.keep_rules import Selection, selection_from
 from ...recorder.tracking import FinishedEpisode
+from ...results.run import EVALUATION
 from ...schedules import (
     Schedule,
     capped_cubic_video_schedule,
@@ -39,8 +40,6 @@ _BY_NAME: Mapping[str, Schedule] = {
 }
 _WITH_NUMBERS = re.compile(r"every:\d{1,15}|at:\d{1,15}(,\d{1,15}){0,9999}", re.ASCII)
 _KEEP = "keep:"
-# As `evaluation.settling` says it.
-_EVALUATION = "evaluation"
 _RULE = re.compile(r"(best|worst|failures):\d{1,18}|failures|median", re.ASCII)
 
 # Numbers of begun episodes, each of which a schedule is asked about.
@@ -137,7 +136,7 @@ def _check_selection(
         return _check(
             recording, Verdict.FAIL, "its manifest names two choices of one rule"
         )
-    if keep.get("scope") == _EVALUATION:
+    if keep.get("scope") == EVALUATION:
         return _unknown(
             recording,
             f"{rule[:100]} was asked about all episodes of an evaluation, of whichever "

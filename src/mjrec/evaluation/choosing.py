@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which episodes of an evaluation get a video, written down where they were recorded.
+
+Monitors of an evaluation promise no videos: the best episode of a task may be in any of
+its chunks. When all episodes of a task have ended, the choice is made, and the
+trajectories, journals and manifests of what was chosen say so, as if each monitor had
+chosen itself. `finish` then draws these videos, and `mjrec render` what is left.
+
+What can only be drawn while it runs has videos already, and those that were not chosen
+are removed.
+
+All of it may be killed at any point and done again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .. import json_text
+from ..atomic_files import write_text
+from ..errors import FileNotWritten
+from ..formats.frame_hashes import frame_hash_path
+from ..formats.journal import JournalWriter
+from ..formats.json_fields import read_object, unreadable
+from ..formats.monitor_directory import Infix, infix_of, journal_name
+from ..formats.spans import FINISHED
+from ..formats.trajectory_file import amend_trajectory
+from ..formats.trajectory_hdf5 import open_hdf5
+from ..formats.video_metadata import finished_videos, metadata_path
+from ..rendering.jobs import RecordingKey
+from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
+from ..results.run import EVALUATION, Run
+
+Chosen = Mapping[RecordingKey, Sequence[str]]
+
+
+def write_choice(folder: Path, chosen: Chosen, *, rule: str, finished: int) -> None:
+    """Write down which episodes of a chunk get a video. Idempotent.
+
+    An episode that was chosen before, among fewer, keeps its video.
+
+    Args:
+        folder: the chunk's monitor directory, whose monitors are closed.
+        chosen: the episodes, each with its roles.
+        rule: by which they were chosen.
+        finished: among how many.
+
+    Raises:
+        UnreadableFile: a trajectory, a journal or metadata is damaged.
+        FileNotWritten: the disk is full.
+        DirectoryNotWritable: there can be no lock in the directory.
+    """
+    facts = {"rule": rule, "decided": True, "scope": EVALUATION, "finished": finished}
+    for path in sorted(folder.glob("openaigym.episodes.*.jsonl")):
+        infix = Infix.parse(infix_of(path.name) or "")
+        if infix is None:
+            continue
+        own = {key: roles for key, roles in chosen.items() if key.infix == infix}
+        run = Run.read(path)
+        before = set((run.keep or {}).get("recorded", ()))
+        recorded = sorted(before | {key.number for key in own} - run.dropped)
+        live = run.filmed - run.deferred - run.dropped
+        losers = sorted(live.difference(recorded))
+        for key, roles in own.items():
+            selection = {**facts, "roles": list(roles)}
+            if key.number in live:
+                _say_in_metadata(folder / key.video_name, selection)
+            else:
+                _promise_video(folder / f"{key.name}{FINISHED}", selection)
+        for number in losers:
+            _remove_videos(folder / RecordingKey(infix, number).video_name)
+        keep = {
+            **facts,
+            "chosen": recorded,
+            "recorded": recorded,
+            "recording": "live" if live else "deferred",
+        }
+        if (recorded or live) and keep != run.keep:
+            events = [("dropped", number) for number in losers]
+            _note(folder, infix, [*events, ("keep", keep)])
+            write_manifest_and_stats(folder, infix)
+
+
+def _promise_video(path: Path, selection: Mapping[str, Any]) -> None:
+    """Let a trajectory promise the video that it could have."""
+    if not path.exists():
+        return
+    with open_hdf5(path) as reader:
+        video, possible = reader.facts.get("video"), reader.facts.get("possible_video")
+    if possible is not None and (video or {}).get("selection") != selection:
+        promise = {**possible, "selection": selection}
+        amend_trajectory(path, lambda known: {**known, "video": promise})
+
+
+def _say_in_metadata(video: Path, selection: Mapping[str, Any]) -> None:
+    path = metadata_path(video)
+    if not path.exists():
+        return
+    with unreadable(path):
+        said = read_object(path)
+    if said.get("selection") != selection:
+        write_text(path, json_text.dumps({**said, "selection": selection}))
+
+
+def _remove_videos(video: Path) -> None:
+    """Remove the videos of an episode; the metadata, which says they are there, first.
+
+    The first one goes last: it names those of further cameras.
+    """
+    for name, metadata in reversed(finished_videos(video)):
+        path = video.with_name(name)
+        video.with_name(metadata).unlink(missing_ok=True)
+        for each in (path, path.with_suffix(".json"), frame_hash_path(path)):
+            each.unlink(missing_ok=True)
+
+
+def _note(folder: Path, infix: Infix, events: Iterable[tuple[str, Any]]) -> None:
+    path = folder / journal_name(infix)
+    with (
+        manifest_lock(folder, infix),
+        contextlib.closing(JournalWriter(path)) as writer,
+    ):
+        for kind, facts in events:
+            try:
+                writer.note(kind, facts)
+            except OSError as error:
+                raise FileNotWritten(path, error.strerror or error) from error

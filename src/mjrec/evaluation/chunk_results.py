@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is done of a chunk, as the journals in its directory tell it.
+
+An episode of an evaluation is up to three lines of a journal. `begun` comes before its
+reset; its end is the journal's usual line, with `evaluation`, or a line `failed`::
+
+    {"begun": {"seed": 7, "episode": 0}}
+    {"episode_id": 0, "length": 200, ..., "evaluation": {"seed": 7, "episode": 0,
+     "warnings": {"BADQACC": 1}}}
+    {"failed": {"seed": 7, "episode": 1, "episode_id": 1, "failure": "...",
+     "length": 12, "start_time": 1790000000.0, "seconds": 0.2}}
+
+A monitor that closes says so in its journal. Where neither that nor an end follows a
+`begun`, the process died of the episode, or was killed at it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..formats.journal import JournalEntry, JournalReader
+from ..formats.json_fields import field as field_of
+from ..formats.json_fields import integer, mapping, number, optional, text, unreadable
+from ..formats.monitor_directory import infix_of
+from .episode_results import EpisodeResult
+from .plan import Unit
+
+_JOURNALS = "openaigym.episodes.*.jsonl"
+
+
+@dataclass
+class ChunkResults:
+    """What is done of a chunk.
+
+    Attributes:
+        results: of the episodes that ended, by seed and number.
+        deaths: how often a process ended in an episode that has no result.
+        is_drawn_live: videos were drawn while episodes ran.
+    """
+
+    results: dict[Unit, EpisodeResult] = field(default_factory=dict)
+    deaths: Counter[Unit] = field(default_factory=Counter)
+    is_drawn_live: bool = False
+
+
+def read_chunk(folder: Path, task: str) -> ChunkResults:
+    """Return what is done of a chunk.
+
+    Args:
+        folder: its monitor directory, which may be missing.
+        task: the environment's name.
+
+    Raises:
+        UnreadableFile: a journal cannot be read.
+    """
+    found = ChunkResults()
+    for path in sorted(folder.glob(_JOURNALS)):
+        _read(path, task, found)
+    for unit in found.results:
+        del found.deaths[unit]
+    return found
+
+
+def _read(path: Path, task: str, found: ChunkResults) -> None:
+    monitor = str(infix_of(path.name))
+    running: list[Unit] = []
+
+    def note(kind: str, facts: Any) -> None:
+        if kind == "closed":
+            running.clear()
+        elif kind == "begun":
+            running[:] = [_unit(facts)]
+        elif kind == "failed":
+            running.clear()
+            failed = _failed(facts, task, monitor)
+            found.results.setdefault(failed.unit, failed)
+
+    with unreadable(path):
+        for entry in JournalReader(path, on_event=note):
+            if entry.evaluation is not None:
+                running.clear()
+                found.is_drawn_live |= entry.recording == "live"
+                result = _completed(entry, entry.evaluation, task, monitor)
+                found.results.setdefault(result.unit, result)
+    found.deaths.update(running)
+
+
+def _completed(
+    entry: JournalEntry, said: Mapping[str, Any], task: str, monitor: str
+) -> EpisodeResult:
+    seed, episode = _unit(said)
+    return EpisodeResult(
+        task=task,
+        seed=seed,
+        episode=episode,
+        total_reward=entry.reward,
+        length=entry.length,
+        terminated=entry.terminated,
+        truncated=entry.truncated,
+        success=entry.success,
+        warnings=field_of(said, "warnings", mapping, default={}),
+        monitor=monitor,
+        episode_id=entry.episode_id,
+        start_time=entry.start_time,
+        seconds=entry.end_time - entry.start_time,
+    )
+
+
+def _failed(said: Mapping[str, Any], task: str, monitor: str) -> EpisodeResult:
+    seed, episode = _unit(said)
+    episode_id = field_of(said, "episode_id", optional(integer))
+    return EpisodeResult(
+        task=task,
+        seed=seed,
+        episode=episode,
+        total_reward=None,
+        length=field_of(said, "length", integer),
+        terminated=None,
+        truncated=None,
+        failure=field_of(said, "failure", text),
+        monitor=None if episode_id is None else monitor,
+        episode_id=episode_id,
+        start_time=field_of(said, "start_time", optional(number)),
+        seconds=field_of(said, "seconds", optional(number)),
+    )
+
+
+def _unit(said: Mapping[str, Any]) -> Unit:
+    return field_of(said, "seed", integer), field_of(said, "episode", integer)
