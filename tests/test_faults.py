@@ -125,6 +125,21 @@ def test_a_schedule_that_raises_breaks_no_finished_video(
     assert [fault["reason"] for fault in details["faults"]] == ["no idea"]
 
 
+def test_a_trigger_that_raises_stops_no_simulation(pendulum: Any, out: Path) -> None:
+    """It is asked again at the next step."""
+
+    def trigger(steps: int) -> bool:
+        if steps == 2:
+            raise RuntimeError("no idea")
+        return steps == 4
+
+    options: dict[str, Any] = {"step_trigger": trigger, "video_length": 2}
+    with pendulum(None, on_error="warn", workers=1, **options) as monitor:
+        run(monitor)
+    assert [path.name[-14:] for path in out.glob("*.mp4")] == ["step000004.mp4"]
+    assert [f["reason"] for f in manifest_of(out)["mjrec"]["faults"]] == ["no idea"]
+
+
 def test_a_dead_encoder(
     pendulum: Any,
     out: Path,
@@ -241,7 +256,7 @@ def test_a_full_disk_while_an_episode_is_recorded(
 
 @both_ways
 def test_a_full_disk_at_the_journal(on_error: str, pendulum: Any, out: Path) -> None:
-    """The statistics come from memory at the close; the journal has whole lines."""
+    """What it lacks is written as soon as there is room again."""
     monitor = pendulum(render="off", trajectory_callable=False, on_error=on_error)
     run(monitor)
     [journal] = out.glob("*.jsonl")
@@ -251,12 +266,12 @@ def test_a_full_disk_at_the_journal(on_error: str, pendulum: Any, out: Path) -> 
     run(monitor)
     monitor.close()
     assert stats_of(out)["episode_lengths"] == [8, 8, 8]
-    assert [entry["episode_id"] for entry in journal_of(out)] == [0, 2]
+    assert [entry["episode_id"] for entry in journal_of(out)] == [0, 1, 2]
     assert on_error == "raise" or faults_of(out) == [(1, "journal")]
 
 
 def test_a_disk_without_any_room(pendulum: Any, out: Path) -> None:
-    """Nothing is pending of which nothing was written; results come later."""
+    """Nothing is pending of which nothing was written; results come later, and stay."""
     monitor = pendulum(workers=0, on_error="warn")
     with file_size_limit(0):
         run(monitor)
@@ -267,6 +282,9 @@ def test_a_disk_without_any_room(pendulum: Any, out: Path) -> None:
     assert (0, "trajectory") in faults_of(out)
     assert manifest_of(out)["mjrec"]["pending"] == []
     assert in_flight(out) == []
+    before = manifest_of(out)
+    mjrec.render_videos(out, workers=1)
+    assert manifest_of(out) == before
 
 
 # --- removed directories -------------------------------------------------------------

@@ -328,14 +328,14 @@ def test_a_frame_that_fails_is_left_out(make_corridor: Any, tmp_path: Path) -> N
 def test_forked_child_leaves_the_files_alone(
     corridor: Any, tmp_path: Path, play: Any
 ) -> None:
-    """A child may exit, but not record; the parent's files stay the parent's."""
+    """A child may exit, but not record or close; the files stay the parent's."""
     script = LEAVING.replace("HalfCheetah-v5", "CartPole-v1").format(
         tests=str(Path(__file__).parent),
         directory=str(tmp_path),
         how="""
 import os
 if os.fork() == 0:
-    for call in (env.reset, lambda: env.step(0)):
+    for call in (env.reset, lambda: env.step(0), env.close):
         try:
             call()
         except mjrec.Error as error:
@@ -355,7 +355,7 @@ print(sorted(os.listdir(env.directory)))
         text=True,
         check=True,
     )
-    assert done.stdout.count("forked from it") == 2
+    assert done.stdout.count("forked from it") == 3
     assert "manifest" not in done.stdout.splitlines()[-1]
     assert len(manifest_of(tmp_path)["videos"]) == 1
 

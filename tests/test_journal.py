@@ -199,7 +199,7 @@ def test_what_cannot_be_read_is_one_error(
 
 
 def test_a_line_that_does_not_fit_is_taken_back(path: Path) -> None:
-    """A full disk is an error; half a line left by Ctrl-C goes at the next append."""
+    """It comes before the next one; half a line left by Ctrl-C goes then."""
     writer = JournalWriter(path)
     writer.append(ENTRY)
     # As on a full disk, the first part of the line is written, and then no more.
@@ -211,13 +211,14 @@ def test_a_line_that_does_not_fit_is_taken_back(path: Path) -> None:
     assert len(path.read_bytes().splitlines()) == 1
     with path.open("ab") as file:
         file.write(b'{"episode_id": 4, "le')
-    writer.append(NEXT)
-    assert read(path) == [ENTRY, NEXT]
+    third = dataclasses.replace(NEXT, episode_id=NEXT.episode_id + 1)
+    writer.append(third)
+    assert read(path) == [ENTRY, NEXT, third]
     # One that is removed is noticed, and the entry after that begins another.
     path.unlink()
     with pytest.raises(FileNotFoundError, match="removed while it was written"):
         writer.append(ENTRY)
     assert not path.exists()
-    writer.append(ENTRY)
+    writer.append(NEXT)
     writer.close()
-    assert read(path) == [ENTRY]
+    assert read(path) == [ENTRY, NEXT]

@@ -27,6 +27,7 @@ from recordings import (
 from waiting import wait_until
 
 import mjrec
+from mjrec.formats import spans
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.recorder.keep_rules import UNDECIDED
 from mjrec.recorder.tracking import FinishedVideo, Tracker
@@ -415,6 +416,22 @@ def test_a_killed_run_leaves_its_candidates(
 
 
 # --- what cannot be ------------------------------------------------------------------
+
+
+def test_deciding_costs_each_candidate_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No list is looked for among those of all the others."""
+    read: list[Path] = []
+    original = spans.read_list
+    monkeypatch.setattr(spans, "read_list", lambda p: read.append(p) or original(p))
+    monitor = mjrec.Monitor(
+        pendulum([1] * 20), tmp_path, keep="median", env_id="Pole-v0", workers=0
+    )
+    run(monitor, 20)
+    read.clear()
+    monitor.close(wait=False)
+    assert 0 < len(read) <= 3 * 20
 
 
 def test_nothing_was_finished(tmp_path: Path) -> None:

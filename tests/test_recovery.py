@@ -65,7 +65,9 @@ def run(env, steps=12):
 
 def encoding(env):
     # What was captured has gone to the encoder, all of it.
-    writer = env.video_recorder._sink._writer
+    clips = env._recorder._clips
+    recorder = clips._clip.live.recorders[0] if clips else env.video_recorder
+    writer = recorder._sink._writer
     while writer._encoding._encoded < writer.frame_count:
         time.sleep(0.001)
     return writer._encoding
@@ -270,6 +272,26 @@ def test_a_killed_encoder_is_reported(killed: Callable[[str], Path]) -> None:
     assert broken.endswith(".video000000.meta.json")
     assert not mjrec.recover(directory)
     assert part.exists()
+
+
+@pytest.mark.parametrize("is_fed", [True, False])
+def test_a_clip_whose_encoder_wrote_nothing(
+    is_fed: bool, killed: Callable[[str], Path]
+) -> None:
+    """It is told apart from one without a frame; no episode's end is taken for its."""
+    directory = killed(
+        "env = monitor(video_length=60)\nrun(env)\nrun(env, 7)\n"
+        "encoding = encoding(env)\nos.kill(encoding._process.pid, signal.SIGKILL)\n"
+        f"if not {is_fed}: encoding._hashes.truncate(0)\n"
+        "encoding.temporary.write_bytes(b'')\ndie()"
+    )
+    assert mjrec.recover(directory)
+    assert videos_in(directory) == []
+    metadata = metadata_of(directory, 0)
+    assert metadata["empty"]
+    assert ("none of 21 frames" in metadata.get("broken_reason", "")) is is_fed
+    assert (metadata["complete"], metadata["reason"]) == (False, "killed")
+    assert not mjrec.recover(directory)
 
 
 def test_an_encoder_that_outlives_its_process_is_waited_for(

@@ -118,7 +118,8 @@ class JournalWriter:
     """Appends episodes and other events to a journal.
 
     The file is made by the first of them. Each is one `write` of whole lines, so that
-    a reader at any moment, and a process killed at any moment, has whole lines.
+    a reader at any moment, and a process killed at any moment, has whole lines. What
+    could not be written, because the disk was full, is written before the next one.
 
     Args:
         path: the file.
@@ -131,6 +132,7 @@ class JournalWriter:
         self._file: io.FileIO | None = None
         # Of the whole lines; beyond it is what a failed write has left.
         self._size = 0
+        self._unwritten = b""
         self._closed = False
 
     def append(self, entry: JournalEntry) -> None:
@@ -141,8 +143,8 @@ class JournalWriter:
 
         Raises:
             ClosedError: after `close`.
-            OSError: it cannot be written (a full disk); the journal is then as it
-                was before. Or it was removed.
+            OSError: it cannot be written now (a full disk); the journal is then as
+                it was before. Or it was removed.
         """
         # Not `asdict`, which would copy the options deeply; they may not allow it.
         optional_keys = ("chosen", "recording", "evaluation")
@@ -183,9 +185,12 @@ class JournalWriter:
             if self._size and os.pread(self._file.fileno(), 1, self._size - 1) != b"\n":
                 # Its writer was killed in the middle of a line.
                 line = b"\n" + line
+        self._unwritten += line
+        first = b""
         if self._size == 0 and self._run is not None:
-            line = f"{dumps({'run': self._run})}\n".encode() + line
-        self._write(self._file, line)
+            first = f"{dumps({'run': self._run})}\n".encode()
+        self._write(self._file, first + self._unwritten)
+        self._unwritten = b""
 
     def _write(self, file: io.FileIO, line: bytes) -> None:
         status = os.fstat(file.fileno())

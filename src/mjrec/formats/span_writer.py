@@ -47,6 +47,10 @@ from .trajectory_log import pack_change
 # A new log begins with the next recording then.
 _LONG = 64 << 20
 
+# The tail of a log of one recording is that much shorter: making it takes longer than
+# all else at the start of an episode.
+_TAILS_OF_ONE = 8
+
 ROW_HEAD = struct.Struct("=qqdQ")
 
 
@@ -101,7 +105,8 @@ class SpanLogs:
             self.close()
         if self._log is None:
             path = self.directory / states_name(self._infix, next(self._numbers))
-            self._log = OpenLog(path, facts, dtype, tail_bytes=self._tail_bytes)
+            tail = self._tail_bytes // _TAILS_OF_ONE if alone else self._tail_bytes
+            self._log = OpenLog(path, facts, dtype, tail_bytes=tail)
         span = SpanWriter(self._log, name, facts)
         if alone:
             self._log.is_alone = True
@@ -336,6 +341,24 @@ class SpanWriter:
         with contextlib.suppress(FileNotWritten):
             self.log.say({"note": self._name, "facts": self._unsaid})
             self._unsaid = {}
+
+    def add(self, facts: Mapping[str, Any]) -> None:
+        """Add to the facts, also after the end; of a key, the newest counts.
+
+        Raises:
+            FileNotWritten: the disk is full; nothing was added.
+        """
+        self.log.say({"note": self._name, "facts": dict(facts)})
+
+    def remove(self) -> None:
+        """Give up its rows after its end; its log goes where nothing else is in it.
+
+        Raises:
+            FileNotWritten: the disk is full.
+            DirectoryNotWritable: files cannot be removed.
+        """
+        self.drop()
+        remove_if_done(self.log.path)
 
     def end(self, facts: Mapping[str, Any]) -> None:
         """Say how it ended. Idempotent; what the first call says counts.

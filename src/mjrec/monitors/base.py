@@ -15,7 +15,7 @@ from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
 from ..recorder.ending_reasons import last_error
 from ..recorder.exit_guard import ExitGuard
-from ..recorder.finishing_process import Finisher
+from ..recorder.monitored_run import Finisher
 from ..recorder.options import (
     DEFERRED,
     LIVE,
@@ -90,7 +90,10 @@ class MonitorBase:
             RenderError: videos could not be rendered; all else is done, and their
                 trajectories are kept.
             FileNotWritten: the disk is full; the next call tries again.
+            Error: in a process forked from the one that made the monitor.
         """
+        for recorder in self._recorders:
+            recorder.check_process()
         try:
             if wait:
                 with render_progress() as on_progress:

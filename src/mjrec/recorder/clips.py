@@ -69,8 +69,15 @@ class Clips:
         """Begin a video, if it is its time."""
         self._settle()
         taken = self._run.stats.total_steps
-        if self._clip is None and self._trigger is not None and self._trigger(taken):
-            self._start(taken)
+        if self._clip is None and self._trigger is not None:
+            try:
+                is_chosen = self._trigger(taken)
+            except Exception as error:
+                if not self._run.tolerates("video", error):
+                    raise
+                return
+            if is_chosen:
+                self._start(taken)
 
     def step(
         self, reward: float, *, terminated: bool, truncated: bool, has_picture: bool

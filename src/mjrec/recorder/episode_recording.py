@@ -14,7 +14,6 @@ from ..errors import DirectoryNotWritable
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import trajectory_prefix, video_prefix
-from ..formats.spans import add_facts, drop_recording
 from .fast_path import FastPath, counting
 from .keep_rules import Standing
 from .live_videos import LiveVideos
@@ -261,11 +260,11 @@ class EpisodeRecording:
             self._run.finisher.submit(self._states.path)
             self._run.journal.note("dropped", self.episode_id)
         else:
-            drop_recording(self._states.path)
+            self._states.remove()
 
     def _add_verdict(self, standing: Standing, selection: Mapping[str, Any]) -> None:
-        if self._states is not None and self._states.is_there:
-            add_facts(self._states.path, self._verdict(standing, selection))
+        if self._states is not None:
+            self._states.add(self._verdict(standing, selection))
 
     def _verdict(
         self, standing: Standing, selection: Mapping[str, Any]

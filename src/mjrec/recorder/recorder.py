@@ -24,7 +24,7 @@ from ..formats.monitor_directory import (
     video_prefix,
 )
 from ..formats.render_failures import note_failure, reason_of
-from ..formats.spans import FINISHED
+from ..formats.spans import FINISHED, recordings_in_flight
 from ..provenance import versions
 from ..results.manifest_writing import write_manifest_and_stats
 from .clips import Clips
@@ -32,10 +32,9 @@ from .ending_reasons import CLOSE, RESET, ending
 from .episode_choice import EpisodeChoice
 from .episode_recording import EpisodeRecording
 from .fast_path import FastPath
-from .finishing_process import Finisher, LaterFinisher
 from .keep_rules import Standing
 from .kept_videos import KeptVideos
-from .monitored_run import BegunEpisode, MonitoredRun
+from .monitored_run import BegunEpisode, Finisher, LaterFinisher, MonitoredRun
 from .opening import open_directory
 from .options import LIVE, RecorderOptions, type_of_mode
 from .recording import DeferredVideo
@@ -246,8 +245,7 @@ class Recorder:
             ResetNotAllowed: in mid-episode, unless early resets are allowed.
             Error: in a process forked from the one that made the recorder.
         """
-        if self._is_forked:
-            self._refuse_process()
+        self.check_process()
         self.fast = None
         self.stats_recorder.before_reset(after_error=self._ending is not None)
         if not self._is_unbegun():
@@ -336,8 +334,7 @@ class Recorder:
             ResetNeeded: before the first reset, or after the end of an episode.
             Error: in a process forked from the one that made the recorder.
         """
-        if self._is_forked:
-            self._refuse_process()
+        self.check_process()
         self.stats_recorder.before_step()
         if self._clips is not None:
             self._clips.before_step()
@@ -457,14 +454,8 @@ class Recorder:
             self._trackers.end()
             pending = self._write_last_results()
         self._leave()
-        if pending and not (self._kept and self._kept.selection.is_left_open):
-            # Said aloud: nobody else will render them.
-            logger.warning(
-                "%d %s pending: mjrec render %s",
-                pending,
-                "video" if pending == 1 else "videos",
-                self.directory,
-            )
+        if not (self._kept and self._kept.selection.is_left_open):
+            self._say_what_is_left(pending)
         failures.raise_first()
         logger.info("Finished writing results. They are in %s.", self.directory)
 
@@ -472,12 +463,14 @@ class Recorder:
         """Return why videos could not be rendered, by their names."""
         return self._finisher.failures
 
-    def _refuse_process(self) -> None:
-        raise Error(
-            f"This monitor belongs to process {self._pid}, and this is {os.getpid()}, "
-            "forked from it. Two processes cannot write the same files: make the "
-            "monitor inside the process that uses it."
-        )
+    def check_process(self) -> None:
+        """Raise `Error` in a process forked from the one that made the recorder."""
+        if self._is_forked:
+            raise Error(
+                f"This monitor belongs to process {self._pid}, and this is "
+                f"{os.getpid()}, forked from it. Two processes cannot write the same "
+                "files: make the monitor inside the process that uses it."
+            )
 
     def _is_unbegun(self) -> bool:
         """Whether the running episode has had its reset only."""
@@ -659,6 +652,21 @@ class Recorder:
             logs.release()
         self._journal.close()
         self._place.lock.release()
+
+    def _say_what_is_left(self, pending: int) -> None:
+        """Say aloud what nobody does unless somebody asks for it."""
+        if pending:
+            videos = "video" if pending == 1 else "videos"
+            logger.warning(
+                "%d %s pending: mjrec render %s", pending, videos, self.directory
+            )
+        elif in_logs := len(recordings_in_flight(self.directory, self.infix)):
+            logger.warning(
+                "%d %s in a log: mjrec recover %s",
+                in_logs,
+                "trajectory" if in_logs == 1 else "trajectories",
+                self.directory,
+            )
 
     def _write_last_results(self) -> int:
         """Write what the run amounts to; return how many videos are pending."""

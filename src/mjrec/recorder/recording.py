@@ -259,6 +259,25 @@ class Recording:
             if self._is_alone:
                 self._logs.close()
 
+    def add(self, facts: Mapping[str, Any]) -> None:
+        """Add to its facts, also after its end.
+
+        Raises:
+            FileNotWritten: the disk is full.
+        """
+        if self._span is not None:
+            self._span.add(facts)
+
+    def remove(self) -> None:
+        """Give up its rows, after its end.
+
+        Raises:
+            FileNotWritten: the disk is full.
+            DirectoryNotWritable: files cannot be removed.
+        """
+        if self._span is not None:
+            self._span.remove()
+
     def _try(self, take: Callable[[], None]) -> None:
         if self.is_stopped:
             return

@@ -31,6 +31,8 @@ from ..formats.video_metadata import (
 )
 
 _MOMENT = 0.05
+# In the metadata of clips only.
+_FIRST_STEP = "first_step"
 _CUT = {"complete": False, "reason": KILLED}
 _BROKEN = (
     "the recording process was killed, and its encoder before it had finished the file"
@@ -66,18 +68,27 @@ def finish_video(
         note_file.unlink(missing_ok=True)
         return
     _wait_for_encoder(video, deadline)
-    if not metadata_path(video.path).exists() and _is_begun(video):
+    if not metadata_path(video.path).exists():
+        if _FIRST_STEP in video.metadata:
+            # A clip crosses episodes: what is known of one says nothing of its end.
+            known = {}
         ending = known if "complete" in known else {**known, **_CUT}
         without_video = {**video.metadata, **ending, "empty": True, "recovered": True}
         try:
-            if not _holds_frames(video):
-                # It was killed before its encoder had been given a frame.
-                write_metadata(video.path, without_video)
-                yield metadata_path(video.path).name, "there was no frame yet"
-            else:
+            if _holds_frames(video):
                 metadata = _metadata(video, video.finish(), known)
                 write_metadata(video.path, metadata)
                 yield video.path.name, _counted(metadata["frame_count"], metadata)
+            # The hash comes first: of the last one the encoder may have had nothing.
+            elif (lost := _hashed_frames(video)) > 1:
+                why = f"it holds none of {lost} frames"
+                broken = {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
+                write_metadata(video.path, {**without_video, **broken})
+                yield video.path.name, f"broken ({why})"
+            else:
+                # It was killed before its encoder had been given a frame.
+                write_metadata(video.path, without_video)
+                yield metadata_path(video.path).name, "there was no frame yet"
         except EncoderError as error:
             why = (error.stderr.strip().splitlines() or [str(error)])[-1]
             broken = {"broken": True, "broken_reason": f"{_BROKEN}: {why}"}
@@ -109,18 +120,12 @@ def _wait_for_encoder(video: UnfinishedVideo, deadline: float) -> None:
         time.sleep(_MOMENT)
 
 
-def _is_begun(video: UnfinishedVideo) -> bool:
-    """Tell whether there is a file that anything was written into."""
-    for path in (video.temporary, video.path):
-        # A link may lead anywhere.
-        if path.is_file() and not path.is_symlink():
-            return path.stat().st_size > 0
-    return False
-
-
 def _holds_frames(video: UnfinishedVideo) -> bool:
     """Tell whether the file holds anything besides what every mp4 begins with."""
     path = video.temporary if video.temporary.exists() else video.path
+    # A link may lead anywhere.
+    if path.is_symlink() or not path.is_file():
+        return False
     end = path.stat().st_size
     with path.open("rb") as file:
         position = 0
@@ -135,6 +140,14 @@ def _holds_frames(video: UnfinishedVideo) -> bool:
                 return True
             position += max(size, 8)
     return False
+
+
+def _hashed_frames(video: UnfinishedVideo) -> int:
+    """Return how many frames have a hash, which the encoder was given or was to be."""
+    if video.hashes is None or video.hashes.is_symlink() or not video.hashes.is_file():
+        return 0
+    with video.hashes.open("rb") as lines:
+        return sum(not line.startswith(b"#") for line in lines)
 
 
 def _metadata(
