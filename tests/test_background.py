@@ -109,12 +109,6 @@ def has_ended(pid: int) -> bool:
     return stat.rpartition(")")[2].split()[0] == "Z"
 
 
-def workers_of(process: int) -> set[int]:
-    """Return the processes that draw for it."""
-    commands = {pid: Path(f"/proc/{pid}/cmdline") for pid in children(process)}
-    return {p for p, path in commands.items() if b".worker" in path.read_bytes()}
-
-
 # What it does
 
 
@@ -371,20 +365,35 @@ def test_one_that_hangs_is_ended(
     assert children() == others
 
 
-# What it leaves alone
+def test_workers_are_forks_and_one_that_dies_is_replaced(
+    recorded: Path, others: set[int], start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What they import is imported once; they end with the process, however it ends."""
+    background = start(recorded, workers=2)
+    for victim in ("a worker", "the process"):
+        background.expect()
+        [process] = children() - others
+        wait_until(lambda: len(children(process)) == 2)  # noqa: B023  called at once
+        commands = {
+            Path(f"/proc/{pid}/cmdline").read_bytes()
+            for pid in (process, *children(process))
+        }
+        assert len(commands) == 1
+        workers = children(process)
+        os.kill(min(workers) if victim == "a worker" else process, signal.SIGKILL)
+        background.submit(in_flight(recorded)[0])
+        background.wait()
+        assert background.failures == {}
+        if victim == "a worker":
+            assert "A drawing worker died and is replaced" in caplog.text
+            background.stop()
+            background = start(recorded, workers=2)
+        wait_until(lambda: all(map(has_ended, workers)))  # noqa: B023  called at once
+    assert "it was killed by SIGKILL" in caplog.text
+    assert [len(frames_of(video)) for video in recorded.glob("*.mp4")] == [4, 4]
 
-LOUD = """
-import logging, os
-os.write(1, b'early words\\n[1]\\n')
-import mjrec.rendering.finish as f
-add = f.Finisher.add
-def tell(*a, **k):
-    print('late words', flush=True)
-    os.write(1, b'half a line')
-    logging.getLogger('mjrec').warning('100% slow')
-    return add(*a, **k)
-f.Finisher.add = tell
-"""
+
+# What it leaves alone
 
 
 def test_a_forked_child_leaves_it_alone(tmp_path: Path, start: Start) -> None:

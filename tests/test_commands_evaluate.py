@@ -100,6 +100,77 @@ def test_failed_episodes_fail_the_command(run: Run, tmp_path: Path) -> None:
     assert (tmp_path / "e" / "results.json").exists()
 
 
+NAN = """
+import gymnasium
+import numpy as np
+
+class Nan(gymnasium.Env):
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), float("nan"), True, False, {}
+
+gymnasium.register("Nan-v0", Nan)
+"""
+
+
+@parametrize(("allowed", "expected"), [([], 1), (["--allow-nan"], 0)])
+def test_a_return_that_is_nan_is_no_success(
+    run: Run, tmp_path: Path, allowed: list[str], expected: int
+) -> None:
+    """It is said, and fails the command unless it is allowed."""
+    (tmp_path / "nan_env.py").write_text(NAN)
+    arguments = ["nan_env:Nan-v0", "--policy", "zero", "--keep", "none", *allowed]
+    status, out, _ = run(*arguments)
+    assert status == expected
+    assert "2 returns NaN or infinite" in out
+
+
+def test_a_directory_is_enough_to_go_on(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its best, median and worst episodes are named, each with a file."""
+    assert run(TASK, "--policy", "zero", "--keep", "none")[0] == 0
+    more = ["--seeds", "0-2", "--workers", "1", "--fail-under", "Inverted*=5"]
+    assert commands.main(["evaluate", "--resume", "e", *more]) == 0
+    out = capsys.readouterr().out
+    assert out.split()[out.split().index(TASK) + 1] == "6"
+    [worst] = [line for line in out.splitlines() if line.startswith("  worst")]
+    path = Path(worst.split()[-1])
+    assert path.is_file()
+    assert path.suffix == ".h5"
+    assert commands.main(["evaluate", "--resume", "e", "--seeds", "0-1"]) == 1
+    assert "seeds was (0, 1, 2)" in capsys.readouterr().err
+
+
+def test_an_evaluation_is_recovered_and_rendered_as_one(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """All folders in it; its table of files is right before and after."""
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert run(TASK, "--policy", "zero", "--keep", "all")[0] == 0
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    table = (tmp_path / "e" / "timing.csv").read_text()
+    videos = [row.split(",") for row in table.splitlines()[1:]]
+    assert not list(tmp_path.rglob("*.mp4"))
+    assert commands.main(["render", "e"]) == 0
+    assert all((tmp_path / "e" / row[5] / row[-1]).is_file() for row in videos)
+    assert (tmp_path / "e" / "timing.csv").read_text() == table
+    capsys.readouterr()
+    [manifest, *_] = (tmp_path / "e").rglob("*.manifest.json")
+    manifest.unlink()
+    assert commands.main(["recover", "e"]) == 0
+    assert f"{manifest.parent.relative_to(tmp_path / 'e')}" in capsys.readouterr().out
+    assert manifest.is_file()
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -140,7 +211,7 @@ def test_ctrl_c_says_how_to_go_on(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("mjrec.commands.evaluate.evaluate_policy", interrupted)
     status, _, err = run(TASK, "--policy", "zero")
     assert status == 130
-    assert "--resume goes on" in err
+    assert "mjrec evaluate --resume e goes on" in err
 
 
 def test_it_goes_on_with_resume(run: Run, tmp_path: Path) -> None:

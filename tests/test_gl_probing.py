@@ -32,10 +32,12 @@ def probe_with(backend: str, **variables: str) -> Probe:
     return probe_environment({**environ, "MUJOCO_GL": backend, **variables})
 
 
-def python_that_starts_with(folder: Path, code: str) -> dict[str, str]:
-    """Return the variables that make every Python run `code` first."""
+def let_python_start_with(
+    code: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Make every child run `code` first."""
     (folder / "sitecustomize.py").write_text(code)
-    return {"PYTHONPATH": str(folder)}
+    monkeypatch.syspath_prepend(folder)
 
 
 def test_egl_renders_and_says_with_what() -> None:
@@ -145,10 +147,11 @@ def test_driver_that_draws_nothing() -> None:
     ],
 )
 def test_the_end_of_the_child_is_an_answer(
-    tmp_path: Path, code: str, cause: str
+    tmp_path: Path, code: str, cause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A crash ends the child only."""
-    answer = probe_with("egl", **python_that_starts_with(tmp_path, code))
+    let_python_start_with(code, tmp_path, monkeypatch)
+    answer = probe_environment({**os.environ, "MUJOCO_GL": "egl"})
     assert cause in answer.cause
 
 
@@ -161,7 +164,7 @@ def test_hang_ends_with_where_it_hangs(
     assert "The driver hangs" in answer.cause
     assert "most recent call first" in answer.output
     monkeypatch.setattr(probing, "_GRACE", 0.2)
-    environ |= python_that_starts_with(tmp_path, "import signal; signal.pause()")
+    let_python_start_with("import signal; signal.pause()", tmp_path, monkeypatch)
     answer = probe_environment(environ, timeout=0.2)
     assert "no answer within 0.2 seconds" in answer.output
 

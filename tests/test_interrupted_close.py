@@ -28,6 +28,7 @@ import mjrec
 from mjrec.rendering.finish import finish
 
 MOMENTS = 20
+_ENTRANCE = ("close", "close_here", "call_all", "_leaving_if_interrupted")
 
 
 def record(directory: Path, render: str) -> Any:
@@ -60,7 +61,8 @@ class Interrupting:
         is_ours = "mjrec" in path.parts and path.stem != "trajectory_hdf5"
         if event in ("call", "return") and is_ours:
             self.count += 1
-            if self.count == self.last:
+            # At its very entrance closing has not begun: the next call does all of it.
+            if self.count >= self.last and frame.f_code.co_name not in _ENTRANCE:
                 raise KeyboardInterrupt
 
 
@@ -95,7 +97,7 @@ def test_finish_completes_what_ctrl_c_has_cut_short(
     cut = Interrupting(whole.count * (moment + 0.5) // MOMENTS)
     close(monitor, cut)
     # Python takes a profiler that has raised for a broken one.
-    assert cut.count == cut.last
+    assert cut.count >= cut.last
     # Closed: it does nothing more, and another process may put things in order.
     before = sorted(directory.iterdir())
     monitor.close()

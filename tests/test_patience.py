@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 
 import pytest
@@ -37,13 +38,15 @@ def test_who_was_stopped_counts_no_more_than_he_was_to_wait(
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     patience = Patience(120)
-    assert patience.begin_slice() == 1
-    now[0] += 3600
-    patience.end_slice()
+
+    def sleep(seconds: float, *, really: float = 0, news: bool = False) -> bool:
+        now[0] += really or seconds
+        return news
+
+    assert not patience.wait(functools.partial(sleep, really=3600))
     assert not patience.is_over
     for _ in range(119):
-        now[0] += patience.begin_slice()
-        patience.end_slice()
+        assert not patience.wait(sleep)
     assert patience.is_over
-    patience.renew()
+    assert patience.wait(functools.partial(sleep, news=True))
     assert not patience.is_over

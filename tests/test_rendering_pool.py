@@ -181,19 +181,17 @@ def test_a_killed_worker_is_replaced(
 
 @pytest.fixture
 def be_impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[WorkerPool], None]:
-    """Let the first worker hang after a moment; the next one gets its time."""
+    """Let a worker hang after a moment; the next one gets its time."""
 
     def shorten(pool: WorkerPool) -> None:
         stacks = Child.stacks
 
         def prolong_and_ask(child: Child) -> str:
-            for worker in pool._workers:
-                worker.patience.seconds = 120
+            pool._patience.seconds = 120
             return stacks(child)
 
         monkeypatch.setattr(Child, "stacks", prolong_and_ask)
-        # It has drawn, the others may only be about to begin.
-        pool._workers[0].patience.seconds = 0.5
+        pool._patience.seconds = 0.5
 
     return shorten
 

@@ -1,52 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes of ours that run a module of ours: `Child`, and in there `Parent`.
+"""Processes of ours that run a module of ours, which makes a `Parent` there.
 
 Not with multiprocessing, whose children import the caller's main module (a script
 without a guard would run again), cannot be started from daemonic processes, and with
 "fork" inherit OpenGL's locks without its threads.
-
-Both sides send messages: a JSON object, or the bytes of a frame. Errors come home as
-JSON (`carried`, `unpacked`): pickle would let a process that writes into the pipe run
-code here.
 """
 
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import fcntl
-import json
 import logging
 import os
-import queue
 import select
 import signal
-import struct
 import subprocess
 import sys
-import threading
 import time
 import traceback
 import weakref
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, Self, TypeAlias
+from typing import IO, Any, Self
 
-from .errors import KINDS, Error, rebuilt
+from .messages import (
+    MOST_BYTES,
+    PIPES_VARIABLE,
+    STACKS_SIGNAL,
+    Message,
+    packed,
+    received,
+)
+from .patience import Patience
 
-logger = logging.getLogger(__name__)
-
-Message: TypeAlias = "dict[str, Any] | bytearray"
-
-# Each message begins with whether it is the bytes of a frame, and its length.
-_HEADER = struct.Struct("=?Q")
 # What users may have without privileges: one frame of 480x480, and more.
 _PIPE_BYTES = 1 << 20
-
-# In the environment of a child: the descriptors that it receives from and sends to.
-_PIPES = "MJREC_PARENT"
-
-_STACKS = signal.SIGUSR1
 _MOST_WORDS_READ = 20_000
 _LOOKS_FOR_STACKS = 20
 _SECONDS_BETWEEN_LOOKS = 0.1
@@ -81,7 +69,7 @@ class Child:
         most_bytes: of a message; what is longer ends them. No frame is.
     """
 
-    most_bytes = 1 << 32
+    most_bytes = MOST_BYTES
 
     def __init__(
         self,
@@ -92,11 +80,11 @@ class Child:
         is_heard: bool = False,
         fork: Callable[[], object] | None = None,
     ) -> None:
-        words, printed = os.pipe() if is_heard else _memory()
-        their_orders, orders = os.pipe()
-        answers, their_answers = os.pipe()
+        words, printed = _pipe() if is_heard else _memory()
+        their_orders, orders = _pipe()
+        answers, their_answers = _pipe()
         pipes = (their_orders, their_answers)
-        environ = {**environ, _PIPES: f"{their_orders} {their_answers}"}
+        environ = {**environ, PIPES_VARIABLE: f"{their_orders} {their_answers}"}
         try:
             if fork is None:
                 command = [*python_command(module), *arguments]
@@ -120,7 +108,7 @@ class Child:
         self._answers = os.fdopen(answers, "rb", buffering=0)
         self.words: IO[bytes] = os.fdopen(words, "rb", buffering=0)
         self._unsent = b""
-        self._messages = _messages(answers, self.most_bytes)
+        self._messages = received(answers, self.most_bytes)
         files = (self._orders, self._answers, self.words)
         self._end = weakref.finalize(
             self, _end_child, self._process, files, os.getpid()
@@ -136,7 +124,7 @@ class Child:
 
         That it has died is noticed where its messages are waited for.
         """
-        self._unsent += b"".join(_packed(message))
+        self._unsent += b"".join(packed(message))
         self._send_on()
 
     def receive(self) -> Message | None:
@@ -151,9 +139,9 @@ class Child:
 
     def messages(self, seconds: float) -> Iterator[dict[str, Any] | None]:
         """Yield its messages until it ends; None once it was silent for so long."""
-        last = time.monotonic()
-        while (rest := last + seconds - time.monotonic()) > 0:
-            if not wait_for_news([self], rest):
+        patience = Patience(seconds)
+        while not patience.is_over:
+            if not patience.wait(lambda slice_: wait_for_news([self], slice_)):
                 continue
             try:
                 while (message := self.receive()) is not None:
@@ -161,14 +149,13 @@ class Child:
                         yield message
             except EOFError:
                 return
-            last = time.monotonic()
         yield None
 
     def stacks(self) -> str:
         """Return what the threads of one that hangs are at, for the log."""
         before = after = self._size_of_words()
         # One that has not begun yet dies of it. It may only have been stopped.
-        self._process.send_signal(_STACKS)
+        self._process.send_signal(STACKS_SIGNAL)
         self._process.send_signal(signal.SIGCONT)
         for _ in range(_LOOKS_FOR_STACKS):
             time.sleep(_SECONDS_BETWEEN_LOOKS)
@@ -180,13 +167,15 @@ class Child:
 
     def last_words(self) -> str:
         """Return what became of it, and the end of what it printed."""
-        said = self._words_from(max(0, self._size_of_words() - _MOST_WORDS_READ))
+        how = self.how_it_ended()
         # What Python says of a crash ends with the names of dozens of modules.
-        words = said.partition("\nExtension modules:")[0].strip()
-        return (
-            f"{self.how_it_ended()}. The end of what it said: "
-            f"{words[-_END_OF_WORDS:] or '(nothing)'}"
-        )
+        words = self.printed().partition("\nExtension modules:")[0].strip()
+        end = words[-_END_OF_WORDS:] or "(nothing)"
+        return f"{how}. The end of what it said: {end}"
+
+    def printed(self) -> str:
+        """Return the end of what it has printed."""
+        return self._words_from(max(0, self._size_of_words() - _MOST_WORDS_READ))
 
     def how_it_ended(self) -> str:
         """Return in words its exit status, for which it is waited some seconds."""
@@ -278,163 +267,6 @@ def wait_for_news(children: Iterable[Child], seconds: float) -> list[Child]:
     return found
 
 
-class Parent:
-    """The process that started this one, as its `Child`.
-
-    Not through the standard input, which is empty, and the standard output, which is
-    the standard error: libraries and drivers print whenever they like. What this
-    process starts or forks cannot speak to it.
-
-    Asked by `Child.stacks`, and when it dies of a signal such as SIGSEGV, this process
-    writes what its threads are at to the standard error.
-    """
-
-    def __init__(self) -> None:
-        faulthandler.enable()
-        faulthandler.register(_STACKS)
-        self._pipes = [int(number) for number in os.environ.pop(_PIPES).split()]
-        for pipe in self._pipes:
-            os.set_inheritable(pipe, False)
-        self._orders, self._answers = self._pipes
-        self._messages = _messages(self._orders, Child.most_bytes)
-        self._said: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        self._listens = False
-        self._one_at_a_time = threading.Lock()
-        os.register_at_fork(after_in_child=self._close)
-
-    def receive(self, seconds: float | None = None) -> dict[str, Any]:
-        """Return its next message, waiting for it.
-
-        Args:
-            seconds: to wait at most, where `listen` was called; None is for ever.
-
-        Raises:
-            queue.Empty: nothing has come in that time.
-            EOFError: it has ended, and `listen` was not called.
-        """
-        if self._listens:
-            return self._said.get(timeout=seconds)
-        for message in self._messages:
-            assert isinstance(message, dict)
-            return message
-        raise EOFError
-
-    @property
-    def has_said_something(self) -> bool:
-        """Whether `receive` would not wait, where `listen` was called."""
-        return not self._said.empty()
-
-    def listen(self, at_end: Callable[[], object] | None = None) -> None:
-        """Receive on a thread from now on, to notice its end whatever is done here.
-
-        Args:
-            at_end: called there when it has ended; ends this process. At once, if None:
-                what is done here is of use to nobody else.
-        """
-        self._listens = True
-        threading.Thread(
-            target=self._listen, args=[at_end], name="mjrec-parent", daemon=True
-        ).start()
-
-    def send(self, content: memoryview | None = None, **message: Any) -> None:
-        """Send a message, or the bytes of a frame; from any thread."""
-        parts = _packed(message if content is None else content)
-        # Where it has ended, `listen` sees to it.
-        with contextlib.suppress(OSError), self._one_at_a_time:
-            for part in parts:
-                rest = memoryview(part)
-                while rest:
-                    rest = rest[os.write(self._answers, rest) :]
-
-    def send_warnings(self) -> None:
-        """Send it what is logged here as a warning or worse, as `log`, from now on."""
-        logging.getLogger().addHandler(_ToParent(self))
-
-    def _listen(self, at_end: Callable[[], object] | None) -> None:
-        # Reset, where it died before it had read everything.
-        with contextlib.suppress(OSError):
-            for message in self._messages:
-                assert isinstance(message, dict)
-                self._said.put(message)
-        if at_end is not None:
-            at_end()
-        # Not `sys.exit`, which would wait for a driver.
-        os._exit(0)
-
-    def _close(self) -> None:
-        while self._pipes:
-            os.close(self._pipes.pop())
-
-
-def log_message(message: Mapping[str, Any]) -> bool:
-    """Log here what a child has sent as `log`; return whether it is that."""
-    if "log" in message:
-        name, level, text = message["log"]
-        logging.getLogger(name).log(level, "%s", text)
-    return "log" in message
-
-
-class _ToParent(logging.Handler):
-    def __init__(self, parent: Parent) -> None:
-        super().__init__(logging.WARNING)
-        self._parent = parent
-
-    def emit(self, record: logging.LogRecord) -> None:
-        try:
-            self._parent.send(log=[record.name, record.levelno, self.format(record)])
-        except Exception:
-            # As all handlers: who logs is not disturbed by it.
-            self.handleError(record)
-
-
-def _packed(
-    message: Mapping[str, Any] | memoryview,
-) -> tuple[bytes, bytes | memoryview]:
-    if isinstance(message, memoryview):
-        return _HEADER.pack(True, message.nbytes), message.cast("B")
-    content = json.dumps(message).encode()
-    return _HEADER.pack(False, len(content)), content
-
-
-def _messages(pipe: int, most_bytes: int) -> Generator[Message | None, None, None]:
-    """Yield what comes through a pipe until its end; None where it has to wait."""
-    with contextlib.suppress(EOFError):
-        while True:
-            is_frame, size = _HEADER.unpack((yield from _received(pipe, _HEADER.size)))
-            if size > most_bytes:
-                logger.warning("A process of mjrec's sends what is not understood.")
-                return
-            content = yield from _received(pipe, size)
-            if is_frame:
-                yield content
-                continue
-            try:
-                message = json.loads(content)
-            except (ValueError, RecursionError):
-                message = None
-            if isinstance(message, dict):
-                yield message
-            else:
-                logger.warning(
-                    "A process of mjrec's said what is not understood: %.200r", content
-                )
-
-
-def _received(pipe: int, size: int) -> Generator[None, None, bytearray]:
-    content = bytearray(size)
-    missing = memoryview(content)
-    while missing:
-        try:
-            count = os.readv(pipe, [missing])
-        except BlockingIOError:
-            yield None
-            continue
-        if not count:
-            raise EOFError
-        missing = missing[count:]
-    return content
-
-
 class _Process:
     """A process that this one has started, as far as it has to be waited for."""
 
@@ -468,6 +300,18 @@ class _Process:
             else:
                 self._status = os.waitstatus_to_exitcode(status) if pid else None
         return self._status
+
+
+def _pipe() -> tuple[int, int]:
+    """Return the ends of a pipe, not in the place of a standard stream that is closed.
+
+    There the child's own would take its place.
+    """
+    ends = os.pipe()
+    reading, writing = (fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 3) for end in ends)
+    for end in ends:
+        os.close(end)
+    return reading, writing
 
 
 def _memory() -> tuple[int, int]:
@@ -593,43 +437,3 @@ def _is_of_main(entry: str) -> bool:
     return entry == "" or (
         file is not None and Path(entry).resolve() == Path(file).resolve().parent
     )
-
-
-def carried(error: BaseException) -> dict[str, Any]:
-    """Return what `unpacked` makes an error like `error` of, in plain JSON."""
-    if not isinstance(error, Error):
-        told = "".join(traceback.format_exception(error)).strip()
-        return {
-            "type": "Error",
-            "message": f"A worker failed in a way that nobody foresaw.\n{told}",
-        }
-    # One that a module made of its own is known by the nearest that everybody knows.
-    kinds = (kind.__name__ for kind in type(error).__mro__)
-    return {
-        "type": next(name for name in kinds if name in KINDS),
-        "message": str(error),
-        "facts": {k: _plain(v) for k, v in vars(error).items() if _is_plain(v)},
-    }
-
-
-def unpacked(plain: Mapping[str, Any]) -> Error:
-    """Return the error that was carried.
-
-    It has the class, the message and, of the attributes, numbers, texts, lists of them
-    and paths.
-    """
-    facts = {
-        key: Path(value["path"]) if isinstance(value, dict) else value
-        for key, value in plain.get("facts", {}).items()
-    }
-    return rebuilt(KINDS.get(plain["type"], Error), plain["message"], facts)
-
-
-def _is_plain(value: object) -> bool:
-    if isinstance(value, list):
-        return all(isinstance(item, str | int | float) for item in value)
-    return value is None or isinstance(value, str | int | float | Path)
-
-
-def _plain(value: Any) -> Any:
-    return {"path": str(value)} if isinstance(value, Path) else value

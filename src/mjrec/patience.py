@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Callable
 
 from .errors import InvalidArgument
 
@@ -48,10 +49,8 @@ class Patience:
 
         patience = Patience()
         while not patience.is_over:
-            has_news = wait(patience.begin_slice())
-            patience.end_slice()
-            if has_news:
-                patience.renew()
+            if patience.wait(look_for_news):
+                ...
 
     Args:
         seconds: without progress; `patience_s()` if None.
@@ -60,8 +59,6 @@ class Patience:
     def __init__(self, seconds: float | None = None) -> None:
         self.seconds = patience_s() if seconds is None else seconds
         self._waited = 0.0
-        self._began = 0.0
-        self._slice = 0.0
 
     @property
     def is_over(self) -> bool:
@@ -72,13 +69,16 @@ class Patience:
         """Begin anew: there was progress."""
         self._waited = 0.0
 
-    def begin_slice(self) -> float:
-        """Return how many seconds to wait now."""
-        rest = max(0.0, self.seconds - self._waited)
-        self._slice = min(_LONGEST_SLICE_S, rest)
-        self._began = time.monotonic()
-        return self._slice
+    def wait(self, look: Callable[[float], object]) -> bool:
+        """Wait for a slice of the time, and begin anew where there was progress.
 
-    def end_slice(self) -> None:
-        """Count the time since `begin_slice`, up to what it had said."""
-        self._waited += min(time.monotonic() - self._began, self._slice)
+        Args:
+            look: waits at most so many seconds, and tells whether there was progress.
+        """
+        seconds = max(0.0, min(_LONGEST_SLICE_S, self.seconds - self._waited))
+        began = time.monotonic()
+        if look(seconds):
+            self.renew()
+            return True
+        self._waited += min(time.monotonic() - began, seconds)
+        return False

@@ -29,8 +29,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from .child_python import Child, Parent
+from .child_python import Child
 from .machine import cpu_flags, cpu_model, machine_fingerprint, usable_cpus
+from .parent import Parent
 
 logger = logging.getLogger(__name__)
 

@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from . import json_text
-from .child_python import Child, Parent
+from .child_python import Child
 from .errors import Error
+from .parent import Parent
 
 logger = logging.getLogger(__name__)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import math
 import re
 import sys
@@ -23,6 +24,8 @@ from ..errors import InvalidArgument, UnknownName
 from ..evaluation.dataclass_json import to_json
 from ..evaluation.evaluating import evaluate as evaluate_policy
 from ..evaluation.evaluation import Evaluation, EvaluationProgress
+from ..evaluation.kept_episodes import keep_rule
+from ..evaluation.results_files import PLAN_NAME
 from ..evaluation.statistics import Interval
 from ..evaluation.summaries import TaskSummary
 from ..evaluation.task_sets import tasks_from
@@ -38,6 +41,7 @@ T = TypeVar("T")
 _FAILED = 1
 _INTERRUPTED = 130
 _SHOWN = 10
+_MOST_SEEDS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -57,11 +61,11 @@ class _Shortfall:
 def evaluate(
     tasks: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK...")
-    ],
+    ] = (),
     /,
     *,
-    policy: str,
-    out: Path,
+    policy: str | None = None,
+    out: Path | None = None,
     episodes: int = 10,
     seeds: str | None = None,
     num_seeds: int | None = None,
@@ -69,14 +73,18 @@ def evaluate(
     keep: str = "best,median,worst",
     protocol: Literal["seeded", "suite"] = "seeded",
     resume: bool = False,
+    force: bool = False,
     max_steps: int | None = None,
+    episode_timeout: float | None = None,
     camera: str | None = None,
     size: str | None = None,
     max_fps: float = 60,
     quality: Literal["full", "draft"] = "full",
     env_kwargs: str = "{}",
+    policy_kwargs: str = "{}",
     score_range: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     fail_under: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    allow_nan: bool = False,
     confidence: float = 0.95,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
     engine_options: Annotated[
@@ -86,8 +94,9 @@ def evaluate(
     """Evaluate a policy: so many episodes of each task, and what came of them.
 
     The exit status is 1 where an episode failed (the policy raised, or gave NaN or the
-    wrong shape, or the environment raised) or a task fell short of --fail-under; the
-    results are written all the same. What was interrupted goes on with --resume.
+    wrong shape, or the environment raised), a return is NaN, or a task fell short of
+    --fail-under; the results are written all the same. What was interrupted goes on
+    with mjrec evaluate --resume DIR.
 
     Args:
         tasks: environments as in mjrec record, sets (dm_control:benchmarking,
@@ -96,7 +105,7 @@ def evaluate(
         policy: random, zero, module:name or module:name(), as in mjrec record.
         out: the directory of the evaluation, empty or new.
         episodes: how many of each task and seed.
-        seeds: of the runs, such as 0,1,2.
+        seeds: of the runs, such as 0,1,2 or 0-99.
         num_seeds: how many, from 0 on, instead of --seeds; 5, if neither is given.
         workers: how many processes; one for each CPU, if it is not given. The results
             do not depend on it. With --engine, how many workers it has.
@@ -106,20 +115,26 @@ def evaluate(
         protocol: seeded: episode i of seed s starts from NumPy's SeedSequence([s, i]).
             suite: each task and seed has one random stream, seeded with s.
         resume: go on with the evaluation in the directory, and repeat nothing that is
-            finished. More tasks, seeds or episodes may be asked for.
+            finished. mjrec evaluate --resume DIR is enough: what is not given is as it
+            was. More tasks, seeds or episodes may be asked for.
+        force: delete the evaluation that is in the directory.
         max_steps: ends an episode as truncated; 1000 where the environment itself has
             no limit.
+        episode_timeout: an episode that takes more seconds has failed.
         camera: name or number; the model's tracking camera, where there is one, if it
             is not given.
         size: of the videos, WIDTHxHEIGHT in pixels.
         max_fps: the most frames for a second of simulated time.
         quality: full, or draft: several times faster, with coarser edges and shadows.
         env_kwargs: more arguments for each environment, as a JSON object.
+        policy_kwargs: more arguments for the policy, likewise.
         score_range: TASK=LOW:HIGH, the returns that count as 0 and as 1 in what is said
             over all tasks. Those of dm_control have theirs. May be given several
             times.
         fail_under: TASK=VALUE. The exit status is 1 where the mean return of this task
-            is below, or an episode of it failed. May be given several times.
+            is below, or an episode of it failed. TASK may be a pattern. May be given
+            several times.
+        allow_nan: returns that are NaN or infinite do not make the exit status 1.
         confidence: the share of intervals that hold the true value.
         as_json: print one JSON object at the end, and nothing else.
         engine_options: where episodes are run and videos are drawn, in place of
@@ -128,10 +143,10 @@ def evaluate(
     height, width = size_of(size)
     ranges = _by_task("--score-range", score_range, _range_of, "TASK=LOW:HIGH")
     least = _by_task("--fail-under", fail_under, float, "TASK=VALUE")
-    names = tasks_from(tasks)
-    for task in least:
-        if task not in names:
-            raise UnknownName("task for --fail-under in this evaluation", task, names)
+    tasks, out = _tasks_and_directory(tasks, out, resume=resume)
+    names = tasks_from(tasks) if tasks else ()
+    if names:
+        _matching(least, names)
     engine = engine_options.chosen(workers)
     console = rich.console.Console(stderr=True, quiet=as_json)
     try:
@@ -148,6 +163,9 @@ def evaluate(
                 keep=keep,
                 protocol=protocol,
                 resume=resume,
+                force=force,
+                episode_timeout=episode_timeout,
+                policy_kwargs=kwargs_of(policy_kwargs, "--policy-kwargs"),
                 max_steps=max_steps,
                 camera=camera_of(camera),
                 height=height,
@@ -161,19 +179,52 @@ def evaluate(
             )
     except KeyboardInterrupt:
         console.print(
-            f"Interrupted. What was finished is in {out}: the same command with "
-            "--resume goes on, and repeats none of it.",
+            f"Interrupted. What was finished is in {out}: mjrec evaluate "
+            f"--resume {out} goes on, and repeats none of it.",
             highlight=False,
             markup=False,
             soft_wrap=True,
         )
         return _INTERRUPTED
+    least = _matching(least, [task.name for task in evaluation.plan.tasks])
     short = _shortfalls(evaluation, least)
+    is_nan = bool(evaluation.not_finite) and not allow_nan
     if as_json:
         sys.stdout.write(json_text.dumps(_fields(evaluation, short)) + "\n")
     else:
         _show(evaluation, short)
-    return _FAILED if evaluation.failed or short else 0
+    return _FAILED if evaluation.failed or short or is_nan else 0
+
+
+def _tasks_and_directory(
+    tasks: tuple[str, ...], out: Path | None, *, resume: bool
+) -> tuple[tuple[str, ...], Path]:
+    """Return the tasks and the directory; `--resume DIR` names only the latter."""
+    if out is None and resume and tasks and (Path(tasks[-1]) / PLAN_NAME).is_file():
+        return tasks[:-1], Path(tasks[-1])
+    if out is None:
+        raise InvalidArgument(
+            "Say where the results go, --out DIR, or which evaluation goes on, "
+            "--resume DIR."
+        )
+    return tasks, out
+
+
+def _matching(least: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
+    """Return what is asked for by task; a pattern is of all tasks that match it.
+
+    Raises:
+        UnknownName: no task matches.
+    """
+    matching: dict[str, float] = {}
+    for pattern, value in least.items():
+        found = [n for n in names if n == pattern or fnmatch.fnmatchcase(n, pattern)]
+        if not found:
+            raise UnknownName(
+                "task for --fail-under in this evaluation", pattern, names
+            )
+        matching |= dict.fromkeys(found, value)
+    return matching
 
 
 @dataclass
@@ -263,12 +314,18 @@ def _range_of(text: str) -> tuple[float, float]:
 def _seeds_of(text: str | None) -> list[int] | None:
     if text is None:
         return None
-    if not re.fullmatch(r"[0-9]{1,18}(,[0-9]{1,18})*", text, re.ASCII):
-        raise InvalidArgument(
-            f"--seeds are whole numbers with commas between, such as 0,1,2, got "
-            f"{text!r}."
-        )
-    return [int(number) for number in text.split(",")]
+    seeds: list[int] = []
+    for part in text.split(","):
+        ends = re.fullmatch(r"([0-9]{1,10})(?:-([0-9]{1,10}))?", part, re.ASCII)
+        first = int(ends[1]) if ends else 0
+        last = int(ends[2] or first) if ends else -1
+        if not first <= last < first + _MOST_SEEDS:
+            raise InvalidArgument(
+                "--seeds are whole numbers, or ranges of them, with commas between, "
+                f"such as 0,1,2 or 0-99, got {text!r}."
+            )
+        seeds += range(first, last + 1)
+    return seeds
 
 
 def _shortfalls(evaluation: Evaluation, least: Mapping[str, float]) -> list[_Shortfall]:
@@ -326,6 +383,8 @@ def _lines(evaluation: Evaluation, short: Sequence[_Shortfall]) -> list[str]:
     return [
         *_across_lines(evaluation),
         *_failure_lines(evaluation),
+        *_nan_lines(evaluation),
+        *_example_lines(evaluation),
         *(f"{each.task} falls short: {each.reason}." for each in short),
         *_video_lines(evaluation),
         f"The results are in {evaluation.directory.absolute()}",
@@ -375,6 +434,32 @@ def _failure_lines(evaluation: Evaluation) -> list[str]:
     return [count, *lines[:_SHOWN], *more]
 
 
+def _nan_lines(evaluation: Evaluation) -> list[str]:
+    found = evaluation.not_finite
+    if not found:
+        return []
+    first = found[0]
+    return [
+        f"{counted(len(found), 'return')} NaN or infinite, which is no success "
+        f"(--allow-nan): {first.task} seed {first.seed} episode {first.episode}"
+        f"{_and_more(len(found) - 1)}"
+    ]
+
+
+def _example_lines(evaluation: Evaluation) -> list[str]:
+    """Return the best, median and worst episode of each task, each with a file."""
+    lines = []
+    rule = keep_rule("best,median,worst")
+    for task in evaluation.plan.tasks[:_SHOWN]:
+        own = [each for each in evaluation.results if each.task == task.name]
+        for each, role in rule.choose(own):
+            lines.append(
+                f"  {role:6}  {_number(each.total_reward):>10}  {task.name} seed "
+                f"{each.seed} episode {each.episode}  {evaluation.file_of(each)}"
+            )
+    return lines
+
+
 def _video_lines(evaluation: Evaluation) -> list[str]:
     lines = []
     if evaluation.videos:
@@ -399,6 +484,7 @@ def _fields(evaluation: Evaluation, short: Sequence[_Shortfall]) -> dict[str, An
         "directory": str(evaluation.directory.absolute()),
         "episodes": len(evaluation.results),
         "failed": len(evaluation.failed),
+        "not_finite": len(evaluation.not_finite),
         "tasks": [to_json(each) for each in evaluation.summaries],
         "across": to_json(evaluation.across),
         "videos": [str(path) for path in evaluation.videos],

@@ -11,6 +11,8 @@ import rich.console
 import tyro
 
 from .. import json_text
+from ..evaluation.results_files import is_evaluation
+from ..formats.monitor_directory import monitor_directories_in
 from ..rendering.recovery import RecoveredFile, Recovery
 from ..rendering.recovery import recover as recover_directory
 from .help_text import flowing_help
@@ -34,12 +36,12 @@ def recover(
     be rendered later stay pending: mjrec render DIR.
 
     Args:
-        directory: the monitor directory.
+        directory: the monitor directory, or that of an evaluation.
         timeout: how many seconds to wait for encoders that have outlived the process
             that recorded, and are finishing their files.
         as_json: print one JSON object, instead of text.
     """
-    recovery = recover_directory(directory, timeout=timeout)
+    recovery = _recover_all(directory, timeout)
     if as_json:
         sys.stdout.write(json_text.dumps(_fields(recovery)) + "\n")
     else:
@@ -48,6 +50,25 @@ def recover(
             str(recovery), highlight=False, markup=False, soft_wrap=True
         )
     return _FAILED if recovery.failures else 0
+
+
+def _recover_all(directory: Path, timeout: float) -> Recovery:
+    """Recover a directory, and of an evaluation all monitor directories in it."""
+    recovery = recover_directory(directory, timeout=timeout)
+    for below in monitor_directories_in(directory) if is_evaluation(directory) else ():
+        found = recover_directory(below, timeout=timeout)
+        folder = below.relative_to(directory)
+        files, failures = (
+            tuple(RecoveredFile(f"{folder}/{each.name}", each.what) for each in of)
+            for of in (found.files, found.failures)
+        )
+        recovery = Recovery(
+            recovery.directory,
+            recovery.files + files,
+            recovery.failures + failures,
+            recovery.open_monitors + found.open_monitors,
+        )
+    return recovery
 
 
 def _fields(recovery: Recovery) -> dict[str, object]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -14,6 +15,7 @@ import tyro
 from .. import json_text
 from ..annotation import check_annotation
 from ..errors import InvalidArgument
+from ..formats.monitor_directory import iter_monitor_files, monitor_directories_in
 from ..monitors.progress import render_progress
 from ..rendering.jobs import RenderedVideos
 from ..rendering.render_videos import iter_rendered_videos
@@ -62,8 +64,8 @@ def render(
     by side where it was recorded so.
 
     Args:
-        target: a monitor directory; or a trajectory or video in one, for that episode
-            only.
+        target: a monitor directory, or that of an evaluation; or a trajectory or video
+            in one, for that episode only.
         pending: render the pending videos, which is also what is done without any
             option.
         episode: its number; all recorded ones, if it is not given.
@@ -103,16 +105,19 @@ def render(
     engine = engine_options.chosen(workers)
     console = rich.console.Console(quiet=as_json)
     with render_progress(console) as on_progress:
-        results = iter_rendered_videos(
-            target,
-            variant,
-            episode=episode,
-            out=out,
-            workers=workers if engine is None else None,
-            strict=strict,
-            trust_models=trust_models,
-            engine=engine,
-            on_progress=on_progress,
+        results = itertools.chain.from_iterable(
+            iter_rendered_videos(
+                place,
+                variant,
+                episode=episode,
+                out=out,
+                workers=workers if engine is None else None,
+                strict=strict,
+                trust_models=trust_models,
+                engine=engine,
+                on_progress=on_progress,
+            )
+            for place in _places(target, episode)
         )
         done, is_interrupted = _collect(results, console)
     report = RenderedVideos.joined(done, target if target.is_dir() else target.parent)
@@ -130,6 +135,13 @@ def render(
     if is_interrupted:
         return _INTERRUPTED
     return _FAILED if report.failures or report.blank else 0
+
+
+def _places(target: Path, episode: int | None) -> list[Path]:
+    """Return what is named; of an evaluation the monitor directories in it."""
+    if episode is not None or not target.is_dir() or any(iter_monitor_files(target)):
+        return [target]
+    return monitor_directories_in(target) or [target]
 
 
 def _collect(

@@ -35,8 +35,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from ..child_python import Parent, carried
 from ..gl.devices import render_on_given_gpu
+from ..messages import carried
+from ..parent import Parent
 from ..signals import Terminated, exiting_on_signals, received
 from .worker import PAYLOAD, SECONDS_TO_CLOSE, STOP
 

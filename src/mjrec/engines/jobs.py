@@ -27,8 +27,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from ..child_python import unpacked
 from ..errors import ClosedError, DirectoryNotWritable, Error, InvalidArgument
+from ..messages import unpacked
 from .local import LocalEngine
 from .worker import AGAIN, PAYLOAD, STOP, do_job, end_idle_children
 

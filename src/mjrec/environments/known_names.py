@@ -16,8 +16,9 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ..child_python import Child, Parent
+from ..child_python import Child
 from ..errors import EnvironmentNotMade, Error, MissingDependency
+from ..parent import Parent
 
 _VERSION = re.compile(r"-v([0-9]+)$", re.ASCII)
 _SUITE = "dm_control"

@@ -181,8 +181,8 @@ def evaluate(
         "width": width,
         "max_fps": max_fps,
         "quality": quality,
-        "env_kwargs": env_kwargs,
-        "policy_kwargs": policy_kwargs,
+        "env_kwargs": env_kwargs or None,
+        "policy_kwargs": policy_kwargs or None,
     }
     given = given_engine(engine, workers)
     local = LocalEngine(workers)

@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..child_python import unpacked
 from ..engines.jobs import Job, JobOutcome, Run
 from ..errors import EnvironmentNotMade, Error
 from ..formats.monitor_directory import Infix
+from ..messages import unpacked
 from ..rendering.engine_jobs import result_of
 from ..rendering.finish import bring_up_to_date, do_jobs
 from ..rendering.jobs import Progress, RecordingKey, RenderedVideos, VideoJob

@@ -27,10 +27,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..child_python import carried
 from ..errors import DirectoryNotWritable, Error, GLError
 from ..formats.locks import wait_for_lock
 from ..gl import use_gl
+from ..messages import carried
 from ..rendering.recovery import recover
 from ..simulation.find_simulation import simulation_in
 from ..simulation.model_trust import note_models, noting_models

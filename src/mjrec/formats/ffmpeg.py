@@ -305,8 +305,7 @@ class FfmpegProcess:
         """
         last = state()
         self._patience.renew()
-        while not is_ready(self._patience.begin_slice()):
-            self._patience.end_slice()
+        while not self._patience.wait(is_ready):
             if (now := state()) != last:
                 last = now
                 self._patience.renew()

@@ -3,18 +3,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import re
-import signal
-import subprocess
 import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from ..child_python import Child
 from ..machine import gpu_device_files
 from .backends import backend_name, environment_for
 from .diagnosis import Diagnosis, diagnose
@@ -157,41 +154,19 @@ def _ask_child(
     environ: Mapping[str, str], *, measure: bool, timeout: float
 ) -> tuple[dict[str, Any], str]:
     """Return what the child reported, and in words all that points to a failure."""
-    # `-P`: the working directory may hold a file called `random.py`.
-    command = [sys.executable, "-P", "-m", "mjrec.simulation.gl_probe"]
-    command += [f"--seconds={timeout}", *(["--measure"] if measure else [])]
+    arguments = [f"--seconds={timeout}", *(["--measure"] if measure else [])]
+    facts: dict[str, Any] = {}
     start = time.monotonic()
     try:
-        child = subprocess.Popen(
-            command,
-            env=dict(environ),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            # Ctrl-C is the parent's to handle.
-            start_new_session=True,
-        )
+        child = Child("mjrec.simulation.gl_probe", *arguments, environ=environ)
     except OSError as error:
         return {}, f"{sys.executable} could not be started: {error}"
     with child:
-        try:
-            answer, said = child.communicate(timeout=timeout + _GRACE)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            answer, said = child.communicate()
-        except BaseException:
-            child.kill()
-            raise
-    facts: dict[str, Any] = {}
-    for line in answer.splitlines():
-        # The last line is torn if the child died in it.
-        with contextlib.suppress(ValueError):
-            facts |= json.loads(line)
-    if time.monotonic() - start >= timeout:
-        end = f"no answer within {timeout:g} seconds"
-    elif child.returncode < 0:
-        end = f"The driver crashed ({signal.Signals(-child.returncode).name})."
-    else:
-        end = f"The child process ended with status {child.returncode}."
-    words = [said.decode(errors="replace").strip(), *facts.get("notes", [])]
+        for said in child.messages(timeout + _GRACE):
+            facts |= said or {}
+        if time.monotonic() - start >= timeout:
+            end = f"no answer within {timeout:g} seconds"
+        else:
+            end = f"The child process {child.how_it_ended()}."
+        words = [child.printed(), *facts.get("notes", [])]
     return facts, "\n".join(filter(None, [*words, facts.get("error") or end]))

@@ -15,7 +15,7 @@ from ..environments.scenes import Scenes
 from ..errors import NotPicklable, PicturesDiffer, RenderError
 from ..recorder.ending_reasons import last_error
 from ..recorder.exit_guard import ExitGuard
-from ..recorder.finishing_process import Finisher
+from ..recorder.monitored_run import Finisher
 from ..recorder.options import (
     DEFERRED,
     LIVE,

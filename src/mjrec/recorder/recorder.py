@@ -32,10 +32,9 @@ from .ending_reasons import CLOSE, RESET, ending
 from .episode_choice import EpisodeChoice
 from .episode_recording import EpisodeRecording
 from .fast_path import FastPath
-from .finishing_process import Finisher, LaterFinisher
 from .keep_rules import Standing
 from .kept_videos import KeptVideos
-from .monitored_run import BegunEpisode, MonitoredRun
+from .monitored_run import BegunEpisode, Finisher, LaterFinisher, MonitoredRun
 from .opening import open_directory
 from .options import LIVE, RecorderOptions, type_of_mode
 from .recording import DeferredVideo

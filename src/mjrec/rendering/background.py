@@ -31,9 +31,11 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..child_python import Child, Parent, log_message, wait_for_news
+from ..child_python import Child, wait_for_news
 from ..errors import Error
 from ..formats.monitor_directory import infix_of
+from ..messages import log_message
+from ..parent import Parent
 from ..patience import Patience, patience_s
 from .jobs import Progress, VideoJob, key_of
 from .pool import check_workers
@@ -142,15 +144,14 @@ class Background:
                 self._send(waited_for=True)
                 self._is_waited_for = True
             on_progress(self._progress)
-            has_news = wait_for_news([child], patience.begin_slice())
-            patience.end_slice()
+            has_news = patience.wait(lambda slice_: wait_for_news([child], slice_))
             # What it waits for itself, it looks at every second. Blocked for good, by
             # a disk that does not answer for example, it uses no CPU.
             before, cpu_seconds = cpu_seconds, child.cpu_seconds()
             self._listen()
-            if has_news or cpu_seconds > before:
+            if cpu_seconds > before:
                 patience.renew()
-            elif patience.is_over:
+            elif not has_news and patience.is_over:
                 logger.error(
                     "The process that renders the videos of %s has given no sign of "
                     "life for %g seconds, and is ended. What its threads were at:\n%s",

@@ -22,7 +22,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..child_python import Child, log_message, unpacked, wait_for_news
+from ..child_python import Child, wait_for_news
 from ..errors import (
     ClosedError,
     DirectoryNotWritable,
@@ -41,6 +41,7 @@ from ..gl.backends import (
     rendering_is_off,
 )
 from ..machine import usable_cpus
+from ..messages import log_message, unpacked
 from ..patience import Patience
 from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
 from .views import PlainCamera, View, plain_camera
@@ -85,9 +86,8 @@ class WorkerPool:
         directory: whose CPUs are shared.
         trust_models: whether they load compiled models that a stranger wrote; they do
             in any case where `MJREC_TRUST_MODELS` says so here.
-        forks: whether `start` forks this process, which then imports once for all, and
-            sets its environment variables. It has a single thread until then, and
-            never uses OpenGL.
+        forks: whether `start` forks this process, which then imports once for all. It
+            has a single thread until then, and never uses OpenGL.
 
     Raises:
         InvalidArgument: `workers` is not a whole number of at least 1.
@@ -116,6 +116,7 @@ class WorkerPool:
         self._held: dict[int, Lock] = {}
         self._workers = [_Worker() for _ in range(count)]
         self._forks = forks
+        self._patience = Patience()
         self.gl_facts: dict[str, Any] = {}
         self._has_drawn = False
         # Whether the backend is the user's, or has drawn what it should.
@@ -263,6 +264,7 @@ class WorkerPool:
     def _main_of_fork(self) -> Callable[[], object] | None:
         if not self._forks or threading.active_count() > 1:
             return None
+        before = dict(os.environ)
         # Read when mujoco is imported.
         os.environ.update(self._environ)
         try:
@@ -272,6 +274,10 @@ class WorkerPool:
             # A process of its own says why; or another backend works.
             self._forks = False
             return None
+        finally:
+            # Which backend is the user's choice is asked again where this one fails.
+            os.environ.clear()
+            os.environ.update(before)
         return main
 
     def _try_backends(self) -> None:
@@ -294,7 +300,7 @@ class WorkerPool:
         self._start(worker)
         assert worker.child is not None
         indices = [int(self._indices[position]) for position in worker.owes]
-        worker.patience.renew()
+        self._patience.renew()
         worker.child.send(drawing=self._drawing, indices=indices)
 
     def _drawn(self, call: int, workers: Sequence[_Worker]) -> Iterator[Frame]:
@@ -312,6 +318,7 @@ class WorkerPool:
                     self._wait_for_news(workers)
                     self._check_usable(call)
                 frame = worker.arrived.popleft()
+                self._patience.renew()
                 # Before the caller has it: it may be busy with it for long.
                 self._listen(workers, 0)
                 yield frame
@@ -327,17 +334,15 @@ class WorkerPool:
         for worker in hungry:
             if worker.child is None:
                 self._order(worker)
-        seconds = min(worker.patience.begin_slice() for worker in hungry)
-        heard = self._listen(hungry, seconds)
-        for worker in hungry:
-            worker.patience.end_slice()
-            if worker in heard:
-                worker.patience.renew()
-            elif worker.patience.is_over:
+        self._patience.wait(lambda seconds: self._listen(hungry, seconds))
+        if self._patience.is_over:
+            # All that sent more have no room for it, or owe nothing.
+            for worker in hungry:
                 self._end_hanging(worker)
+            self._patience.renew()
 
-    def _listen(self, workers: Sequence[_Worker], seconds: float) -> list[_Worker]:
-        """Take in what the workers send, waiting so long for it; return who sent."""
+    def _listen(self, workers: Sequence[_Worker], seconds: float) -> bool:
+        """Take in what the workers send, waiting so long for it; tell if they did."""
         by_child = {
             worker.child: worker
             for worker in workers
@@ -356,7 +361,7 @@ class WorkerPool:
                 # Ctrl-C, in the midst of a message: what follows makes no sense.
                 worker.end()
                 raise
-        return heard
+        return bool(heard)
 
     def _take_in(self, worker: _Worker, child: Child) -> None:
         while worker.may_send:
@@ -384,7 +389,7 @@ class WorkerPool:
 
     def _end_hanging(self, worker: _Worker) -> None:
         assert worker.child is not None
-        seconds = worker.patience.seconds
+        seconds = self._patience.seconds
         logger.error(
             "A drawing worker hangs: it has drawn nothing for %g seconds, and is "
             "ended. What its threads were at:\n%s",
@@ -433,7 +438,6 @@ class _Worker:
 
     def __init__(self) -> None:
         self.child: Child | None = None
-        self.patience = Patience()
         self.shape = (0, 0, 3)
         self.arrived: collections.deque[Frame] = collections.deque()
         self.owes = range(0)

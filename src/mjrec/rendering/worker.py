@@ -29,9 +29,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..child_python import Parent, carried
 from ..errors import InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
+from ..messages import carried
+from ..parent import Parent
 from ..simulation.cameras import Camera, camera_from_members, is_tracking
 from ..simulation.gl_probe import draw_test_scene
 from ..simulation.recorded_scene import GivenStates, RecordedScene

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The child process that tries one OpenGL backend: `python -m` this module.
 
-It imports mujoco as `MUJOCO_GL` says, draws a scene, looks at the picture, and writes
-what it found to standard output as JSON objects, one a line and each at once: what was
-written stays known if the driver crashes afterwards. Everything that a driver prints
-goes to standard error.
+It imports mujoco as `MUJOCO_GL` says, draws a scene, looks at the picture, and sends
+what it found to its parent, each thing at once: what was sent stays known if the driver
+crashes afterwards.
 
 ::
 
@@ -32,6 +31,7 @@ import numpy as np
 
 from ..gl.egl import egl_devices
 from ..machine import gpu_device_files
+from ..parent import Parent
 
 _SIZE = 480
 _SMALL = 96
@@ -133,19 +133,18 @@ def main() -> None:
         "--seconds", type=float, required=True, help="give up, with a traceback, after"
     )
     arguments = parser.parse_args()
+    parent = Parent()
     # A driver may hang inside a call, where no Python code can end it.
-    faulthandler.enable()
     faulthandler.dump_traceback_later(arguments.seconds, exit=True)
-    say = _reporter()
     backend = os.environ.get("MUJOCO_GL", "")
     facts: dict[str, Any] = {}
     try:
         draw, facts = draw_test_scene(_SIZE)
-        say(renders=True, **facts)
+        parent.send(renders=True, **facts)
         if arguments.measure:
-            say(frames_per_second=_frames_per_second(draw))
+            parent.send(frames_per_second=_frames_per_second(draw))
     except Exception as error:  # Whatever it is, it is the answer.
-        say(notes=list(_notes(backend)), error=_text_of(error))
+        parent.send(notes=list(_notes(backend)), error=_text_of(error))
     # Last, because asking for CUDA's numbers begins CUDA, which may fail or hang.
     if backend == "egl":
         used = facts.get("gl_device", {}).get("index")
@@ -153,19 +152,7 @@ def main() -> None:
             {**dataclasses.asdict(device), "in_use": device.index == used}
             for device in egl_devices()
         ]
-        say(devices=devices)
-
-
-def _reporter() -> Callable[..., None]:
-    """Return a function that reports, and send all other output to stderr."""
-    ours = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-
-    def say(**facts: Any) -> None:
-        ours.write(json.dumps(facts) + "\n")
-        ours.flush()
-
-    return say
+        parent.send(devices=devices)
 
 
 def _frames_per_second(draw: Callable[[], np.ndarray]) -> float:
