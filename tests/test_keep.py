@@ -29,7 +29,6 @@ from waiting import wait_until
 import mjrec
 from mjrec.formats import spans
 from mjrec.formats.trajectory_file import open_trajectory
-from mjrec.recorder.keep_rules import UNDECIDED
 from mjrec.recorder.tracking import FinishedVideo, Tracker
 from mjrec.rendering.finish import finish
 
@@ -444,22 +443,3 @@ def test_nothing_was_finished(tmp_path: Path) -> None:
         "finished": 0,
         "most_bytes_held": 0,
     }
-
-
-def test_what_is_decided_elsewhere_is_left_without_a_word(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Also what was not completed: failures may be wanted."""
-    options: dict[str, Any] = {"mode": "evaluation", "workers": 0}
-    with mjrec.Monitor(
-        pendulum(RETURNS[:2]), tmp_path, keep=UNDECIDED, env_id="Pole-v0", **options
-    ) as monitor:
-        run(monitor, 1)
-        monitor.reset(seed=1)
-        monitor.step(monitor.action_space.sample())
-    assert caplog.text == ""
-    facts = [facts_of(tmp_path, number) for number in logs_of(tmp_path)]
-    told = [(each["candidate"], each["complete"]) for each in facts]
-    assert told == [(True, True), (True, False)]
-    keep = manifest_of(tmp_path)["mjrec"]["keep"]
-    assert (keep["decided"], keep["left_open"], keep["chosen"]) == (False, True, [])

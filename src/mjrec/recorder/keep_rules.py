@@ -21,15 +21,6 @@ from .tracking import FinishedEpisode
 Keep: TypeAlias = str | Callable[[Sequence[FinishedEpisode]], Iterable[int]]
 
 
-class _Sentinel(str):
-    """A text that is equal to others, and the same as none of them."""
-
-
-# For what mjrec itself records and chooses among later, over several monitors: all
-# recordings, also of episodes that were not completed, are left as candidates when the
-# monitor closes, and logs stay logs. No text that a user gives means this.
-UNDECIDED = _Sentinel("undecided")
-
 RULES = ("best:N", "worst:N", "failures", "failures:N", "median")
 
 _RULE = re.compile(r"(?P<kind>[^:]*)(?P<colon>:(?P<count>.*))?", re.DOTALL)
@@ -63,12 +54,9 @@ class Selection:
         name: as given.
         finished: how many episodes it was told of.
         holds_all: every episode is a candidate until `close`.
-        is_left_open: every episode stays a candidate, of whatever end: somebody else
-            decides, when the monitor is gone.
     """
 
     holds_all = False
-    is_left_open = False
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -81,8 +69,7 @@ class Selection:
 
     def facts(self) -> dict[str, Any]:
         """Return what a run says of it."""
-        left_open = {"left_open": True} if self.is_left_open else {}
-        return {"rule": self.name, **left_open}
+        return {"rule": self.name}
 
     def __call__(self, episode_id: int) -> bool:
         """Tell whether an episode is to be recorded, as if it got a video."""
@@ -142,8 +129,6 @@ def selection_from(keep: object) -> Selection:
         UnknownName: there is no such rule.
         InvalidArgument: it is neither text nor a function, or N is not 1 or more.
     """
-    if keep is UNDECIDED:
-        return _LeftOpen(UNDECIDED)
     if callable(keep):
         check_takes_one(keep, "keep", "the sequence of finished episodes")
         return _ByFunction(schedule_name(keep), keep)
@@ -225,18 +210,6 @@ def _has_failed(episode: FinishedEpisode) -> bool:
     That is right for tasks that end when the robot falls.
     """
     return episode.terminated if episode.success is None else not episode.success
-
-
-class _LeftOpen(Selection):
-    """Nobody here."""
-
-    holds_all = True
-    is_left_open = True
-
-    def standing(self, episode_id: int) -> Standing:
-        return Standing.CANDIDATE
-
-    def close(self) -> None: ...
 
 
 class _ByFunction(Selection):

@@ -50,10 +50,9 @@ class KeptVideos:
             episode_id: its number.
             episode: the episode; None where it was not completed.
         """
-        if episode is not None:
-            self.selection.add(episode)
-        elif not self.selection.is_left_open:
+        if episode is None:
             return Standing.DROPPED
+        self.selection.add(episode)
         return self.selection.standing(episode_id)
 
     def hold(self, recording: EpisodeRecording) -> None:
@@ -82,15 +81,12 @@ class KeptVideos:
     def decide(self) -> None:
         """Decide about all that is held: there are no more episodes. Idempotent.
 
-        Where that is left to somebody else, all that is held stays as it is, and its
-        videos are pending.
-
         Raises:
             InvalidArgument: the user's function could not choose. All episodes that
                 are held stay, and their videos are pending, or there.
             DirectoryNotWritable, FileNotWritten: as of `settle`.
         """
-        if self.selection.is_left_open or self._failure is not None:
+        if self._failure is not None:
             self._leave_all()
             return
         try:
@@ -113,7 +109,6 @@ class KeptVideos:
             "finished": self.selection.finished,
             "most_bytes_held": self._most_bytes_held,
             "recorded": self._left or self.selection.chosen,
-            **({"left_open": True} if self.selection.is_left_open else {}),
             **failure,
         }
 

@@ -454,8 +454,7 @@ class Recorder:
             self._trackers.end()
             pending = self._write_last_results()
         self._leave()
-        if not (self._kept and self._kept.selection.is_left_open):
-            self._say_what_is_left(pending)
+        self._say_what_is_left(pending)
         failures.raise_first()
         logger.info("Finished writing results. They are in %s.", self.directory)
 

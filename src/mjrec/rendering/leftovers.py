@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
-from ..formats.manifest import read_manifest
 from ..formats.monitor_directory import (
     Infix,
     infix_of,
@@ -97,21 +95,8 @@ class Leftovers:
 
     @property
     def unfinished_logs(self) -> list[Path]:
-        """The files of episodes in flight that are to get their final form.
-
-        Those of a monitor that closed and left the choice among them to another
-        process wait for that.
-        """
-        logs = [each.path for each in self.in_flight if each.path.suffix == ".h5"]
-        manifest = self.files.manifest
-        if not logs or self.lock in self.paths or manifest is None:
-            return logs
-        try:
-            keep = (read_manifest(manifest).mjrec or {}).get("keep")
-        except UnreadableFile:
-            return logs
-        is_left = isinstance(keep, Mapping) and keep.get("left_open") is True
-        return [] if is_left else logs
+        """The files of episodes in flight that are to get their final form."""
+        return [each.path for each in self.in_flight if each.path.suffix == ".h5"]
 
     @property
     def unfinished_files(self) -> dict[Path, str]:

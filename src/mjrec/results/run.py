@@ -29,7 +29,7 @@ class Run:
 
     Attributes:
         facts: what the journal's first line says: `env_info`, `schedule` (its name),
-            `keep` (`rule`, `left_open`), `first_episode_id`, `versions`, and `views`,
+            `keep` (`rule`), `first_episode_id`, `versions`, and `views`,
             what the names of further cameras' videos have before their ending.
         surroundings: its provenance; None where that is not known.
         count: how many episodes were completed.
