@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import importlib.util
 import json
 import math
 import os
@@ -704,6 +705,21 @@ def test_of_what_is_drawn_live_all_is_recorded_and_the_losers_deleted(
     two = run(tmp_path / "two", **live)
     assert [p.read_bytes() for p in two.videos] == [p.read_bytes() for p in one.videos]
     assert one.plan.tasks[0].folder == "flat_world%3AFlatWorld-v0"
+
+
+def test_what_cannot_be_drawn_has_results_without_videos(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """And one line says why; nothing fails, and nothing stays pending."""
+    is_drawn = importlib.util.find_spec("pygame") is not None
+    evaluation = run(
+        tmp_path / "e", tasks=["CartPole-v1"], keep="best", height=None, width=None
+    )
+    assert not evaluation.failed
+    assert len(evaluation.videos) == is_drawn
+    assert not evaluation.pending
+    said = [r.message for r in caplog.records if "no videos, only results" in r.message]
+    assert len(said) == (not is_drawn)
 
 
 def test_newly_chosen_videos_are_drawn_from_their_trajectories(tmp_path: Path) -> None:

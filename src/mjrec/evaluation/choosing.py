@@ -37,7 +37,9 @@ from ..results.run import EVALUATION, Run
 Chosen = Mapping[RecordingKey, Sequence[str]]
 
 
-def write_choice(folder: Path, chosen: Chosen, *, rule: str, finished: int) -> None:
+def write_choice(
+    folder: Path, chosen: Chosen, *, rule: str, finished: int
+) -> set[RecordingKey]:
     """Write down which episodes of a chunk get a video. Idempotent.
 
     An episode that was chosen before, among fewer, keeps its video.
@@ -48,28 +50,36 @@ def write_choice(folder: Path, chosen: Chosen, *, rule: str, finished: int) -> N
         rule: by which they were chosen.
         finished: among how many.
 
+    Returns:
+        Those of the chosen ones that can be drawn.
+
     Raises:
         UnreadableFile: a trajectory, a journal or metadata is damaged.
         FileNotWritten: the disk is full.
         DirectoryNotWritable: there can be no lock in the directory.
     """
     facts = {"rule": rule, "decided": True, "scope": EVALUATION, "finished": finished}
+    drawable: set[RecordingKey] = set()
     for path in sorted(folder.glob("openaigym.episodes.*.jsonl")):
         infix = Infix.parse(infix_of(path.name) or "")
         if infix is None:
             continue
-        own = {key: roles for key, roles in chosen.items() if key.infix == infix}
         run = Run.read(path)
-        before = set((run.keep or {}).get("recorded", ()))
-        recorded = sorted(before | {key.number for key in own} - run.dropped)
         live = run.filmed - run.deferred - run.dropped
-        losers = sorted(live.difference(recorded))
-        for key, roles in own.items():
+        own: set[int] = set()
+        for key, roles in chosen.items():
             selection = {**facts, "roles": list(roles)}
+            if key.infix != infix:
+                continue
             if key.number in live:
                 _say_in_metadata(folder / key.video_name, selection)
-            else:
-                _promise_video(folder / f"{key.name}{FINISHED}", selection)
+            elif not _promise_video(folder / f"{key.name}{FINISHED}", selection):
+                continue
+            own.add(key.number)
+            drawable.add(key)
+        before = set((run.keep or {}).get("recorded", ()))
+        recorded = sorted(before | own - run.dropped)
+        losers = sorted(live.difference(recorded))
         for number in losers:
             _remove_videos(folder / RecordingKey(infix, number).video_name)
         keep = {
@@ -82,17 +92,20 @@ def write_choice(folder: Path, chosen: Chosen, *, rule: str, finished: int) -> N
             events = [("dropped", number) for number in losers]
             _note(folder, infix, [*events, ("keep", keep)])
             write_manifest_and_stats(folder, infix)
+    return drawable
 
 
-def _promise_video(path: Path, selection: Mapping[str, Any]) -> None:
-    """Let a trajectory promise the video that it could have."""
+def _promise_video(path: Path, selection: Mapping[str, Any]) -> bool:
+    """Let a trajectory promise the video that it could have, if it could."""
     if not path.exists():
-        return
+        # Drawing it will say so.
+        return True
     with open_hdf5(path) as reader:
         video, possible = reader.facts.get("video"), reader.facts.get("possible_video")
     if possible is not None and (video or {}).get("selection") != selection:
         promise = {**possible, "selection": selection}
         amend_trajectory(path, lambda known: {**known, "video": promise})
+    return possible is not None or video is not None
 
 
 def _say_in_metadata(video: Path, selection: Mapping[str, Any]) -> None:

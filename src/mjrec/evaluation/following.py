@@ -297,17 +297,20 @@ class Runner:
                 chosen.setdefault(chunk.folder, {}).setdefault(key, []).append(role)
         for name, each in of.chunks.items():
             own = chosen.get(name, {})
-            of.videos += [ChosenVideo(each.folder, key, each.models) for key in own]
             if not own and not each.known.is_drawn_live:
                 continue
+            keys = set(own)
             try:
-                write_choice(
+                keys = write_choice(
                     each.folder, own, rule=self._plan.keep, finished=len(of.results)
                 )
             except Error as error:
                 logger.warning("The videos of %s cannot be chosen: %s", name, error)
                 for key in own:
                     self.not_drawn[each.folder / key.video_name] = str(error)
+            of.videos += [
+                ChosenVideo(each.folder, key, each.models) for key in own if key in keys
+            ]
 
     def _take_video(self, outcome: JobOutcome) -> None:
         video = self._videos[outcome.key]

@@ -171,7 +171,10 @@ class Evaluator:
         except BaseException:
             named.environment.close()
             raise
-        return Acting(task, seed, named, policy, self.draws and choice.mode == LIVE)
+        can_be_drawn = self.draws and named.no_pictures is None
+        if self.draws and not can_be_drawn:
+            logger.warning("%s: no videos, only results. %s", task, named.no_pictures)
+        return Acting(task, seed, named, policy, can_be_drawn and choice.mode == LIVE)
 
     def _make_policy(self, environment: Any) -> Policy:
         name = self._plan.policy
