@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import os
 import signal
@@ -21,9 +20,8 @@ import mjrec
 class OddJobs:
     """Does what a job's `do` names, and notes in a file that it was closed."""
 
-    def __init__(self, settings: Mapping[str, Any], payload: bytes | None) -> None:
+    def __init__(self, settings: Mapping[str, Any]) -> None:
         self._settings = settings
-        self._payload = payload
 
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
         job: Mapping[str, Any] = getattr(self, arguments["do"])(arguments)
@@ -47,15 +45,6 @@ class OddJobs:
             "main": Path(str(main.__file__)).name,
             "session": os.getsid(0),
             "threads": os.environ.get("OMP_NUM_THREADS"),
-        }
-
-    def payload(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-        if self._payload is None:
-            return {"payload": None}
-        return {
-            "pid": os.getpid(),
-            "size": len(self._payload),
-            "sha256": hashlib.sha256(self._payload).hexdigest(),
         }
 
     def die(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -136,29 +125,27 @@ class OddJobs:
             print("let go")
 
 
-def make(settings: Mapping[str, Any], payload: bytes | None) -> OddJobs:
-    return OddJobs(settings, payload)
+def make(settings: Mapping[str, Any]) -> OddJobs:
+    return OddJobs(settings)
 
 
-def make_nothing(settings: Mapping[str, Any], payload: bytes | None) -> OddJobs:
+def make_nothing(settings: Mapping[str, Any]) -> OddJobs:
     print("about to raise")
     raise ValueError("there is no handler")
 
 
-def make_no_name(settings: Mapping[str, Any], payload: bytes | None) -> OddJobs:
+def make_no_name(settings: Mapping[str, Any]) -> OddJobs:
     raise mjrec.UnknownName("camera", "egocentric", ["back", "side"])
 
 
-def make_and_die(settings: Mapping[str, Any], payload: bytes | None) -> OddJobs:
+def make_and_die(settings: Mapping[str, Any]) -> OddJobs:
     with Path(settings["begun"]).open("a") as file:
         file.write("begun\n")
     print("a library is missing", flush=True)
     os._exit(3)
 
 
-def make_and_be_told_to_end(
-    settings: Mapping[str, Any], payload: bytes | None
-) -> OddJobs:
+def make_and_be_told_to_end(settings: Mapping[str, Any]) -> OddJobs:
     """As a SIGTERM may come while modules are imported: in a class's body."""
 
     class Ends:
@@ -166,15 +153,13 @@ def make_and_be_told_to_end(
             signal.raise_signal(signal.SIGTERM)
 
     type("Imported", (), {"part": Ends()})
-    return OddJobs(settings, payload)
+    return OddJobs(settings)
 
 
-def make_and_die_at_first(
-    settings: Mapping[str, Any], payload: bytes | None
-) -> OddJobs:
+def make_and_die_at_first(settings: Mapping[str, Any]) -> OddJobs:
     """Two die as they begin, each with a file of its own; others do their jobs."""
     for number in range(2):
         with contextlib.suppress(FileExistsError):
             Path(settings["deaths"], str(number)).touch(exist_ok=False)
             os._exit(3)
-    return OddJobs(settings, payload)
+    return OddJobs(settings)

@@ -10,7 +10,7 @@ from typing import Any
 
 import av
 
-from mjrec.formats.spans import recordings_in_flight
+from mjrec.formats.spans import append_line, get_recording, recordings_in_flight
 
 
 def in_flight(directory: Path) -> list[Path]:
@@ -76,3 +76,9 @@ def _json(pattern: str, directory: Path) -> dict[str, Any]:
     [path] = directory.glob(pattern)
     content: dict[str, Any] = json.loads(path.read_text())
     return content
+
+
+def add_facts(path: Path, facts: dict[str, Any]) -> None:
+    """Add to the facts of a recording in flight, as its monitor does."""
+    recording = get_recording(path)
+    append_line(recording.spans.path, {"note": recording.name, "facts": facts})

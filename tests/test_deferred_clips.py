@@ -18,11 +18,10 @@ from compiled_tasks import growing
 from full_disk import file_size_limit
 from parts import parametrize
 from recorded_states import assert_same, trajectories
-from recordings import in_flight, manifest_of
+from recordings import add_facts, in_flight, manifest_of
 
 import mjrec
 from mjrec.commands import main
-from mjrec.formats.spans import add_facts
 from mjrec.rendering import finish as module
 from mjrec.rendering.jobs import key_of
 from mjrec.rendering.recordings import recordings

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import gc
-import hashlib
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -27,7 +26,7 @@ from engine_runs import (
 from parts import parametrize
 
 import mjrec
-from mjrec.engines.jobs import Job, JobOutcome, Run, Work
+from mjrec.engines.jobs import Job, JobOutcome, Run
 from mjrec.engines.local import LocalEngine
 from mjrec.engines.ray import RayEngine
 from mjrec.engines.slurm import SlurmEngine
@@ -133,22 +132,6 @@ def test_children_are_where_the_driver_is(
     assert first == second or engine == "slurm"
     assert first["directory"] == str(tmp_path)
     assert first["session"] == first["pid"]
-
-
-@on_each
-def test_children_get_the_payload(begin: Begin, tmp_path: Path) -> None:
-    """As a policy travels; a run without one has None."""
-    payload = os.urandom(1 << 20)
-    with begin() as run:
-        submit(run, "none", do="payload")
-        assert values(run) == [{"payload": None}]
-        shared = tmp_path / "shared"
-        work = Work(entry="odd_jobs:make", payload=payload, shared_directory=shared)
-        with Run(run.engine, work) as with_payload:
-            submit(with_payload, *"abc", do="payload")
-            found = values(with_payload)
-    digest = hashlib.sha256(payload).hexdigest()
-    assert [value["sha256"] for value in found] == [digest] * 3
 
 
 @on_each

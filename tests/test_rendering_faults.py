@@ -36,7 +36,7 @@ from mjrec.formats.trajectory_file import (
 from mjrec.formats.video_metadata import metadata_path
 from mjrec.rendering import finish as module
 from mjrec.rendering.jobs import Progress, RenderedVideos
-from mjrec.rendering.recordings import recorded_episodes
+from mjrec.rendering.recordings import recordings
 
 VIDEO = "openaigym.video.0.7.video00000{}.mp4"
 FRAMES = 5
@@ -75,7 +75,7 @@ def check_nothing_is_half(directory: Path) -> None:
         assert metadata_path(video).exists()
     for path in directory.glob("*.json"):
         assert json.loads(path.read_text())
-    for key in recorded_episodes(directory):
+    for key in recordings(directory):
         path = find_trajectory(directory, key.infix, key.number)
         assert path is not None
         with open_trajectory(path) as reader:

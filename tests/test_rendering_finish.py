@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from recordings import add_facts
 from trajectories_by_hand import (
     INFIX,
     Painter,
@@ -29,7 +30,7 @@ from mjrec.formats.monitor_directory import (
     trajectory_prefix,
     video_lock_name,
 )
-from mjrec.formats.spans import add_facts, is_in_flight
+from mjrec.formats.spans import is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
 from mjrec.rendering.finish import Finisher

@@ -16,6 +16,7 @@ import pytest
 from full_disk import file_size_limit
 from processes import forked, kill_self
 from random_rows import ACTION, DTYPE, FACTS, INFIX, NAME, STATE, check, write
+from recordings import add_facts
 from trajectories_by_hand import add_row, new_logs
 from trajectory_contents import TrajectoryContent, content_of
 
@@ -26,7 +27,6 @@ from mjrec.formats.monitor_directory import lock_name, trajectory_prefix
 from mjrec.formats.row_log import TAIL_HEAD, RowLog, tail_path
 from mjrec.formats.span_writer import SpanLogs
 from mjrec.formats.spans import (
-    add_facts,
     drop_recording,
     is_in_flight,
     list_paths,

@@ -39,7 +39,7 @@ from ..gl.devices import render_on_given_gpu
 from ..messages import carried
 from ..parent import Parent
 from ..signals import Terminated, exiting_on_signals, received
-from .worker import PAYLOAD, SECONDS_TO_CLOSE, STOP
+from .worker import SECONDS_TO_CLOSE, STOP
 
 # Not `__name__`, which is `__main__`.
 logger = logging.getLogger("mjrec.engines.child")
@@ -108,12 +108,9 @@ def _handler(work: Mapping[str, Any], parent: Parent) -> Any:
         if work["require_gpu"] is not None:
             # Before the handler's module, which may import mujoco.
             render_on_given_gpu(required=work["require_gpu"])
-        payload = Path(work["place"], PAYLOAD)
         module, _, name = work["entry"].partition(":")
         make = operator.attrgetter(name)(importlib.import_module(module))
-        return make(
-            work["settings"], payload.read_bytes() if payload.exists() else None
-        )
+        return make(work["settings"])
     except Exception as error:
         # Python 3.11 turns what is raised inside a class's body into a RuntimeError.
         if terminated := received():

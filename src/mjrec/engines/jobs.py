@@ -6,7 +6,7 @@ An engine is a `concurrent.futures.Executor`: ours (`LocalEngine`, `RayEngine`,
 `worker.do_job` with plain data, which does the job in a child process of the worker. So
 a crash costs one job, and the executor never notices it.
 
-Doing a job twice is harmless: a job whose child died is handed out again, and says so.
+Doing a job twice is harmless: a job whose child died is handed out again.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import Any, Self
 from ..errors import ClosedError, DirectoryNotWritable, Error, InvalidArgument
 from ..messages import unpacked
 from .local import LocalEngine
-from .worker import AGAIN, PAYLOAD, STOP, do_job, end_idle_children
+from .worker import STOP, do_job, end_idle_children
 
 logger = logging.getLogger(__name__)
 
@@ -49,11 +49,10 @@ class Work:
 
     Attributes:
         entry: `module:name` of what makes a handler. It is called once in each child,
-            with the settings and the payload. The handler is called with the arguments
-            of one job after the other and returns a small JSON object; its `close()`
-            lets go of what it holds.
+            with the settings. The handler is called with the arguments of one job
+            after the other and returns a small JSON object; its `close()` lets go of
+            what it holds.
         settings: for all jobs; JSON.
-        payload: bytes that each child reads once, such as a policy; None for none.
         environ: environment variables of the children, besides their worker's.
         shared_directory: one that all workers see under this name; a folder in it is
             used while the run lasts. None is enough for processes of this machine.
@@ -61,7 +60,6 @@ class Work:
 
     entry: str
     settings: Mapping[str, Any] = field(default_factory=dict)
-    payload: bytes | None = None
     environ: Mapping[str, str] = field(default_factory=dict)
     shared_directory: Path | None = None
 
@@ -72,8 +70,7 @@ class Job:
 
     Attributes:
         key: tells it from all others of its run.
-        arguments: JSON. Where a child has begun the job before, the next one gets
-            `AGAIN` with true besides.
+        arguments: JSON.
     """
 
     key: str
@@ -129,7 +126,7 @@ class Run:
             )
         shared = None if is_here else work.shared_directory
         is_new = shared is not None and not shared.exists()
-        self._place = _new_place(shared, work)
+        self._place = _new_place(shared)
         self._work = {
             "entry": work.entry,
             "settings": dict(work.settings),
@@ -226,11 +223,10 @@ class Run:
     def _hand_out(self) -> None:
         while self._waiting and self._leave.alive:
             task = self._waiting.popleft()
-            again = {AGAIN: True} if task.deaths else {}
             message = {
                 "work": self._work,
                 "key": task.job.key,
-                "arguments": {**task.job.arguments, **again},
+                "arguments": dict(task.job.arguments),
             }
             self._tasks[self.engine.submit(do_job, message)] = task
 
@@ -334,8 +330,8 @@ def _results_of(
             last = time.monotonic()
 
 
-def _new_place(shared: Path | None, work: Work) -> Path:
-    """Return a new folder that children see, with the payload in it."""
+def _new_place(shared: Path | None) -> Path:
+    """Return a new folder that children see."""
     name = os.urandom(8).hex()
     try:
         if shared is None:
@@ -343,10 +339,8 @@ def _new_place(shared: Path | None, work: Work) -> Path:
         else:
             place = shared.absolute() / WORK_FOLDER / name
             place.parent.mkdir(parents=True, exist_ok=True)
-        # Only its owner reads the policy, or says what is run.
+        # Only its owner says what is run.
         place.mkdir(mode=0o700)
-        if work.payload is not None:
-            (place / PAYLOAD).write_bytes(work.payload)
     except OSError as error:
         raise DirectoryNotWritable(shared or _TEMPORARY, error.strerror) from error
     return place

@@ -25,11 +25,8 @@ from ..gl.devices import CUDA_VISIBLE_DEVICES
 
 logger = logging.getLogger(__name__)
 
-# Added to the arguments of a job that a child has begun before.
-AGAIN = "again"
-
-# In a run's folder: what each child reads once, and the sign that all is over.
-PAYLOAD, STOP = "payload", "stop"
+# In a run's folder: the sign that all is over.
+STOP = "stop"
 
 # A monitor is closed in well under a second, on a slow network disk in a few; Slurm
 # kills 30 seconds after its SIGTERM, Kubernetes too, docker after 10.

@@ -64,11 +64,6 @@ class KeepRule:
     parts: tuple[_Part, ...]
 
     @property
-    def needs_returns(self) -> bool:
-        """Whether it can only be told when all episodes are done."""
-        return self.name not in _ALONE
-
-    @property
     def keeps_none(self) -> bool:
         """Whether no episode gets a video."""
         return not self.parts

@@ -50,13 +50,9 @@ class EvaluationWorker:
 
     Args:
         settings: see the module.
-        payload: there is none.
     """
 
-    def __init__(
-        self, settings: Mapping[str, Any], payload: bytes | None = None
-    ) -> None:
-        del payload
+    def __init__(self, settings: Mapping[str, Any]) -> None:
         self._directory = Path(settings["directory"])
         self._plan = from_json(EvaluationPlan, settings["plan"])
         policy = settings.get("policy")

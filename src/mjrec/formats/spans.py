@@ -382,17 +382,6 @@ def recordings_in_flight(
     return found
 
 
-def add_facts(path: Path, facts: Mapping[str, Any]) -> None:
-    """Add to the facts of a recording in flight; of a key, the newest counts.
-
-    Raises:
-        UnreadableFile: there is no such recording.
-        FileNotWritten: the disk is full; nothing was added.
-    """
-    recording = get_recording(path)
-    append_line(recording.spans.path, {"note": recording.name, "facts": dict(facts)})
-
-
 def drop_recording(path: Path) -> None:
     """Give up the rows of a recording; it is no error where there are none.
 

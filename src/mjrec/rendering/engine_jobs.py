@@ -118,13 +118,9 @@ class VideoWorker:
 
     Args:
         settings: see the module.
-        payload: there is none.
     """
 
-    def __init__(
-        self, settings: Mapping[str, Any] | None = None, payload: bytes | None = None
-    ) -> None:
-        del payload
+    def __init__(self, settings: Mapping[str, Any] | None = None) -> None:
         note_models((settings or {}).get("models", ()))
         # With a number of workers no directory's CPUs are shared.
         self._finisher = Finisher(Path(), workers=1)

@@ -163,11 +163,6 @@ def recordings(directory: Path) -> list[RecordingKey]:
     )
 
 
-def recorded_episodes(directory: Path) -> list[RecordingKey]:
-    """Return the episodes that have a trajectory, monitor by monitor, in order."""
-    return [key for key in recordings(directory) if not key.is_clip]
-
-
 def parts_of(directory: Path, key: RecordingKey) -> list[Path]:
     """Return the rows of a recording, by the names of their files, in order."""
     if not key.is_clip:
