@@ -45,6 +45,8 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"engine_option": ("=gpu",), "engine": "slurm"}, "KEY=VALUE"),
     ({"engine_option": ("a=1", "a=2"), "engine": "slurm"}, "given twice"),
     ({"gpus": -1.0}, "gpus"),
+    ({"engine": "dusk"}, "dask:ADDRESS"),
+    ({"engine": "dask:tcp://127.0.0.1:8786", "gpus": 1.0}, "those that the Dask"),
 ]
 
 

@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import gc
 import os
 from collections.abc import Callable, Iterator
@@ -26,6 +28,7 @@ from engine_runs import (
 from parts import parametrize
 
 import mjrec
+from mjrec.engines.choice import engine_from
 from mjrec.engines.jobs import Job, JobOutcome, Run
 from mjrec.engines.local import LocalEngine
 from mjrec.engines.ray import RayEngine
@@ -39,7 +42,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
 ]
 # Real Ray, and Slurm jobs through submitit, take seconds each.
-on_each = parametrize("engine", ["local", "own", "slurm", "ray"], default=2)
+on_each = parametrize("engine", ["local", "own", "slurm", "ray", "dask"], default=2)
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +52,23 @@ def ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
     with home_for_ray(tmp_path_factory.mktemp("home")), own_ray(cpus=2):
         yield
+
+
+@pytest.fixture(scope="module")
+def dask() -> Iterator[Callable[[int], str]]:
+    """The address of a Dask cluster with a number of workers."""
+    import distributed
+
+    with contextlib.ExitStack() as clusters:
+
+        @functools.cache
+        def address(workers: int) -> str:
+            cluster = distributed.LocalCluster(
+                n_workers=workers, threads_per_worker=1, dashboard_address=":0"
+            )
+            return str(clusters.enter_context(cluster).scheduler_address)
+
+        yield address
 
 
 @pytest.fixture
@@ -67,6 +87,9 @@ def begin(
         elif engine == "slurm":
             pytest.importorskip("submitit")
             executor = SlurmEngine(workers, cluster="local")
+        elif engine == "dask":
+            address = request.getfixturevalue("dask")(workers)
+            executor = engine_from(f"dask:{address}")
         else:
             request.getfixturevalue("ray")
             executor = RayEngine(workers)

@@ -178,7 +178,7 @@ class Wandering(Executor):
     ) -> Future[Any]:
         [message] = json.loads(json.dumps(args))
         if self.worker is None:
-            self.worker = EvaluationWorker(message["work"]["settings"], None)
+            self.worker = EvaluationWorker(message["work"]["settings"])
         future: Future[Any] = Future()
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_STATE_HOME", str(self.homes / message["key"]))

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Literal
 
 import tyro
 
@@ -24,7 +23,8 @@ class EngineOptions:
 
     Attributes:
         engine: local, processes of this machine; ray, a Ray cluster; slurm, jobs of a
-            Slurm cluster. All machines see the directory under the same name.
+            Slurm cluster; dask:ADDRESS, the Dask cluster whose scheduler is there. All
+            machines see the directory under the same name.
         gpus: how much of a GPU each worker gets; with 0.25 four share one.
         require_gpu: fail where a worker would draw in software.
         address: of the Ray cluster, HOST:PORT, or auto for the one that runs here; the
@@ -34,7 +34,7 @@ class EngineOptions:
             partition=gpu of Slurm. May be given several times.
     """
 
-    engine: Literal["local", "ray", "slurm"] | None = None
+    engine: str | None = None
     gpus: float | None = None
     require_gpu: bool = False
     address: str | None = None

@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
+import importlib
+import weakref
 from collections.abc import Mapping
 from concurrent.futures import Executor
 
-from ..errors import InvalidArgument, UnknownName
+from ..errors import Error, InvalidArgument, MissingDependency, UnknownName
 from .local import LocalEngine
 from .ray import RayEngine
 from .slurm import SlurmEngine
 
-ENGINES = ("local", "ray", "slurm")
+_DASK = "dask:"
+ENGINES = ("local", "ray", "slurm", f"{_DASK}ADDRESS")
 
 
 def given_engine(engine: Executor | str | None, workers: int | None) -> Executor | None:
@@ -56,7 +59,8 @@ def engine_from(
     """Return an engine.
 
     Args:
-        name: `"local"`, `"ray"` or `"slurm"`.
+        name: `"local"`, `"ray"`, `"slurm"`, or `"dask:ADDRESS"`, where a Dask scheduler
+            listens.
         workers: how many at most; None is what the engine takes by itself.
         address: of a Ray cluster, `"auto"` for the one that runs on this machine; None
             is the one that `RAY_ADDRESS` names, else one that is started for the run.
@@ -68,8 +72,16 @@ def engine_from(
         UnknownName: there is no such engine, or no such option.
         InvalidArgument: one of them cannot be, or belongs to another engine.
         MissingDependency: what the engine needs is not installed.
+        Error: there is no Dask scheduler.
     """
-    if name not in ENGINES:
+    if name.startswith(_DASK):
+        if workers is not None or address is not None or gpus or options:
+            raise InvalidArgument(
+                f"The workers of {name} are those that the Dask cluster has: start "
+                "them there, as many and with what they are to have."
+            )
+        return _dask(name.removeprefix(_DASK))
+    if name not in ENGINES[:-1]:
         raise UnknownName("engine", name, ENGINES)
     if address is not None and name != "ray":
         raise InvalidArgument(
@@ -87,3 +99,27 @@ def engine_from(
             options or {}, workers=workers, gpus=gpus, require_gpu=require_gpu
         )
     return LocalEngine(workers, gpus=gpus, require_gpu=require_gpu)
+
+
+def _dask(address: str) -> Executor:
+    try:
+        distributed = importlib.import_module("distributed")
+    except ModuleNotFoundError as error:
+        if error.name != "distributed":
+            raise
+        raise MissingDependency(
+            "distributed",
+            purpose=f'engine="{_DASK}{address}"',
+            install='pip install "dask[distributed]"',
+        ) from error
+    try:
+        client = distributed.Client(address, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise Error(
+            f"There is no Dask scheduler to be had at {address}. `dask scheduler` "
+            f"starts one, and says its address. Dask says: {error}"
+        ) from error
+    # Each job is done, though another one looks the same.
+    executor: Executor = client.get_executor(pure=False)
+    weakref.finalize(executor, client.close)
+    return executor
