@@ -146,6 +146,11 @@ def test_the_chosen_episodes_get_videos(tmp_path: Path) -> None:
         )
 
 
+def names_in(directory: Path) -> set[str]:
+    """Return the names of all files below a directory."""
+    return {str(path.relative_to(directory)) for path in directory.rglob("*")}
+
+
 # Takes more than five seconds: two evaluations with videos.
 @parametrize("engine", ["local", mjrec.LocalEngine(5)])
 def test_workers_and_engines_change_nothing(tmp_path: Path, engine: Any) -> None:
@@ -158,6 +163,7 @@ def test_workers_and_engines_change_nothing(tmp_path: Path, engine: Any) -> None
     assert there.pending == here.pending == {}
     assert recorded_in(there) == recorded_in(here)
     assert len(recorded_in(there)) == 8 + 4
+    assert names_in(there.directory) == names_in(here.directory)
     listed = {video for folder in folders_of(there) for video in listed_in(folder)}
     assert listed == {path.name for path in there.videos}
 

@@ -206,14 +206,17 @@ def _claim(
 
     Args:
         path: the directory.
-        uid: stands in it instead of the process id.
+        uid: stands in it instead of the process id; then its number follows from the
+            directory, so that names are the same whichever process records.
         run: what is known of the run.
         looks: also for stray files with it. Without that, a manifest, a journal or a
             lock say that it was somebody's: each monitor leaves one of them.
     """
     content = json_text.dumps({"pid": os.getpid(), "since": time.time(), "run": run})
+    of_directory = itertools.count()
     while True:
-        infix = Infix(_monitor_ids.take(), uid or str(os.getpid()))
+        number = _monitor_ids.take() if uid is None else next(of_directory)
+        infix = Infix(number, uid or str(os.getpid()))
         if _is_taken(path, infix, looks=looks):
             continue
         try:
