@@ -21,7 +21,11 @@ from mjrec.environments.policies import load_policy, policy_file
 SEEDS = EpisodeSeeds(environment=1, actions=2, policy=3)
 
 # Of torch, which prefers its newer formats.
-pytestmark = pytest.mark.filterwarnings("ignore:.*torch:DeprecationWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*torch:DeprecationWarning"),
+    # From 2.15 on torch says of TorchScript that `torch.export` follows it.
+    pytest.mark.filterwarnings("ignore:.*torch.jit:FutureWarning"),
+]
 
 
 @pytest.mark.parametrize(
