@@ -72,16 +72,15 @@ class Idle:
 
     Args:
         settings: none.
-        payload: none.
     """
 
-    def __init__(self, settings: Mapping[str, Any], payload: bytes | None) -> None:
+    def __init__(self, settings: Mapping[str, Any]) -> None:
         # Here, because whoever hands out the work loads none of it.
         import gymnasium
 
         import mjrec.evaluation.worker
 
-        del settings, payload, mjrec
+        del settings, mjrec
         gymnasium.make("InvertedPendulum-v5").reset()
 
     def __call__(self, arguments: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -28,5 +28,5 @@ class ClusterJobs(OddJobs):
         return {}
 
 
-def make(settings: Mapping[str, Any], payload: bytes | None) -> ClusterJobs:
-    return ClusterJobs(settings, payload)
+def make(settings: Mapping[str, Any]) -> ClusterJobs:
+    return ClusterJobs(settings)
