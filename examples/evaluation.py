@@ -44,7 +44,8 @@ def main() -> None:
         for summary in evaluation.summaries:
             print(f"{name}: {summary.task}: mean return {summary.mean:.3g}")
     comparison = mjrec.compare(PLACE / "random", PLACE / "wave")
-    print(f"probability that the wave is better: {comparison.probability:.2f}")
+    better = comparison.figures["probability of improvement"]
+    print(f"probability that the wave is better: {better.value:.2f}")
     print(mjrec.write_report([PLACE / "random", PLACE / "wave"], PLACE / "report"))
 
 
