@@ -295,7 +295,7 @@ class _Process:
             try:
                 pid, status = os.waitpid(self._pid, os.WNOHANG)
             except ChildProcessError:
-                # Whoever ignores SIGCHLD never knows.
+                # Where SIGCHLD is ignored, the system keeps no status.
                 self._status = 0
             else:
                 self._status = os.waitstatus_to_exitcode(status) if pid else None

@@ -83,7 +83,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _arguments(argv: Sequence[str] | None) -> Sequence[str]:
-    """Return the arguments, the first of which is a command.
+    """Return the arguments, which begin with a command.
 
     Raises:
         SystemExit: it is none, or help was asked for; that is printed.

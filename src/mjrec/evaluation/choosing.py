@@ -19,17 +19,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .. import json_text
-from ..atomic_files import write_text
 from ..errors import FileNotWritten
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.journal import JournalWriter
-from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import Infix, infix_of, journal_name
 from ..formats.spans import FINISHED
 from ..formats.trajectory_file import amend_trajectory
 from ..formats.trajectory_hdf5 import open_hdf5
-from ..formats.video_metadata import finished_videos, metadata_path
+from ..formats.video_metadata import amend_metadata, finished_videos, metadata_path
 from ..rendering.jobs import RecordingKey
 from ..results.manifest_writing import manifest_lock, write_manifest_and_stats
 from ..results.run import EVALUATION, Run
@@ -72,7 +69,9 @@ def write_choice(
             if key.infix != infix:
                 continue
             if key.number in live:
-                _say_in_metadata(folder / key.video_name, selection)
+                video = folder / key.video_name
+                if metadata_path(video).exists():
+                    amend_metadata(video, {"selection": selection})
             elif not _promise_video(folder / f"{key.name}{FINISHED}", selection):
                 continue
             own.add(key.number)
@@ -106,16 +105,6 @@ def _promise_video(path: Path, selection: Mapping[str, Any]) -> bool:
         promise = {**possible, "selection": selection}
         amend_trajectory(path, lambda known: {**known, "video": promise})
     return possible is not None or video is not None
-
-
-def _say_in_metadata(video: Path, selection: Mapping[str, Any]) -> None:
-    path = metadata_path(video)
-    if not path.exists():
-        return
-    with unreadable(path):
-        said = read_object(path)
-    if said.get("selection") != selection:
-        write_text(path, json_text.dumps({**said, "selection": selection}))
 
 
 def _remove_videos(video: Path) -> None:

@@ -242,13 +242,16 @@ class Runner:
         each.models = (outcome.value or {}).get("models", ())
         note_models(each.models)
         if not each.is_complete:
-            assert outcome.failure is not None
             if _size(each.known) > each.size:
                 # It came nearer to its end, and a poisoned episode fails alone.
                 self._submit(of, each)
                 return
-            logger.warning("%s", outcome.failure)
-            why = outcome.failure.partition(" The end of what it said")[0]
+            said = outcome.failure or (
+                f"A worker has done {each.folder}, and what it recorded is not there: "
+                "all machines must see the directory under the same name."
+            )
+            logger.warning("%s", said)
+            why = said.partition(" The end of what it said")[0]
             of.reasons[each.chunk.folder] = why
         each.is_over = True
         self._complete_if_over(of)

@@ -5,7 +5,7 @@ Settings: `{"directory": DIR, "plan": <the plan as JSON, without its chunks>}`;
 `"policy"`, the file with the pickled policy, where that is an object; `"chooses_gl":
 true` where the worker is to choose an OpenGL backend that works on its machine, if
 episodes get videos; and `"models"` as in `rendering.engine_jobs`. Jobs, by their
-`kind`, each of which may be done again:
+`kind`; doing one again is harmless:
 
 `check`  `{"task"}`: makes the environment and the policy, and takes no step. Returns
          `{"env_id", "step_limit", "velocities"}`, the last one the number of degrees

@@ -132,7 +132,7 @@ class RowLog:
         if self.is_open:
             os.close(self._log)
             self._log = -1
-            # Whoever keeps this object does not keep the mapping, which is a file.
+            # A reference to this object must not keep the mapping, which is a file.
             del self.slots, self.counter, self.memory
 
     def write(self) -> None:

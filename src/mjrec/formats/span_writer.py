@@ -339,7 +339,7 @@ class SpanWriter:
         """Add to the facts; on a full disk they wait for the next note or the end."""
         self._unsaid.update(facts)
         with contextlib.suppress(FileNotWritten):
-            self.log.say({"note": self._name, "facts": self._unsaid})
+            self.add(self._unsaid)
             self._unsaid = {}
 
     def add(self, facts: Mapping[str, Any]) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 from .. import json_text
 from ..atomic_files import write_text
-from .json_fields import read_object
+from .json_fields import read_object, unreadable
 from .video_file import VideoFile
 
 # Of a file's name, as `video_names` makes them.
@@ -123,6 +123,20 @@ def write_metadata(video: Path, metadata: Mapping[str, Any]) -> None:
         FileNotWritten: the disk is full, or the directory is gone.
     """
     write_text(metadata_path(video), json_text.dumps(metadata))
+
+
+def amend_metadata(video: Path, facts: Mapping[str, Any]) -> None:
+    """Add to what the metadata file of a finished video says.
+
+    Raises:
+        UnreadableFile: there is none, or it is damaged.
+        FileNotWritten: the disk is full.
+    """
+    path = metadata_path(video)
+    with unreadable(path):
+        said = read_object(path)
+    if any(said.get(name) != value for name, value in facts.items()):
+        write_metadata(video, {**said, **facts})
 
 
 def finished_videos(video: Path) -> list[tuple[str, str]]:

@@ -8,12 +8,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .. import json_text
-from ..atomic_files import write_text
 from ..errors import DirectoryNotWritable
 from ..formats.frame_hashes import frame_hash_path
-from ..formats.json_fields import read_object, unreadable
 from ..formats.monitor_directory import trajectory_prefix, video_prefix
+from ..formats.video_metadata import amend_metadata
 from .fast_path import FastPath, counting
 from .keep_rules import Standing
 from .live_videos import LiveVideos
@@ -333,8 +331,5 @@ def _remove(paths: Iterable[Path]) -> None:
 
 
 def _say_in_metadata(recorder: VideoRecorder, selection: Mapping[str, Any]) -> None:
-    path = Path(str(recorder.metadata_path))
     recorder.metadata["selection"] = dict(selection)
-    with unreadable(path):
-        said = read_object(path)
-    write_text(path, json_text.dumps({**said, "selection": selection}))
+    amend_metadata(Path(str(recorder.path)), {"selection": selection})
