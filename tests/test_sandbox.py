@@ -15,7 +15,7 @@ from waiting import wait_until
 
 from mjrec.sandbox import Sandbox
 
-_COMPILER = "mjrec.simulation.model_sources"
+_COMPILER = "mjrec.simulation.foreign_files"
 _FOR_EVER = (
     '<mujoco><worldbody><replicate count="100000000"><geom size="1"/></replicate>'
     "</worldbody></mujoco>"
@@ -37,7 +37,7 @@ def test_a_death_is_told_with_its_last_words(tmp_path: Path) -> None:
         assert list(sandbox.said(60)) == []
         said = sandbox.last_words()
     assert said.startswith("ended with status 1")
-    assert "KeyError: 'path'" in said
+    assert "KeyError: 'task'" in said
 
 
 # Takes more than five seconds: until MuJoCo is at it for certain.
@@ -46,7 +46,7 @@ def test_it_ends_with_its_parent_whatever_it_is_at(tmp_path: Path) -> None:
     path = sources(tmp_path, _FOR_EVER)
     program = (
         "from pathlib import Path\n"
-        "from mjrec.simulation.model_sources import compile_sources\n"
+        "from mjrec.simulation.foreign_files import compile_sources\n"
         f"compile_sources(Path({str(path)!r}), compiled_size=1)\n"
     )
     with subprocess.Popen([sys.executable, "-c", program]) as parent:
