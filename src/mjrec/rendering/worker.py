@@ -27,13 +27,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..errors import InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
 from ..messages import carried
 from ..parent import Parent
-from ..simulation.cameras import Camera, camera_from_members, is_tracking
+from ..simulation.cameras import Camera, camera_from_members
 from ..simulation.gl_probe import draw_test_scene
 from ..simulation.recorded_scene import GivenStates, RecordedScene
 from ..simulation.renderer import Canvas, SceneRenderer
@@ -47,10 +46,8 @@ _NICE = 10
 class Drawing:
     """Frames of a scene, known by their numbers, from 0.
 
-    Each is the same whatever was drawn before. MuJoCo's visualiser remembers: an
-    infinite plane is drawn around the place where the cameras stood in the frame
-    before, and a camera that tracks a body goes a part of the way to it in each frame.
-    So the cameras are brought to where they would be.
+    Each is the same whatever was drawn before: the cameras are brought to where they
+    would be if all before had been drawn.
 
     Args:
         scene: what is drawn.
@@ -62,7 +59,7 @@ class Drawing:
     def __init__(
         self,
         scene: RecordedScene | GivenStates,
-        cameras: Iterable[_CameraReplay],
+        cameras: Iterable[SceneRenderer],
         acquired: contextlib.ExitStack,
     ) -> None:
         self._scene = scene
@@ -75,14 +72,14 @@ class Drawing:
     @property
     def size(self) -> tuple[int, int]:
         """`(height, width)` of the frames."""
-        height, width = self._cameras[0].renderer.size
+        height, width = self._cameras[0].size
         rows, columns = grid_shape(len(self._cameras))
         return rows * height, columns * width
 
     @property
     def gl_facts(self) -> dict[str, Any]:
         """Who draws, and on which device: `gl_context.current_gl_facts`."""
-        return self._cameras[0].renderer.gl_facts
+        return self._cameras[0].gl_facts
 
     def draw(self, index: int, *, out: Frame | None = None) -> Frame:
         """Return a frame, in `out` if that is given.
@@ -102,7 +99,7 @@ class Drawing:
             self._prepare(index, last)
         self._bring_to(index)
         if self._context_is_old:
-            self._cameras[0].renderer.model_changed()
+            self._cameras[0].model_changed()
             self._context_is_old = False
         frame = self._render(out)
         self._last = index
@@ -114,10 +111,8 @@ class Drawing:
 
     def _render(self, out: Frame | None) -> Frame:
         if len(self._cameras) == 1:
-            return self._cameras[0].renderer.render(self._scene.data, out=out)
-        grid = grid_frame(
-            [camera.renderer.render(self._scene.data) for camera in self._cameras]
-        )
+            return self._cameras[0].render(self._scene.data, out=out)
+        grid = grid_frame([camera.render(self._scene.data) for camera in self._cameras])
         if out is None:
             return grid
         np.copyto(out, grid)
@@ -134,33 +129,10 @@ class Drawing:
         for earlier in range(start, index):
             self._bring_to(earlier)
             for camera in self._cameras:
-                camera.renderer.look(self._scene.data)
+                camera.look(self._scene.data)
 
     def _bring_to(self, index: int) -> None:
         self._context_is_old |= self._scene.bring_to(index)
-
-
-class _CameraReplay:
-    """One camera's renderer, brought to any frame as if all before had been drawn.
-
-    Args:
-        renderer: of its frames.
-        camera: what it draws with; None where the recording moves that.
-        before: where the two cameras of its scene stand before the first frame.
-    """
-
-    def __init__(self, renderer: SceneRenderer, camera: Any, before: ArrayLike) -> None:
-        self.renderer = renderer
-        self.is_following = is_tracking(camera)
-        self._before = before
-        self._camera = camera
-        self._start = camera.lookat.copy() if self.is_following else None
-
-    def begin(self) -> None:
-        """Go to before the first frame."""
-        self.renderer.camera_positions = self._before
-        if self.is_following:
-            self._camera.lookat[:] = self._start
 
 
 def trajectory_drawing(
@@ -200,23 +172,29 @@ def trajectory_drawing(
         }
         shared = canvas or opened.enter_context(contextlib.closing(Canvas()))
 
-        def replay(asked: PlainCamera | None) -> _CameraReplay:
+        def renderer(asked: PlainCamera | None) -> SceneRenderer:
             # Of a camera as recorded it is known how the frames have moved it.
-            camera = None if asked is None else _camera(model, asked)
-            renderer = SceneRenderer(
+            own: dict[str, Any] = (
+                {"camera": _camera(model, asked)}
+                if asked is not None
+                else {
+                    "camera": recorded.camera,
+                    "begins_at": scene.previous_cameras,
+                    "is_moved": True,
+                }
+            )
+            return SceneRenderer(
                 model,
-                camera=recorded.camera if camera is None else camera,
                 scene_option=recorded.option,
                 max_geom=recorded.max_geom,
                 fresh=recorded.fresh,
                 canvas=shared,
                 **look,
+                **own,
             )
-            before = scene.previous_cameras if asked is None else np.zeros((2, 3))
-            return _CameraReplay(renderer, camera, before)
 
         wanted = [view.camera] if cameras is None else cameras
-        return Drawing(scene, [replay(asked) for asked in wanted], opened.pop_all())
+        return Drawing(scene, [renderer(asked) for asked in wanted], opened.pop_all())
 
 
 def states_drawing(
@@ -241,8 +219,7 @@ def states_drawing(
         "quality": view.quality,
     }
     renderer = SceneRenderer(scene.model, camera=camera, canvas=canvas, **look)
-    replay = _CameraReplay(renderer, camera, np.zeros((2, 3)))
-    return Drawing(scene, [replay], contextlib.ExitStack())
+    return Drawing(scene, [renderer], contextlib.ExitStack())
 
 
 def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:

@@ -264,4 +264,3 @@ def _existing(
     if not found:
         raise ValueError(f"there is no {reference!r}")
     return found
-
