@@ -351,7 +351,7 @@ def test_a_slack_cable_is_not_mixed_although_its_limit_is_active() -> None:
         (THINGS, "light_xpos", "pos of light"),
         (THINGS, "cam_xpos", "pos of light 0"),
         (FLEX, "flexvert_xpos", "pos of geom"),
-        (TENDONS, "wrap_xpos", "geoms instead of"),
+        (TENDONS, "wrap_xpos", "number of geoms"),
         (TENDONS, "tendon_rgba", "rgba of geom"),
         (SENSORS, "sensordata", "geom"),
     ],
@@ -386,8 +386,8 @@ def test_scenes_of_other_states_differ() -> None:
     shown.option.geomgroup[0] = False
     fewer = updated_scene(model, data, shown)
     found = " ".join(differences(live, fewer, shown.option))
-    assert "geoms instead of" in found
-    assert "lights instead of" in found
+    assert "number of geoms" in found
+    assert "number of lights" in found
 
 
 PID = """

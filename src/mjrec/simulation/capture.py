@@ -24,8 +24,8 @@ from .captured_arrays import (
     state_dtype,
     state_words,
 )
-from .change_detection import Looks
 from .fields import VIEW_PREFIXES, is_settable
+from .looks import Looks
 from .model_sources import AuthoredModel
 from .model_store import ModelStore
 from .self_check import scene_difference

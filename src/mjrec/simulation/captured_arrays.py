@@ -43,30 +43,16 @@ ALWAYS = (
     *("ten_wrapadr", "ten_wrapnum", "ten_length", "wrap_obj", "wrap_xpos"),
 )
 _FOR_SKINS = ("xpos", "xquat")
-_BODIES = ("xpos", "xmat", "xipos", "ximat")
-
-# What a flag that is off by default needs besides.
-_FOR_FLAGS: dict[str, tuple[str, ...]] = {
-    "mjVIS_JOINT": ("xanchor", "xaxis", "xmat"),
-    "mjVIS_ACTUATOR": ("ctrl", "xanchor", "xaxis", "xmat"),
-    "mjVIS_ACTIVATION": ("act",),
-    "mjVIS_CONSTRAINT": ("eq_active", "xpos", "xmat"),
-    "mjVIS_INERTIA": ("xipos", "ximat"),
-    "mjVIS_SCLINERTIA": ("xipos", "ximat"),
-    "mjVIS_PERTFORCE": ("xfrc_applied", "xipos"),
-    "mjVIS_SELECT": _BODIES,
-    "mjVIS_AUTOCONNECT": ("xanchor", "xipos"),
-    "mjVIS_BODYBVH": ("xipos", "ximat", "bvh_active"),
-    # Until mujoco 3.3 on their own.
-    "mjVIS_FLEXBVH": ("bvh_aabb_dyn", "bvh_active", "xpos", "xmat"),
-    "mjVIS_MESHBVH": ("bvh_aabb_dyn", "bvh_active", "xpos", "xmat"),
-}
-_FRAMES_OF_BODIES = ("mjFRAME_BODY", "mjFRAME_WORLD")
+# What flags, frames and labels that are off by default may need besides.
+_FOR_OPTIONS = (
+    *("xpos", "xmat", "xipos", "ximat", "xanchor", "xaxis", "ctrl", "act"),
+    *("eq_active", "xfrc_applied", "bvh_active", "bvh_aabb_dyn"),
+)
 
 # Nothing else is put into data from a file.
 SNAPSHOT_ARRAYS = frozenset(
-    (*ALWAYS, *_FOR_SKINS, *_BODIES, *sum(_FOR_FLAGS.values(), ()))
-) | {"sensordata", "plastic"}
+    (*ALWAYS, *_FOR_SKINS, *_FOR_OPTIONS, "sensordata", "plastic")
+)
 
 # Read from the constraints of a step, which cannot be put into fresh data.
 _CONSTRAINT_FLAGS = ("mjVIS_CONTACTPOINT", "mjVIS_CONTACTFORCE", "mjVIS_CONTACTSPLIT")
@@ -172,8 +158,8 @@ def snapshot_dtype(
     # Not `np.isin`, whose first call loads numpy's masked arrays (100 ms).
     if not _drawn_sensors().isdisjoint(model.sensor_type.tolist()):
         names.add("sensordata")
-    if option is not None:
-        names.update(_for_option(option))
+    if option is not None and _shows_more(option):
+        names.update(_FOR_OPTIONS)
     held = [name for name in names if array_kind(data, name) is not None]
     # In the order of the memory, which is read faster so.
     held.sort(key=lambda name: address_of(getattr(data, name)))
@@ -234,13 +220,14 @@ def drawn_readings(model: mujoco.MjModel) -> NDArray[np.bool_]:
     return drawn
 
 
-def _for_option(option: mujoco.MjvOption) -> set[str]:
-    flags = [needed for flag, needed in _FOR_FLAGS.items() if _flag(option, flag)]
-    names = {name for needed in flags for name in needed}
-    frames = [int(getattr(mujoco.mjtFrame, name)) for name in _FRAMES_OF_BODIES]
-    if option.frame in frames or option.label != int(mujoco.mjtLabel.mjLABEL_NONE):
-        names.update(_BODIES)
-    return names
+def _shows_more(option: mujoco.MjvOption) -> bool:
+    """Tell whether an option shows anything that MuJoCo's default does not."""
+    default = mujoco.MjvOption()
+    return bool(
+        (option.flags > default.flags).any()
+        or option.frame != default.frame
+        or option.label != default.label
+    )
 
 
 def _flag(option: mujoco.MjvOption, name: str) -> bool:

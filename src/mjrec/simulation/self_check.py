@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import ctypes
 import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from .view import SceneView
 _EVERYTHING = int(mujoco.mjtCatBit.mjCAT_ALL)
 
 # Not set by `mjv_updateScene` in every geom, or only later, when it is drawn.
-_NOT_SET = ("camdist", "modelrbound", "transparent", "label")
+_NOT_SET = ("camdist", "modelrbound", "transparent")
 
 
 def scene_difference(
@@ -82,33 +82,31 @@ def differences(
     live: mujoco.MjvScene, again: mujoco.MjvScene, option: mujoco.MjvOption
 ) -> Iterator[str]:
     """Yield in words what of `again` is not, to the last bit, as in `live`."""
-    if live.ngeom != again.ngeom:
-        yield f"{again.ngeom} geoms instead of {live.ngeom}"
-    if live.nlight != again.nlight:
-        yield f"{again.nlight} lights instead of {live.nlight}"
-    labelled = option.label != int(mujoco.mjtLabel.mjLABEL_NONE)
-    without = tuple(n for n in _NOT_SET if not (labelled and n == "label"))
-    geoms = slice(min(live.ngeom, again.ngeom))
-    lights = slice(min(live.nlight, again.nlight))
-    yield from _different("geom", live.geoms[geoms], again.geoms[geoms], without)
-    yield from _different("light", live.lights[lights], again.lights[lights])
-    yield from _different("camera", live.camera, again.camera)
+    found = dict(_parts(again, option))
+    for what, value in _parts(live, option):
+        if found.get(what) != value:
+            yield what
+
+
+def _parts(
+    scene: mujoco.MjvScene, option: mujoco.MjvOption
+) -> Iterator[tuple[str, Any]]:
+    """Yield what a scene consists of, by what it is called."""
+    is_labelled = option.label != int(mujoco.mjtLabel.mjLABEL_NONE)
+    not_set = _NOT_SET if is_labelled else (*_NOT_SET, "label")
+    yield "the number of geoms", scene.ngeom
+    yield "the number of lights", scene.nlight
+    for what, structs in (
+        ("geom", scene.geoms[: scene.ngeom]),
+        ("light", scene.lights[: scene.nlight]),
+        ("camera", scene.camera),
+    ):
+        for index, struct in enumerate(structs):
+            for name in _members(struct.__class__):
+                if what != "geom" or name not in not_set:
+                    yield f"{name} of {what} {index}", _value(struct, name)
     for name in _shapes():
-        if _value(live, name) != _value(again, name):
-            yield f"the scene's {name}"
-
-
-def _different(
-    what: str,
-    live: Iterable[Any],
-    again: Iterable[Any],
-    without: tuple[str, ...] = (),
-) -> Iterator[str]:
-    for index, (one, other) in enumerate(zip(live, again, strict=True)):
-        names = [n for n in _members(one.__class__) if n not in without]
-        differing = [n for n in names if _value(one, n) != _value(other, n)]
-        if differing:
-            yield f"{', '.join(differing)} of {what} {index} of the scene"
+        yield name, _value(scene, name)
 
 
 def _value(struct: Any, name: str) -> Any:
