@@ -22,11 +22,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ..errors import InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
@@ -52,22 +50,17 @@ class Drawing:
     Args:
         scene: what is drawn.
         cameras: whose frames they are, in a grid where there are several. All draw
-            with one context.
-        acquired: what `close` frees.
+            with one canvas.
     """
 
     def __init__(
-        self,
-        scene: RecordedScene | GivenStates,
-        cameras: Iterable[SceneRenderer],
-        acquired: contextlib.ExitStack,
+        self, scene: RecordedScene | GivenStates, cameras: Sequence[SceneRenderer]
     ) -> None:
         self._scene = scene
-        self._cameras = list(cameras)
-        self._acquired = acquired
+        self._cameras = cameras
         # The frame whose cameras the renderers have in mind.
         self._last: int | None = None
-        self._context_is_old = False
+        self._canvas_is_old = False
 
     @property
     def size(self) -> tuple[int, int]:
@@ -81,8 +74,8 @@ class Drawing:
         """Who draws, and on which device: `gl_context.current_gl_facts`."""
         return self._cameras[0].gl_facts
 
-    def draw(self, index: int, *, out: Frame | None = None) -> Frame:
-        """Return a frame, in `out` if that is given.
+    def draw(self, index: int) -> Frame:
+        """Return a frame.
 
         Raises:
             InvalidArgument: there is no such frame.
@@ -98,25 +91,16 @@ class Drawing:
         if last is None or index != last + 1:
             self._prepare(index, last)
         self._bring_to(index)
-        if self._context_is_old:
+        if self._canvas_is_old:
             self._cameras[0].model_changed()
-            self._context_is_old = False
-        frame = self._render(out)
+            self._canvas_is_old = False
+        frames = [camera.render(self._scene.data) for camera in self._cameras]
         self._last = index
-        return frame
+        return frames[0] if len(frames) == 1 else grid_frame(frames)
 
     def close(self) -> None:
-        """Free what was acquired for this drawing. Idempotent."""
-        self._acquired.close()
-
-    def _render(self, out: Frame | None) -> Frame:
-        if len(self._cameras) == 1:
-            return self._cameras[0].render(self._scene.data, out=out)
-        grid = grid_frame([camera.render(self._scene.data) for camera in self._cameras])
-        if out is None:
-            return grid
-        np.copyto(out, grid)
-        return out
+        """Close the files of the scene. Idempotent."""
+        self._scene.close()
 
     def _prepare(self, index: int, last: int | None) -> None:
         """Bring the cameras to where they are before a frame."""
@@ -132,7 +116,7 @@ class Drawing:
                 camera.look(self._scene.data)
 
     def _bring_to(self, index: int) -> None:
-        self._context_is_old |= self._scene.bring_to(index)
+        self._canvas_is_old |= self._scene.bring_to(index)
 
 
 def trajectory_drawing(
@@ -158,85 +142,59 @@ def trajectory_drawing(
             driver cannot draw.
         GLError: nothing can be drawn here.
     """
-    with contextlib.ExitStack() as opened:
-        reader = opened.enter_context(open_for_rendering(path, is_vetted=True))
+    reader = open_for_rendering(path, is_vetted=True)
+    try:
         check_has_frames(reader)
-        facts = reader.facts
         scene = RecordedScene(reader)
-        model, recorded = scene.model, scene.view
-        look: dict[str, Any] = {
+        recorded = scene.view
+        quality = (reader.facts.get("video") or {}).get("quality", "full")
+        shared: dict[str, Any] = {
+            "scene_option": recorded.option,
+            "max_geom": recorded.max_geom,
+            "fresh": recorded.fresh,
             "height": recorded.height if view.height is None else view.height,
             "width": recorded.width if view.width is None else view.width,
-            "quality": view.quality
-            or (facts.get("video") or {}).get("quality", "full"),
+            "quality": view.quality or quality,
+            "canvas": canvas or Canvas(),
         }
-        shared = canvas or opened.enter_context(contextlib.closing(Canvas()))
-
-        def renderer(asked: PlainCamera | None) -> SceneRenderer:
-            # Of a camera as recorded it is known how the frames have moved it.
-            own: dict[str, Any] = (
-                {"camera": _camera(model, asked)}
-                if asked is not None
-                else {
-                    "camera": recorded.camera,
-                    "begins_at": scene.previous_cameras,
-                    "is_moved": True,
-                }
-            )
-            return SceneRenderer(
-                model,
-                scene_option=recorded.option,
-                max_geom=recorded.max_geom,
-                fresh=recorded.fresh,
-                canvas=shared,
-                **look,
-                **own,
-            )
-
+        # Of a camera as recorded it is known how the frames have moved it.
+        as_recorded = {
+            "camera": recorded.camera,
+            "begins_at": scene.previous_cameras,
+            "is_moved": True,
+        }
         wanted = [view.camera] if cameras is None else cameras
-        return Drawing(scene, [renderer(asked) for asked in wanted], opened.pop_all())
-
-
-def states_drawing(
-    directory: Path, spec: int, view: View, *, canvas: Canvas
-) -> Drawing:
-    """Return the frames of given states, with all that is computed from them.
-
-    Args:
-        directory: where `save_states` wrote them.
-        spec: which components a state has.
-        view: how they are to be drawn, with nothing left open.
-        canvas: what to draw with.
-
-    Raises:
-        UnknownName, InvalidArgument, GLError: as `trajectory_drawing`.
-    """
-    scene = GivenStates(directory, spec)
-    camera = _camera(scene.model, view.camera)
-    look: dict[str, Any] = {
-        "height": view.height,
-        "width": view.width,
-        "quality": view.quality,
-    }
-    renderer = SceneRenderer(scene.model, camera=camera, canvas=canvas, **look)
-    return Drawing(scene, [renderer], contextlib.ExitStack())
+        own = (
+            as_recorded if asked is None else {"camera": _camera(scene.model, asked)}
+            for asked in wanted
+        )
+        renderers = [SceneRenderer(scene.model, **shared, **each) for each in own]
+        return Drawing(scene, renderers)
+    except BaseException:
+        reader.close()
+        raise
 
 
 def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
     """Return what is described, for a worker, in plain JSON.
 
     Args:
-        drawing: `trajectory` (a path), or `states` (a directory) and `spec`; and
-            `view`; and, of a trajectory, `cameras`.
+        drawing: `trajectory` (a path), or `states` (a directory of `save_states`) and
+            `spec`; and `view`; and, of a trajectory, `cameras`.
         canvas: what to draw with.
+
+    Raises:
+        Error: as of `trajectory_drawing`.
     """
     log_mujoco_warnings()
     view = View(**drawing["view"])
     if "trajectory" in drawing:
         path, cameras = Path(drawing["trajectory"]), drawing.get("cameras")
         return trajectory_drawing(path, view, cameras=cameras, canvas=canvas)
-    states = Path(drawing["states"])
-    return states_drawing(states, drawing["spec"], view, canvas=canvas)
+    scene = GivenStates(Path(drawing["states"]), drawing["spec"])
+    # Nothing is left open.
+    look: dict[str, Any] = {**vars(view), "camera": _camera(scene.model, view.camera)}
+    return Drawing(scene, [SceneRenderer(scene.model, canvas=canvas, **look)])
 
 
 def _camera(model: Any, camera: Any) -> Camera:
@@ -269,10 +227,8 @@ def main() -> None:
 def _draw(order: Mapping[str, Any], canvas: Canvas, parent: Parent) -> None:
     with contextlib.closing(open_drawing(order["drawing"], canvas)) as drawing:
         parent.send(size=drawing.size, gl=drawing.gl_facts)
-        frame = np.empty((*drawing.size, 3), np.uint8)
         for index in order["indices"]:
-            drawing.draw(index, out=frame)
-            parent.send(frame.data)
+            parent.send(drawing.draw(index).data)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import ClosedError, InvalidArgument
-from ..frames import Frame, check_frame, check_quality, check_size
+from ..frames import Frame, check_quality, check_size
 from .cameras import FREE_CAMERA, Camera, is_tracking, resolve_camera
 from .fields import holder_of
 from .gl_context import (
@@ -114,8 +114,8 @@ class Canvas:
             self._load(model)
             self._kept = kept
 
-    def draw(self, scene: mujoco.MjvScene, out: Frame | None = None) -> Frame:
-        """Return the frame of `scene`, the top row first, in `out` if that is given.
+    def draw(self, scene: mujoco.MjvScene) -> Frame:
+        """Return the frame of `scene`, the top row first.
 
         Raises:
             ClosedError: after `close`.
@@ -124,9 +124,7 @@ class Canvas:
         with self._current():
             mujoco.mjr_render(self._rectangle, scene, self._drawing)
             mujoco.mjr_readPixels(self._bottom_up, None, self._rectangle, self._drawing)
-        frame = np.empty_like(self._bottom_up) if out is None else out
-        np.copyto(frame, self._bottom_up[::-1])
-        return frame
+        return np.ascontiguousarray(self._bottom_up[::-1])
 
     def close(self) -> None:
         """Free what lies in the context, then the context. Idempotent."""
@@ -289,7 +287,7 @@ class SceneRenderer:
         camera = resolve_camera(self._model, self._camera)
         mujoco.mjv_updateCamera(self._model, data, camera, self._scene)
 
-    def render(self, data: mujoco.MjData, *, out: Frame | None = None) -> Frame:
+    def render(self, data: mujoco.MjData) -> Frame:
         """Return the frame of `data`, a new `(height, width, 3) uint8` array.
 
         The first row is the top one.
@@ -297,15 +295,11 @@ class SceneRenderer:
         Args:
             data: of the model. Its derived quantities are drawn as they are: after
                 `mj_step` they belong to the state before the last substep.
-            out: an array to draw into and return, instead of a new one.
 
         Raises:
-            InvalidFrame: `out` is no frame of this size.
             ClosedError: after `close`.
             GLError: in a forked child.
         """
-        if out is not None:
-            check_frame(out, size=self.size)
         if self._fresh:
             self._put_cameras(np.zeros((2, 3)))
         # The model's free camera and the number of a name may have changed.
@@ -314,7 +308,7 @@ class SceneRenderer:
             *(self._model, data, self._scene_option, None, camera),
             *(_EVERYTHING, self._scene),
         )
-        return self._canvas.draw(self._scene, out)
+        return self._canvas.draw(self._scene)
 
     def model_changed(self) -> None:
         """Bring the canvas up to date with the model.
