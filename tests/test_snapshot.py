@@ -10,11 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from touch_grid import TOUCH_GRID
 
 from mjrec.errors import InvalidArgument
 from mjrec.formats.trajectory import packed
-from mjrec.simulation import self_check
 from mjrec.simulation.captured_arrays import (
     needs_constraints,
     read_state,
@@ -22,7 +20,6 @@ from mjrec.simulation.captured_arrays import (
 )
 from mjrec.simulation.self_check import (
     differences,
-    drawing_plugin,
     scene_difference,
     updated_scene,
 )
@@ -388,29 +385,3 @@ def test_scenes_of_other_states_differ() -> None:
     found = " ".join(differences(live, fewer, shown.option))
     assert "number of geoms" in found
     assert "number of lights" in found
-
-
-PID = """
-<mujoco>
-  <extension><plugin plugin="mujoco.pid"/></extension>
-  <worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody>
-  <actuator>
-    <plugin joint="j" plugin="mujoco.pid"><config key="kp" value="4"/></plugin>
-  </actuator>
-</mujoco>
-"""
-
-
-def test_plugins_that_draw_are_known_before_they_do(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A touch grid's cells appear with the first contact, so that no frame tells."""
-    found = [
-        drawing_plugin(mujoco.MjModel.from_xml_string(xml))
-        for xml in (TOUCH_GRID, PID, "<mujoco/>")
-    ]
-    assert found == ["mujoco.sensor.touch_grid", None, None]
-    # Where MuJoCo's register cannot be read nothing is believed.
-    monkeypatch.setattr(self_check, "_library", lambda: None)
-    model = mujoco.MjModel.from_xml_string(PID)
-    assert "cannot be looked at" in (drawing_plugin(model) or "")

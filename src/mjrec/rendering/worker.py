@@ -30,7 +30,6 @@ from ..errors import InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
 from ..messages import carried
 from ..parent import Parent
-from ..simulation.cameras import Camera, camera_from_members
 from ..simulation.gl_probe import draw_test_scene
 from ..simulation.recorded_scene import GivenStates, RecordedScene
 from ..simulation.renderer import Canvas, SceneRenderer
@@ -164,10 +163,7 @@ def trajectory_drawing(
             "is_moved": True,
         }
         wanted = [view.camera] if cameras is None else cameras
-        own = (
-            as_recorded if asked is None else {"camera": _camera(scene.model, asked)}
-            for asked in wanted
-        )
+        own = (as_recorded if c is None else {"camera": c} for c in wanted)
         renderers = [SceneRenderer(scene.model, **shared, **each) for each in own]
         return Drawing(scene, renderers)
     except BaseException:
@@ -193,12 +189,8 @@ def open_drawing(drawing: Mapping[str, Any], canvas: Canvas) -> Drawing:
         return trajectory_drawing(path, view, cameras=cameras, canvas=canvas)
     scene = GivenStates(Path(drawing["states"]), drawing["spec"])
     # Nothing is left open.
-    look: dict[str, Any] = {**vars(view), "camera": _camera(scene.model, view.camera)}
+    look: dict[str, Any] = vars(view)
     return Drawing(scene, [SceneRenderer(scene.model, canvas=canvas, **look)])
-
-
-def _camera(model: Any, camera: Any) -> Camera:
-    return camera_from_members(model, camera) if isinstance(camera, dict) else camera
 
 
 def main() -> None:

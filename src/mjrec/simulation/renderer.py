@@ -7,7 +7,7 @@ import contextlib
 import copy
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import mujoco
@@ -212,8 +212,8 @@ class SceneRenderer:
         model: the model.
         height: in pixels; may be larger than the model's offscreen buffer.
         width: likewise.
-        camera: the name or number of a camera of the model, -1 for the free camera, or
-            an `MjvCamera`, which is read anew for every frame.
+        camera: as `resolve_camera` takes it; an `MjvCamera` is read anew for every
+            frame.
         scene_option: read anew for every frame; MuJoCo's default, if None, which is
             not dm_control's: that draws no range finders.
         max_geom: how many geoms a scene may have; the rest is not drawn. Environments'
@@ -245,7 +245,7 @@ class SceneRenderer:
         *,
         height: int,
         width: int,
-        camera: Camera = FREE_CAMERA,
+        camera: Camera | Mapping[str, Any] = FREE_CAMERA,
         scene_option: mujoco.MjvOption | None = None,
         max_geom: int = 10000,
         quality: str = "full",
@@ -259,7 +259,8 @@ class SceneRenderer:
         placed = resolve_camera(model, camera)
         self.is_following = not is_moved and is_tracking(placed)
         self._model = model
-        self._camera = camera
+        # The place of the free camera and the number of a name may change.
+        self._camera = placed if isinstance(camera, Mapping) else camera
         self._scene_option = scene_option or mujoco.MjvOption()
         self._fresh = fresh
         self._begins_at = np.asarray(begins_at)
@@ -302,7 +303,6 @@ class SceneRenderer:
         """
         if self._fresh:
             self._put_cameras(np.zeros((2, 3)))
-        # The model's free camera and the number of a name may have changed.
         camera = resolve_camera(self._model, self._camera)
         mujoco.mjv_updateScene(
             *(self._model, data, self._scene_option, None, camera),

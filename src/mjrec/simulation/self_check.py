@@ -7,16 +7,14 @@ back, and they have to be the same.
 
 One scene does not tell of plugins: MuJoCo calls a plugin's `visualize` for each scene,
 and what that draws may come from its own memory and show only at times (a touch grid
-draws nothing until something touches it). So they are asked for by name.
+draws nothing until something touches it). So models with plugins are recorded live.
 """
 
 from __future__ import annotations
 
 import copy
-import ctypes
 import functools
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -51,9 +49,8 @@ def scene_difference(
     Returns:
         What differs, in words; None where the scenes are the same.
     """
-    plugin = drawing_plugin(model)
-    if plugin is not None:
-        return f"the plugin {plugin} draws by itself, from what it alone knows"
+    if model.nplugin:
+        return "its plugins may draw by themselves, from what they alone know"
     # Where tendons have colours of their own these are set in the model.
     sets_model = TENDON_RGBA in (row.dtype.names or ())
     restored_model = copy.copy(model) if sets_model else model
@@ -128,45 +125,3 @@ def _shapes() -> tuple[str, ...]:
     names = (name for name in dir(scene) if name.startswith(("skin", "flex")))
     values = {name: getattr(scene, name) for name in names}
     return tuple(n for n, v in values.items() if getattr(v, "dtype", None) == "<f4")
-
-
-class _Plugin(ctypes.Structure):
-    """The beginning of `mjpPlugin` (mjplugin.h), the same from mujoco 3.3 to 4.0."""
-
-    _functions = (
-        *("nstate", "nsensordata", "init", "destroy", "copy", "reset"),
-        *("compute", "advance", "visualize"),
-    )
-    _fields_ = (
-        ("name", ctypes.c_char_p),
-        ("nattribute", ctypes.c_int),
-        ("attributes", ctypes.POINTER(ctypes.c_char_p)),
-        ("capabilityflags", ctypes.c_int),
-        ("needstage", ctypes.c_int),
-        *((name, ctypes.c_void_p) for name in _functions),
-    )
-
-
-def drawing_plugin(model: mujoco.MjModel) -> str | None:
-    """Return the name of a plugin of `model` that draws; None where there is none.
-
-    A plugin that cannot be looked at counts as one that draws.
-    """
-    for instance in range(model.nplugin):
-        try:
-            plugin = _library().mjp_getPluginAtSlot(int(model.plugin[instance]))[0]
-        except (OSError, AttributeError, ValueError):
-            return f"number {instance}, which cannot be looked at,"
-        if plugin.visualize:
-            return str((plugin.name or b"").decode(errors="replace"))
-    return None
-
-
-@functools.cache
-def _library() -> Any:
-    # Loaded already; this only finds it again.
-    path = next(Path(mujoco.__file__).parent.glob("libmujoco.*"), None)
-    library = ctypes.CDLL(None if path is None else str(path))
-    library.mjp_getPluginAtSlot.restype = ctypes.POINTER(_Plugin)
-    library.mjp_getPluginAtSlot.argtypes = [ctypes.c_int]
-    return library
