@@ -13,11 +13,7 @@ import pytest
 
 from mjrec.errors import InvalidArgument
 from mjrec.formats.trajectory import packed
-from mjrec.simulation.captured_arrays import (
-    needs_constraints,
-    read_state,
-    snapshot_dtype,
-)
+from mjrec.simulation.captured_arrays import needs_constraints, snapshot_dtype
 from mjrec.simulation.self_check import (
     differences,
     scene_difference,
@@ -28,6 +24,7 @@ from mjrec.simulation.snapshot import (
     TendonColours,
     restore_snapshot,
 )
+from mjrec.simulation.states import read_state
 from mjrec.simulation.view import SceneView
 
 ASSETS = Path(__file__).parent.parent / "assets"

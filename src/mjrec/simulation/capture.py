@@ -17,19 +17,14 @@ from numpy.typing import NDArray
 
 from ..errors import ClosedError, PicturesDiffer
 from .cameras import is_tracking, raw_data, raw_model
-from .captured_arrays import (
-    STATE_SPEC,
-    needs_constraints,
-    snapshot_dtype,
-    state_dtype,
-    state_words,
-)
+from .captured_arrays import needs_constraints, snapshot_dtype
 from .fields import VIEW_PREFIXES, is_settable
 from .looks import Looks
 from .model_sources import AuthoredModel
 from .model_store import ModelStore
 from .self_check import scene_difference
 from .snapshot import SnapshotSource
+from .states import STATE_SPEC, state_dtype, state_words
 from .view import SceneView
 
 T = TypeVar("T")

@@ -235,7 +235,7 @@ class Trajectory:
                 data's model.
         """
         # Here, because reading needs no simulator.
-        from .replay import set_state
+        from .states import set_state
 
         row = self.states[self._step(step)]
         set_state(data.model, data, self._columns, row)
