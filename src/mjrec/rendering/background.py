@@ -34,11 +34,11 @@ from typing import TYPE_CHECKING, Any
 from ..child_python import Child, wait_for_news
 from ..errors import Error
 from ..formats.monitor_directory import infix_of
+from ..machine import check_workers
 from ..messages import log_message
 from ..parent import Parent
 from ..patience import Patience, patience_s
 from .jobs import Progress, VideoJob, key_of
-from .pool import check_workers
 
 if TYPE_CHECKING:
     from .finish import Finisher

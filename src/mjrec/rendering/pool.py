@@ -29,7 +29,6 @@ from ..errors import (
     DirectoryNotWritable,
     Error,
     GLError,
-    InvalidArgument,
 )
 from ..formats.locks import Lock, try_lock
 from ..formats.monitor_directory import render_lock_name
@@ -41,7 +40,7 @@ from ..gl.backends import (
     environment_for,
     rendering_is_off,
 )
-from ..machine import usable_cpus
+from ..machine import check_workers, usable_cpus
 from ..messages import log_message, unpacked
 from ..patience import Patience
 from ..simulation.model_trust import ALL_MODELS, TRUST_VARIABLE
@@ -471,21 +470,6 @@ class _Worker:
         child, self.child = self.child, None
         if child is not None:
             child.end()
-
-
-def check_workers(workers: int | None) -> int | None:
-    """Return `workers` if it is a number of processes, or None.
-
-    Raises:
-        InvalidArgument: it is something else.
-    """
-    whole = isinstance(workers, int) and not isinstance(workers, bool)
-    if workers is not None and not (whole and workers >= 1):
-        raise InvalidArgument(
-            "workers must be a positive whole number, or None for one on each CPU that "
-            f"can be used, got {workers!r}."
-        )
-    return workers
 
 
 def _environment(environ: Mapping[str, str], *, alone: bool) -> dict[str, str]:

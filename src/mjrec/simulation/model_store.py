@@ -33,7 +33,6 @@ from ..formats.json_fields import unreadable
 from ..formats.monitor_directory import FILE_PREFIX
 from ..formats.regular_files import open_regular
 from ..worker_thread import WorkerThread
-from .foreign_files import compile_sources
 from .model_sources import AuthoredModel, with_embedded_files, write_authored
 from .model_trust import (
     TRUST_VARIABLE,
@@ -176,6 +175,9 @@ def load_model(
             raise
         objection = error
     logger.info("%s It is compiled from %s.", objection, source.name)
+    # Here, because it loads h5py, for which who records has no use.
+    from .foreign_files import compile_sources
+
     try:
         return compile_sources(source, compiled_size=_recorded_size(source, facts))
     except UnreadableFile as error:
