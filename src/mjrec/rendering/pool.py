@@ -254,8 +254,7 @@ class WorkerPool:
                 f"No process that draws could be started: {sys.executable!r}: {error}."
             ) from error
         worker.is_tried = self._is_chosen
-        if not self._is_chosen:
-            worker.child.send(tries=True)
+        worker.child.send(tries=not self._is_chosen)
 
     def _main_of_fork(self, environ: Mapping[str, str]) -> Callable[[], object] | None:
         if not self._forks or threading.active_count() > 1:

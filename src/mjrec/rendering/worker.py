@@ -3,7 +3,8 @@
 
 Its parent sends::
 
-    {"tries": true}                         it looks first at a frame of its own
+    {"tries": true}                         it makes its context and, if true, looks at
+                                            a frame of its own
     {"drawing": {...}, "indices": [1, 3, 5]}
 
 `drawing` is what `open_drawing` takes; `indices` are the frames. It sends the bytes of
@@ -26,7 +27,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidArgument
+from ..errors import Error, InvalidArgument
 from ..frames import Frame, grid_frame, grid_shape
 from ..messages import carried
 from ..parent import Parent
@@ -202,18 +203,22 @@ def main() -> None:
     canvas = Canvas()
     while True:
         order = parent.receive()
-        if "tries" in order:
+        if "tries" not in order:
             try:
-                draw_test_scene()
+                _draw(order, canvas, parent)
+            except Exception as error:
+                parent.send(error=carried(error))
+        elif order["tries"]:
+            try:
+                draw_test_scene(canvas=canvas)
             except Exception as error:
                 parent.send(untried=str(error))
                 # Not `sys.exit`, which would wait for the driver.
                 os._exit(1)
-            continue
-        try:
-            _draw(order, canvas, parent)
-        except Exception as error:
-            parent.send(error=carried(error))
+        else:
+            # What is in the way is said when there is something to draw.
+            with contextlib.suppress(Error):
+                canvas.open()
 
 
 def _draw(order: Mapping[str, Any], canvas: Canvas, parent: Parent) -> None:

@@ -78,6 +78,15 @@ class Canvas:
         self._kind: object = None
         self._kept = b""
 
+    def open(self) -> None:
+        """Make the context now, so that the first frame comes sooner. Idempotent.
+
+        Raises:
+            GLError: as of `new_context`.
+        """
+        with self._current():
+            pass
+
     def prepare(
         self, model: mujoco.MjModel, *, height: int, width: int, quality: str
     ) -> None:
