@@ -33,7 +33,7 @@ from mjrec.formats.monitor_directory import (
 from mjrec.formats.spans import is_in_flight
 from mjrec.formats.trajectory_file import open_trajectory
 from mjrec.rendering import finish as module
-from mjrec.rendering.finish import Finisher
+from mjrec.rendering.finisher import Finisher
 from mjrec.rendering.jobs import RecordingKey, RenderedVideos, VideoJob
 from mjrec.rendering.recorded_facts import open_for_rendering
 from mjrec.rendering.recordings import (

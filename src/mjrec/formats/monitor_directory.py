@@ -41,6 +41,7 @@ monitors ever share one in a directory. Names that start with a dot and end in
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 import shlex
@@ -96,8 +97,11 @@ _HIDDEN = (
     re.compile(r"\.openaigym\.render\.[0-9]+\.lock"),
     re.compile(rf"\.openaigym\.manifest\.{_INFIX_PART}\.lock"),
     re.compile(rf"\.openaigym\.{_INFIX_PART}\.lock"),
-    re.compile(rf"\.{_VIDEO}\.[^/\n\0]*\.part"),
     re.compile(r"\.openaigym\.[^/\n\0]+\.part"),
+)
+# A note is rewritten as every file is: an unfinished one has both endings.
+_PART = re.compile(
+    r"\.(?P<final>openaigym\..+?)(?P<note>\.note(\.part)?)?(?P<hex>\.[0-9a-f]{8})?\.part"
 )
 
 
@@ -266,6 +270,26 @@ def episode_of(name: str) -> int | None:
     return None if number is None else int(number)
 
 
+def final_name(name: str) -> str | None:
+    """Return the name that an unfinished file, or the file of a note, will get."""
+    part = _PART.fullmatch(name)
+    return None if part is None else part["final"]
+
+
+def is_note(name: str) -> bool:
+    """Tell whether `name` is that of a note beside an unfinished video."""
+    part = _PART.fullmatch(name)
+    return part is not None and bool(part["note"]) and not part["hex"]
+
+
+def unfinished_files(path: Path) -> list[Path]:
+    """Return the hidden files under which `path` is written, or was."""
+    pattern = f".{glob.escape(path.name)}.{8 * '[0-9a-f]'}.part"
+    found = sorted(path.parent.glob(pattern))
+    # A link may lead anywhere.
+    return [part for part in found if part.is_file() and not part.is_symlink()]
+
+
 def iter_monitor_files(directory: Path, *, hidden: bool = False) -> Iterator[Path]:
     """Yield the monitor files of `directory`, sorted by name.
 
@@ -340,6 +364,9 @@ def _is_file(entry: os.DirEntry[str]) -> bool:
 def _match(name: str) -> re.Match[str] | None:
     """Return what tells a name to be a monitor file's; None for other files."""
     if name.startswith("."):
+        final = final_name(name)
+        if final is not None and (match := _match(final)) is not None:
+            return match
         matches = (pattern.fullmatch(name) for pattern in _HIDDEN)
         return next((match for match in matches if match is not None), None)
     _, _, rest = name.partition(".")

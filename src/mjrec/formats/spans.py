@@ -125,6 +125,12 @@ class SpanList:
         rows = self.log.stat().st_size if self.log.exists() else 0
         return self.dtype is None and rows > 0
 
+    @property
+    def last_write(self) -> float:
+        """When its last row was written, in seconds since the epoch."""
+        files = (self.log, tail_path(self.log))
+        return max((f.stat().st_mtime for f in files if f.exists()), default=0.0)
+
     def in_flight(self) -> list[Recording]:
         """Return the recordings that only the log has."""
         return [each for each in self.recordings.values() if each.is_in_flight]

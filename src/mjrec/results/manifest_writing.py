@@ -8,14 +8,13 @@ some of its videos, by one that puts a dead monitor in order.
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from .. import json_text
-from ..errors import DirectoryNotWritable, UnreadableFile
+from ..errors import UnreadableFile
 from ..formats.locks import is_locked, wait_for_lock
 from ..formats.manifest import (
     GYM_VERSION,
@@ -167,14 +166,8 @@ def manifest_lock(directory: Path, infix: Infix) -> Iterator[None]:
     Raises:
         DirectoryNotWritable: there can be no lock in the directory.
     """
-    try:
-        lock = wait_for_lock(directory / manifest_lock_name(infix), f"{os.getpid()}\n")
-    except OSError as error:
-        raise DirectoryNotWritable(directory, error.strerror) from error
-    try:
+    with wait_for_lock(directory / manifest_lock_name(infix)):
         yield
-    finally:
-        lock.release()
 
 
 def _as_read(manifest: Manifest) -> Manifest:
