@@ -181,7 +181,7 @@ def journal_name(infix: Infix) -> str:
     return f"{FILE_PREFIX}.episodes.{infix}.jsonl"
 
 
-def video_prefix(infix: Infix, episode_id: int) -> str:
+def video_prefix(infix: Infix | str, episode_id: int) -> str:
     """Return the name of an episode's video without its extensions."""
     return f"{FILE_PREFIX}.video.{infix}.video{episode_id:06d}"
 

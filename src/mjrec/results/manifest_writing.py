@@ -176,7 +176,7 @@ def _as_read(manifest: Manifest) -> Manifest:
 
 
 def _manifest(directory: Path, infix: Infix, run: Run, *, stats_name: str) -> Manifest:
-    finished, broken = _videos(directory, infix, run)
+    finished, broken = finished_and_broken(directory, infix, run)
     pending = _pending(directory, infix, run)
     keep, name, chosen = _keep(run), run.facts.get("schedule"), set(run.chosen)
     if keep is not None:
@@ -223,8 +223,8 @@ def _keep(run: Run) -> dict[str, Any] | None:
     }
 
 
-def _videos(
-    directory: Path, infix: Infix, run: Run
+def finished_and_broken(
+    directory: Path, infix: Infix | str, run: Run
 ) -> tuple[list[tuple[str, str]], list[str]]:
     """Return finished videos, each with its metadata, and the metadata of broken ones.
 
