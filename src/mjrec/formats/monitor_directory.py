@@ -73,6 +73,10 @@ _TRAJECTORY = (
 # Not the number of an episode: no part of a clip is taken for an episode's file.
 _CLIP = rf"openaigym\.clip\.{_INFIX_PART}\.step(?P<step>[0-9]{{9,18}})"
 _CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})")
+_VIDEO_FILE = re.compile(
+    rf"{_VIDEO}(\.step(?P<step>[0-9]{{6,18}}))?(\.(?P<view>[^/\n\0]+?))?"
+    r"\.(?P<ending>mp4|avi|json|framehash|meta\.json|failed\.json)"
+)
 _STATES = rf"openaigym\.states\.{_INFIX_PART}\.[0-9]{{6,9}}"
 
 _MANIFEST = re.compile(rf"openaigym\.manifest\.{_INFIX_PART}\.manifest\.json")
@@ -149,6 +153,52 @@ class ClipPart:
         if match is None or infix is None:
             return None
         return cls(infix, int(match["step"]), int(match["part"]))
+
+
+@dataclass(frozen=True)
+class VideoName:
+    """What the name of a video, or of a file that belongs to one, says.
+
+    Attributes:
+        name: the name of the file.
+        infix: of its monitor.
+        episode_id: the episode that it shows, or in which a clip began.
+        first_step: as of `ClipPart`; None where no step began it.
+        view: which of several videos; empty for the first camera's as recorded.
+        ending: what kind of file it is, such as `mp4` or `meta.json`.
+    """
+
+    name: str
+    infix: str
+    episode_id: int
+    first_step: int | None
+    view: str
+    ending: str
+
+    @classmethod
+    def parse(cls, name: str) -> VideoName | None:
+        """Return what a file's name says; None for other files."""
+        match = _VIDEO_FILE.fullmatch(name)
+        if match is None:
+            return None
+        step = None if match["step"] is None else int(match["step"])
+        return cls(
+            *(name, match["infix"], int(match["episode"]), step),
+            *(match["view"] or "", match["ending"]),
+        )
+
+    @property
+    def video(self) -> str:
+        """The name of the mp4."""
+        return f"{self.name.removesuffix(self.ending)}mp4"
+
+    @property
+    def is_episodes(self) -> bool:
+        """Whether it is of an episode's first video, and of no clip that a step began.
+
+        A clip that began with an episode has such a name, too.
+        """
+        return not self.view and self.first_step is None
 
 
 def check_uid(uid: object) -> str:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import re
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -29,6 +28,7 @@ from ..formats.journal import (
 from ..formats.locks import try_lock
 from ..formats.monitor_directory import (
     Infix,
+    VideoName,
     episode_of,
     final_name,
     journal_name,
@@ -54,10 +54,6 @@ from .recordings import claim, parts_of
 logger = logging.getLogger(__name__)
 
 _MOMENT = 0.05
-_CLIP_METADATA = re.compile(
-    r"(?P<video>.*\.video(?P<episode>\d{6,18})\.step\d+)\.meta\.json", re.ASCII
-)
-_FIRST_VIDEO = re.compile(r".*\.video\d{6,}\.mp4", re.ASCII)
 
 _Line = tuple[str, Mapping[str, Any]]
 
@@ -317,9 +313,11 @@ class _DeadMonitor:
                     },
                 )
         for path in now.paths:
-            if (match := _CLIP_METADATA.fullmatch(path.name)) is not None:
-                number, video = int(match["episode"]), f"{match['video']}.mp4"
-                yield "clip", {"episode_id": number, "video": video}
+            name = VideoName.parse(path.name)
+            if name is None or name.first_step is None or name.view:
+                continue
+            if name.ending == "meta.json":
+                yield "clip", {"episode_id": name.episode_id, "video": name.video}
 
     def _complete_journal(self, now: MonitorFiles) -> None:
         """Write down what the monitor did not live to write down."""
@@ -382,7 +380,8 @@ def _finish_log(path: Path) -> str:
 
 
 def _is_first(note: Leftover) -> bool:
-    return _FIRST_VIDEO.fullmatch(final_name(note.path.name) or "") is not None
+    name = VideoName.parse(final_name(note.path.name) or "")
+    return name is not None and not name.view
 
 
 def _numbers(files: MonitorFiles) -> set[int]:

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 from ..errors import UnreadableFile
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
+    VideoName,
     final_name,
     is_note,
     iter_monitor_files,
@@ -25,9 +26,7 @@ from ..formats.video_metadata import is_broken, metadata_path
 from ..results.journal_or_stats import MonitorResults
 from ..results.monitor_files import MonitorFiles, monitors_of
 
-_VIDEO = re.compile(r"(?P<stem>openaigym\.video\..+)\.(mp4|framehash|meta\.json|json)")
 _SHARED_LOCK = re.compile(r"\.openaigym\.(recover|render\.\d+)\.lock")
-_TEXT = re.compile(r"openaigym\.video\..+\.video\d{6,}\.json")
 
 
 class Leftover(NamedTuple):
@@ -102,10 +101,10 @@ def _kind_of_part(path: Path, files: MonitorFiles) -> str | None:
     if is_note(path.name):
         # What is left of a broken one stays, for those who want to try more.
         return None if is_broken(metadata_path(video)) else "video"
-    match = _VIDEO.fullmatch(final)
-    if match is None:
+    name = VideoName.parse(final)
+    if name is None:
         return "stale"
-    mp4 = path.with_name(f"{match['stem']}.mp4")
+    mp4 = path.with_name(name.video)
     if note_path(mp4).exists() and final.endswith((".mp4", ".framehash")):
         return None
     # A clip's video may be called as an episode's.
@@ -113,7 +112,7 @@ def _kind_of_part(path: Path, files: MonitorFiles) -> str | None:
     locks = [p for p in files.paths if p.name.startswith(clips)]
     if any(map(is_locked, [*unfinished_files(mp4), *locks, _lock_of(mp4)])):
         return None
-    return "text" if _TEXT.fullmatch(final) else "stale"
+    return "text" if name.is_episodes and name.ending == "json" else "stale"
 
 
 def _lock_of(video: Path) -> Path:

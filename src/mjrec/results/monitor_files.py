@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from ..formats.journal import MOST_EPISODES
 from ..formats.locks import is_locked
 from ..formats.monitor_directory import (
     Infix,
+    VideoName,
     episode_of,
     infix_of,
     is_manifest,
@@ -24,9 +24,6 @@ from ..formats.second_names import is_called_like_second
 from ..formats.spans import recordings_in_flight
 
 logger = logging.getLogger(__name__)
-
-# Videos of further cameras have the camera's name before the ending.
-_VIDEO = re.compile(r".*\.video(?P<episode>\d{6,})\.(?P<kind>meta\.json|mp4|avi|json)")
 
 
 class MonitorFiles:
@@ -83,7 +80,7 @@ class MonitorFiles:
         # A name may hold any number of digits, and be anybody's.
         if number is not None and number < MOST_EPISODES:
             self.last_episode_id = max(self.last_episode_id, number)
-        video = _VIDEO.fullmatch(path.name)
+        video = VideoName.parse(path.name)
         if path.name == f".openaigym.{self.infix}.lock":
             self.lock = path
         elif path.name.startswith("."):
@@ -94,9 +91,11 @@ class MonitorFiles:
             self.stats = path
         elif path.suffix == ".jsonl":
             self.journal = path
-        elif video is not None:
-            kind = self.metadata if video["kind"] == "meta.json" else self.videos
-            kind[int(video["episode"])] = path
+        elif video is not None and video.is_episodes:
+            if video.ending in ("mp4", "avi", "json"):
+                self.videos[video.episode_id] = path
+            elif video.ending == "meta.json":
+                self.metadata[video.episode_id] = path
         elif path.suffix == ".h5" and number is not None:
             self.trajectories[number] = path
 
