@@ -74,7 +74,7 @@ _TRAJECTORY = (
 _CLIP = rf"openaigym\.clip\.{_INFIX_PART}\.step(?P<step>[0-9]{{9,18}})"
 _CLIP_PART = re.compile(rf"{_CLIP}\.part(?P<part>[0-9]{{6,18}})")
 _VIDEO_FILE = re.compile(
-    rf"{_VIDEO}(\.step(?P<step>[0-9]{{6,18}}))?(\.(?P<view>[^/\n\0]+?))?"
+    rf"{_VIDEO}(\.step(?P<step>[0-9]{{6,18}}))?(\.(?P<view>[^/\n\0]+?))??"
     r"\.(?P<ending>mp4|avi|json|framehash|meta\.json|failed\.json)"
 )
 _STATES = rf"openaigym\.states\.{_INFIX_PART}\.[0-9]{{6,9}}"
