@@ -25,7 +25,7 @@ from typing import Any
 from ..formats.journal import JournalEntry, JournalReader
 from ..formats.json_fields import field as field_of
 from ..formats.json_fields import integer, mapping, number, optional, text, unreadable
-from ..formats.monitor_directory import infix_of
+from ..formats.monitor_directory import infix_of, monitor_directories_in
 from .episode_results import EpisodeResult
 from .plan import Unit
 from .plan_file import read_plan
@@ -77,8 +77,8 @@ def recorded_results(directory: Path) -> Iterator[tuple[Path, EpisodeResult]]:
     plan = read_plan(directory)
     for task in plan.tasks:
         found: list[tuple[Path, EpisodeResult]] = []
-        for chunk in plan.chunks:
-            folder = directory / task.folder / chunk.folder
+        top = directory / task.folder
+        for folder in [top, *monitor_directories_in(top)] if top.is_dir() else []:
             results = read_chunk(folder, task.name).results
             found += ((folder, result) for result in results.values())
         place = {seed: index for index, seed in enumerate(plan.seeds)}
