@@ -41,7 +41,7 @@ from ..patience import Patience, patience_s
 from .jobs import Progress, VideoJob, key_of
 
 if TYPE_CHECKING:
-    from .finish import Finisher
+    from .finisher import Finisher
 
 # Not `__name__`, which is `__main__` in the process.
 logger = logging.getLogger("mjrec.rendering.background")
@@ -280,7 +280,7 @@ class _Stopped(BaseException):
 def main() -> None:
     """Finish the recordings that the simulation's process names, until it ends."""
     # Not at the top: the simulation's process needs none of it.
-    from .finish import Finisher
+    from .finisher import Finisher
 
     parser = argparse.ArgumentParser()
     parser.add_argument("directory", type=Path)

@@ -26,7 +26,6 @@ import numpy as np
 from ..child_python import Child, wait_for_news
 from ..errors import (
     ClosedError,
-    DirectoryNotWritable,
     Error,
     GLError,
 )
@@ -228,12 +227,7 @@ class WorkerPool:
         for number in range(len(self._workers)):
             if number not in self._held:
                 path = self._directory / render_lock_name(number)
-                try:
-                    lock = try_lock(path, f"{os.getpid()}\n")
-                except OSError as error:
-                    raise DirectoryNotWritable(
-                        self._directory, error.strerror
-                    ) from error
+                lock = try_lock(path)
                 if lock is not None:
                     self._held[number] = lock
         return len(self._held)
