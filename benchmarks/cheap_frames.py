@@ -84,7 +84,7 @@ def seconds_of(how: str, backend: str | None) -> tuple[float, float]:
         stderr=subprocess.DEVNULL,
         check=True,
     )
-    # What drew may have been killed when all was done, and counts once it is waited for.
+    # What drew was killed when all was done, and counts once it is waited for.
     with contextlib.suppress(ChildProcessError):
         while True:
             os.waitpid(-1, 0)
