@@ -117,7 +117,8 @@ def test_sixty_four_sub_environments(tmp_path: Path) -> None:
         gymnasium.make,
         "InvertedPendulum-v5",
         max_episode_steps=2,
-        **{"height": 16, "width": 16},
+        height=16,
+        width=16,
     )
     vector = SyncVectorEnv([make] * 64)
     with mjrec.Monitor(vector, tmp_path, workers=2, quality="draft") as env:
