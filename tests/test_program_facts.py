@@ -44,25 +44,15 @@ def test_a_program_is_asked_once(program: Path, cache: Path) -> None:
     assert len(asked) == 2
 
 
-@pytest.mark.parametrize("what", ["others may write", "garbage", "link", "no place"])
-def test_what_cannot_be_trusted_is_not_used(
+@pytest.mark.parametrize("what", ["garbage", "no place"])
+def test_what_cannot_be_read_is_asked_anew(
     what: str, program: Path, cache: Path
 ) -> None:
-    """The program is asked anew, and what stands there stays."""
+    """Whatever stands in its place."""
     asked: list[str] = []
     if what == "no place":
         cache.parents[1].write_text("a file")
     else:
         ask(program, asked)
-    if what == "others may write":
-        cache.chmod(0o666)
-    elif what == "garbage":
         cache.write_text("[1]")
-    elif what == "link":
-        cache.replace(cache.with_name("elsewhere"))
-        cache.symlink_to(cache.with_name("elsewhere"))
     assert ask(program, asked, "no") == "no"
-    if what == "others may write":
-        assert ': "no"' not in cache.read_text()
-    if what == "link":
-        assert cache.is_symlink()
