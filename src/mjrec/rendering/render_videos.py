@@ -18,13 +18,12 @@ from ..errors import InvalidArgument
 from ..formats.monitor_directory import iter_monitor_files, where_recordings_are
 from ..formats.spans import is_in_flight
 from ..formats.video_names import camera_part, name_part
-from ..machine import usable_cpus
+from ..machine import check_workers, usable_cpus
 from ..simulation.model_trust import trusting_models
 from .engine_jobs import do_on_engine
 from .finish import finish
 from .finisher import do_jobs
 from .jobs import Progress, RecordingKey, RenderedVideos, VideoJob, key_of
-from .pool import check_workers
 from .recordings import parts_of, recordings
 from .views import Variant, View
 
