@@ -18,10 +18,10 @@ from .ffmpeg import (
     every_frame_arguments,
     ffmpeg_executable,
     ffmpeg_version,
+    remembered,
     run_ffmpeg,
     video_encoders,
 )
-from .program_facts import remembered
 
 _DEFAULT_CODEC = "libx264"
 _WORST_CRF = 51.0
