@@ -116,7 +116,7 @@ import gymnasium, mjrec
 from conftest import Corridor
 import mjrec.formats.appending, mjrec.formats.row_log
 from mjrec.formats import video_file, video_metadata, video_sink
-from mjrec.recorder.run_journal import RunJournal
+from mjrec.formats.journal import JournalWriter
 
 def before(owner, name, when=lambda *_: True):
     known = getattr(owner, name)
@@ -142,12 +142,15 @@ second = lambda *arguments: "episode000001" in str(arguments) or "video000001" i
     [getattr(each, "path", each) for each in arguments]
 )
 if place == "before the journal's line":
-    before(RunJournal, "add", lambda _, entry: entry.episode_id == 1)
+    before(JournalWriter, "append", lambda _, entry: entry.episode_id == 1)
 elif place == "in the journal's line":
     written = os.write
     os.write = half_a_line
 elif place == "before the tail is written":
     before(mjrec.formats.row_log.RowLog, "write")
+elif place == "where no tail is mapped":
+    mjrec.formats.row_log._may_be_mapped = lambda _: False
+    before(JournalWriter, "append", lambda _, entry: entry.episode_id == 1)
 elif place == "before ffmpeg's end":
     before(video_file.Encoding, "finish", lambda e: second(e._file) and fed(e))
 elif place == "between ffmpeg's end and the names":
@@ -171,7 +174,7 @@ with mjrec.Monitor(
             monitor.step(monitor.action_space.sample() * 0 + (render == "live"))
 """
 DEFERRED = ("before the journal's line", "in the journal's line")
-DEFERRED += ("before the tail is written",)
+DEFERRED += ("before the tail is written", "where no tail is mapped")
 LIVE = (
     "before ffmpeg's end",
     "between ffmpeg's end and the names",
@@ -180,7 +183,7 @@ LIVE = (
 )
 
 
-@parametrize("place", [*DEFERRED, *LIVE], default=7)
+@parametrize("place", [*DEFERRED, *LIVE], default=8)
 def test_a_recorder_killed_between_two_things_loses_no_episode(
     place: str, tmp_path: Path
 ) -> None:
