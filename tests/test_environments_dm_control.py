@@ -285,10 +285,7 @@ def test_a_stream_is_what_the_suites_users_have(task: str) -> None:
     ours = named.environment
     for episode in range(3):
         seeds = episode_seeds(7, episode)
-        if episode:
-            first = named.next_episode(ours, seeds)
-        else:
-            first = named.begin_stream(ours, 7, seeds)
+        first = named.begin(ours, seeds, None if episode else 7)
         expected = theirs.reset().observation
         assert {k: v.tolist() for k, v in first.items()} == {
             k: v.tolist() for k, v in expected.items()
@@ -302,8 +299,8 @@ def test_a_stream_of_another_seed_is_begun_anew() -> None:
     fresh, used = (environment_from_name(name, options) for _ in range(2))
     used.environment.reset()
     seeds = episode_seeds(9, 0)
-    one = fresh.begin_stream(fresh.environment, 9, seeds)
-    other = used.begin_stream(used.environment, 9, seeds)
+    one = fresh.begin(fresh.environment, seeds, 9)
+    other = used.begin(used.environment, seeds, 9)
     assert one["orientation"].tolist() == other["orientation"].tolist()
 
 
