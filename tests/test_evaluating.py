@@ -182,13 +182,14 @@ class Wandering(Executor):
     def submit(
         self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any
     ) -> Future[Any]:
-        [message] = json.loads(json.dumps(args))
+        place, job = json.loads(json.dumps(args))
         if self.worker is None:
-            self.worker = EvaluationWorker(message["work"]["settings"])
+            work = json.loads(Path(place, "work.json").read_bytes())
+            self.worker = EvaluationWorker(work["settings"])
         future: Future[Any] = Future()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("XDG_STATE_HOME", str(self.homes / message["key"]))
-            future.set_result({"value": self.worker(message["arguments"])})
+            patch.setenv("XDG_STATE_HOME", str(self.homes / job["key"]))
+            future.set_result({"value": self.worker(job["arguments"])})
         return future
 
 

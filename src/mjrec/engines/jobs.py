@@ -277,10 +277,9 @@ def _new_place(shared: Path | None) -> Path:
             place = _TEMPORARY / f"mjrec-work-{name}"
         else:
             place = shared.absolute() / WORK_FOLDER / name
-            place.parent.mkdir(parents=True, exist_ok=True)
             _end_earlier_runs(place.parent)
         # Only its owner says what is run.
-        place.mkdir(mode=0o700)
+        place.mkdir(mode=0o700, parents=True)
     except OSError as error:
         raise DirectoryNotWritable(shared or _TEMPORARY, error.strerror) from error
     return place
