@@ -224,7 +224,7 @@ def picture_moment(drawn: Any) -> Callable[[Callable[[], None]], None] | None:
     ):
         return None
     # Loaded where there is a simulation, and so mujoco, already.
-    from ..simulation.replay import PreservedState
+    from ..simulation.states import PreservedState
 
     simulation = PreservedState()
 

@@ -21,7 +21,8 @@ from ..errors import EnvironmentNotMade, Error
 from ..formats.monitor_directory import Infix
 from ..messages import unpacked
 from ..rendering.engine_jobs import result_of
-from ..rendering.finish import bring_up_to_date, do_jobs
+from ..rendering.finish import bring_up_to_date
+from ..rendering.finisher import do_jobs
 from ..rendering.jobs import Progress, RecordingKey, RenderedVideos, VideoJob
 from ..simulation.model_trust import note_models
 from .choosing import write_choice

@@ -18,7 +18,7 @@ from typing import Any
 
 from ..engines.jobs import JobOutcome, Run, Work
 from ..simulation.model_trust import TRUST_VARIABLE, note_models, stored_models
-from .finish import Finisher, note_failure
+from .finisher import Finisher, note_failure
 from .jobs import Progress, RenderedVideos, VideoJob
 from .recordings import may_be_left
 

@@ -13,9 +13,8 @@ dm_control's compute them anew for the state that they are in, as all do in a re
 
 from __future__ import annotations
 
-import contextlib
 import copy
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import mujoco
@@ -24,15 +23,10 @@ from numpy.typing import NDArray
 
 from ..errors import InvalidArgument
 from ..formats.trajectory import columns_of
-from .captured_arrays import (
-    STATE_BITS,
-    STATE_SPEC,
-    drawn_readings,
-    read_state,
-    state_dtype,
-)
+from .captured_arrays import drawn_readings
 from .fields import apply_fields
 from .snapshot import SnapshotSource, layout_objection
+from .states import STATE_BITS, STATE_SPEC, read_state, state_columns, state_dtype
 
 # What a simulation with these keeps outside its state, so that no step follows from it.
 _BEYOND_STATE = ("mjENBL_SLEEP", "mjENBL_IPC")
@@ -40,78 +34,6 @@ _BEYOND_STATE = ("mjENBL_SLEEP", "mjENBL_IPC")
 # Geoms whose contacts move smoothly; others' are found by iterating, or choose among
 # corners.
 _SMOOTH = ("PLANE", "SPHERE", "CAPSULE")
-
-# What an environment moves or colours to show a goal or a touch.
-_SHOWING = (
-    *("site_pos", "site_quat", "site_size", "site_rgba"),
-    *("geom_pos", "geom_quat", "geom_size", "geom_rgba"),
-    *("body_pos", "body_quat", "mat_rgba"),
-)
-
-
-def state_columns(
-    model: mujoco.MjModel, parts: Mapping[str, slice]
-) -> NDArray[np.intp]:
-    """Return where in a recorded row the numbers of this MuJoCo's state stand.
-
-    Raises:
-        InvalidArgument: a component is unknown to this MuJoCo, or this model has
-            another number of it.
-    """
-    own = _lengths(columns_of(state_dtype(model)))
-    lengths = _lengths(parts)
-    if lengths == own:
-        return np.concatenate([np.r_[parts[name]] for name in own])
-    unknown = sorted(lengths.keys() - STATE_BITS.keys())
-    if unknown:
-        raise InvalidArgument(
-            f"The state holds {', '.join(unknown)}, which MuJoCo {mujoco.__version__} "
-            "does not know; use the MuJoCo version that recorded it, or a later one."
-        )
-    differences = [
-        f"{name}: {lengths.get(name, 0)}, and this model has {own.get(name, 0)}"
-        for name in STATE_BITS
-        if lengths.get(name, 0) != own.get(name, 0)
-    ]
-    raise InvalidArgument(
-        "The state is not one of this model. How many numbers it holds: "
-        f"{'; '.join(differences)}. Use the model that it was recorded with "
-        "(`trajectory.model()`)."
-    )
-
-
-def _lengths(parts: Mapping[str, slice]) -> dict[str, int]:
-    return {name: part.stop - part.start for name, part in parts.items()}
-
-
-def set_state(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    parts: Mapping[str, slice],
-    row: NDArray[np.float64],
-) -> None:
-    """Put a recorded state into `data`, whichever MuJoCo it was recorded by.
-
-    What follows from the state (positions of bodies, contacts) is not computed.
-    Nothing is set where anything does not fit.
-
-    Args:
-        model: the model of `data`.
-        data: what is set.
-        parts: where the parts of the state are in `row`.
-        row: the state, `(n,) float64`.
-
-    Raises:
-        InvalidArgument: the row is not a state of this model.
-    """
-    columns = state_columns(model, parts)
-    values = np.asarray(row, np.float64)
-    if values.ndim != 1 or len(values) < len(columns):
-        raise InvalidArgument(
-            f"A state of this model is {len(columns)} numbers, got an array of shape "
-            f"{values.shape}."
-        )
-    mujoco.mj_setState(model, data, values[columns], STATE_SPEC)
 
 
 class StateSteps:
@@ -355,37 +277,6 @@ def turns_by_rk4(model: mujoco.MjModel) -> bool:
     return bool(by_rk4 and np.isin(model.jnt_type, [int(k) for k in kinds]).any())
 
 
-class PreservedState:
-    """Puts a simulation back as it was before a block.
-
-    All of the data is put back, and of the model what places, sizes and colours sites,
-    geoms and bodies. The arrays stay where they are in memory.
-    """
-
-    def __init__(self) -> None:
-        self._model: mujoco.MjModel | None = None
-        self._scratch: mujoco.MjData | None = None
-
-    @contextlib.contextmanager
-    def around(self, model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[None]:
-        """Preserve `model` and `data` over the block, also if it raises.
-
-        Not reentrant.
-        """
-        if self._model is not model:
-            # Making one costs as much as a hundred copies.
-            self._scratch, self._model = mujoco.MjData(model), model
-        fields = [getattr(model, name) for name in _SHOWING]
-        before = [field.copy() for field in fields]
-        mujoco.mj_copyData(self._scratch, model, data)
-        try:
-            yield
-        finally:
-            mujoco.mj_copyData(data, model, self._scratch)
-            for field, values in zip(fields, before, strict=True):
-                field[...] = values
-
-
 def _check_snapshots(
     model: mujoco.MjModel, data: mujoco.MjData, kind: np.dtype[Any]
 ) -> None:
@@ -397,7 +288,6 @@ def _check_snapshots(
 def _input_numbers(model: mujoco.MjModel) -> NDArray[np.bool_]:
     """Return which numbers of a state are inputs, in this MuJoCo's order."""
     user = int(mujoco.mjtState.mjSTATE_USER)
-    lengths = _lengths(columns_of(state_dtype(model)))
-    return np.concatenate(
-        [np.full(n, bool(STATE_BITS[name] & user)) for name, n in lengths.items()]
-    )
+    parts = columns_of(state_dtype(model)).items()
+    inputs = [np.full(p.stop - p.start, bool(STATE_BITS[n] & user)) for n, p in parts]
+    return np.concatenate(inputs)

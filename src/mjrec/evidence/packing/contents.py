@@ -38,11 +38,11 @@ from ...formats.monitor_directory import (
     where_recordings_are,
 )
 from ...formats.regular_files import regular_path
-from ...rendering.leftovers import Leftovers, leftovers_in
+from ...rendering.leftovers import leftovers_of
 from ...rendering.recorded_facts import open_for_rendering
 from ...rendering.recordings import look_at, recordings
 from ...results import iter_episodes
-from ...results.monitor_files import monitors_of
+from ...results.monitor_files import MonitorFiles, monitors_of
 
 # In the key `mjrec` of a packed manifest: the episodes that were chosen for packing.
 PACKED_EPISODES = "packed_episodes"
@@ -146,11 +146,11 @@ def _check_nobody_writes(directory: Path) -> None:
 
 
 def _check_all_is_done(directory: Path) -> None:
-    closed = [each for each in leftovers_in(directory) if not each.is_open]
-    killed = [str(leftovers.infix) for leftovers in closed if leftovers.has_work]
+    closed = [files for files in monitors_of(directory) if not files.is_open]
+    killed = [each.infix for each in closed if leftovers_of(directory, each)]
     if killed:
         raise UnfinishedRecordings(directory, killed, advice=_RECOVER.format(directory))
-    strays = [name for leftovers in closed for name in _strays(leftovers)]
+    strays = [name for files in closed for name in _strays(files)]
     if strays:
         raise UnfinishedRecordings(directory, strays, advice=_STRAY)
     pending = [
@@ -162,9 +162,9 @@ def _check_all_is_done(directory: Path) -> None:
         raise UnfinishedRecordings(directory, pending, advice=_RENDER.format(directory))
 
 
-def _strays(leftovers: Leftovers) -> list[str]:
+def _strays(files: MonitorFiles) -> list[str]:
     """Return the names of files of a monitor that has no manifest."""
-    names = [path.name for path in leftovers.paths if not path.name.startswith(".")]
+    names = [path.name for path in files.paths if not path.name.startswith(".")]
     return [] if any(map(is_manifest, names)) else names
 
 
