@@ -587,6 +587,9 @@ def test_nothing_is_run_when_all_is_done(reference: Path, tmp_path: Path) -> Non
         ({"episodes": 1}, "episodes was 2 and is now 1"),
         ({"num_seeds": 1}, r"seeds was \(0, 1\) and is now \(0,\)"),
         ({"keep": "all"}, "keep was 'none'"),
+        # Though they are the defaults.
+        ({"keep": "best,median,worst"}, "keep was 'none' and is now 'best,median"),
+        ({"episodes": 10, "keep": None, "protocol": "suite"}, "episodes was 2"),
         ({"protocol": "suite"}, "protocol"),
         ({"env_kwargs": {"reset_noise_scale": 0.1}}, "env_kwargs"),
     ],
@@ -725,6 +728,9 @@ def test_what_cannot_be_drawn_has_results_without_videos(
     assert not evaluation.failed
     assert len(evaluation.videos) == is_drawn
     assert not evaluation.pending
+    # Nor is any announced.
+    assert len(evaluation.selection["CartPole-v1"]) == is_drawn
+    assert len(read_results(tmp_path / "e").columns["CartPole-v1"].videos) == is_drawn
     said = [r.message for r in caplog.records if "no videos, only results" in r.message]
     assert len(said) == (not is_drawn)
 

@@ -72,7 +72,7 @@ def run_chunk(
     settings: dict[str, Any] = {"directory": str(directory)}
     if policy is not None:
         plan = dataclasses.replace(plan, policy="mine", is_object=True)
-        settings["policy"] = str(directory / "policy")
+        settings["payload"] = str(directory / "policy")
         directory.mkdir(exist_ok=True)
         (directory / "policy").write_bytes(cloudpickle.dumps(policy))
     task = plan.tasks[0].name

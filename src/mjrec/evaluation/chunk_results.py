@@ -48,6 +48,11 @@ class ChunkResults:
     deaths: Counter[Unit] = field(default_factory=Counter)
     is_drawn_live: bool = False
 
+    @property
+    def size(self) -> int:
+        """How much is done of it; episodes that killed their process count, too."""
+        return len(self.results) + self.deaths.total()
+
 
 def read_chunk(folder: Path, task: str) -> ChunkResults:
     """Return what is done of a chunk.

@@ -13,7 +13,6 @@ import contextlib
 import functools
 import logging
 import pickle
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -170,11 +169,6 @@ class Evaluator:
             kwargs=plan.env_kwargs,
         )
         named = environment_from_name(task, options)
-        if "mujoco" in sys.modules:
-            # Not at the top, because it loads MuJoCo, which not every task has.
-            from ..simulation.warnings import log_mujoco_warnings
-
-            log_mujoco_warnings()
         try:
             policy = self._make_policy(named.environment)
             choice = rendering_choice(None, named.scenes(), named.env_id)
@@ -298,6 +292,7 @@ class _ChunkRun:
             # speak of an action, or a reward, that is none.
             if isinstance(error, Error) and not isinstance(error, _OF_EPISODES):
                 raise
+            logger.warning("An episode failed. What was raised:", exc_info=True)
             monitor.recorder.note_error(error)
             monitor.recorder.note_event("failed", failed(_in_one_line(error)))
             self._renew()
