@@ -160,11 +160,6 @@ class StateRecorder:
         """How many snapshots were taken."""
         return 0 if self._span is None else self._span.frame_count
 
-    @property
-    def size(self) -> int:
-        """The bytes of its rows."""
-        return 0 if self._span is None else self._span.size
-
     def before_step(self, action: Any) -> None:
         """Note the action of the coming step, which the environment may overwrite."""
         if self.is_stopped or not self._has_actions:

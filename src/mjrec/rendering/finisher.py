@@ -18,7 +18,7 @@ from ..errors import (
     GLError,
     InvalidArgument,
 )
-from ..formats import render_failures
+from ..formats import video_metadata
 from ..formats.spans import drop_recording
 from ..formats.trajectory_file import finish_trajectory
 from .jobs import Progress, RenderedVideos, VideoJob, key_of
@@ -73,7 +73,7 @@ def note_failure(directory: Path, name: str, reason: str) -> None:
     """
     key = key_of(name)
     if name.endswith(".mp4") or (key is not None and key.is_clip):
-        render_failures.note_failure(directory / name, reason)
+        video_metadata.note_failure(directory / name, reason)
 
 
 class Finisher:
