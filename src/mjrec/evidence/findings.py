@@ -54,6 +54,8 @@ class Outcome(enum.StrEnum):
     WITHIN_TOLERANCE = "within tolerance"
     BELIEVED = "believed"
     DIFFERENT = "different"
+    # A remark about what was made again; it does not lower the verdict.
+    NOTED = "noted"
 
 
 class ExcuseKind(enum.StrEnum):
@@ -93,6 +95,7 @@ class Finding:
         count: how many `unit` it stands for.
         unit: what is counted: "episode", "step", "frame", "video", "file".
         figures: numbers by name, for JSON: `maximum`, `tolerance`, `psnr` ...
+        is_headline: it stands beside the verdict: gaps, episodes that are the same.
     """
 
     topic: Topic
@@ -103,10 +106,17 @@ class Finding:
     count: int = 1
     unit: str = "file"
     figures: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
+    is_headline: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """Return it as JSON has it."""
         return {**_fields(self), "figures": dict(self.figures)}
+
+    @classmethod
+    def from_json(cls, said: Mapping[str, Any]) -> Finding:
+        """Return the finding of which `as_json` made this."""
+        kinds = {"topic": Topic(said["topic"]), "outcome": Outcome(said["outcome"])}
+        return cls(**{**said, **kinds})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +148,12 @@ class Excuse:
     def as_json(self) -> dict[str, Any]:
         """Return it as JSON has it."""
         return {**_fields(self), "items": list(self.items)}
+
+    @classmethod
+    def from_json(cls, said: Mapping[str, Any]) -> Excuse:
+        """Return the excuse of which `as_json` made this."""
+        kinds = {"kind": ExcuseKind(said["kind"]), "items": tuple(said["items"])}
+        return cls(**{**said, **kinds})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +188,8 @@ class Verification:
             return Verdict.FAIL
         allowed = {excuse.name for excuse in self.excuses if excuse.allowed}
         is_whole = all(
-            finding.outcome is Outcome.MADE_AGAIN or finding.excuse in allowed
+            finding.outcome in (Outcome.MADE_AGAIN, Outcome.NOTED)
+            or finding.excuse in allowed
             for finding in self.findings
         )
         return Verdict.PASS if is_whole else Verdict.PARTLY
