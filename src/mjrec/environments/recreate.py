@@ -22,13 +22,16 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.envs import registration
+from numpy.typing import NDArray
 
+from ..formats.trajectory import columns_of
 from .gymnasium_scenes import drawn_part, set_own_camera
 from .names import DmControlName
 from .scenes import (
     class_name,
     generator_state,
     set_generator_state,
+    simulation_below,
 )
 
 # Where the registry's entry points of what is trusted without asking lie.
@@ -115,6 +118,42 @@ class Recreated:
     def seed(self, seed: int) -> None:
         """Seed dm_control's generator; Gymnasium's is seeded by the reset."""
         self._dm_generator().seed(seed)
+
+    def seed_behind(self, state: Any) -> int | None:
+        """Return the seed that a generator was just made with; None for none.
+
+        Of dm_control's: NumPy's legacy generator has its seed as its first word.
+        """
+        key = state.get("state", {}).get("key") if isinstance(state, Mapping) else None
+        if not self.is_dm_env or not isinstance(key, list) or not key:
+            return None
+        seed = key[0]
+        if type(seed) is not int or not 0 <= seed < 2**32:
+            return None
+        fresh = generator_state(np.random.RandomState(seed))
+        return seed if fresh == state else None
+
+    def enter(self, state: NDArray[Any], observation: Any) -> Any:
+        """Put Gymnasium's simulation into a recorded state; return its observation.
+
+        Args:
+            state: a row of a trajectory's states.
+            observation: that it gave before.
+        """
+        # They load MuJoCo.
+        import mujoco
+
+        from ..simulation.replay import set_state
+
+        simulated = simulation_below(self.environment)
+        model, data = simulated.model, simulated.data
+        row = state.view(np.float64).reshape(-1)
+        set_state(model, data, columns_of(state.dtype), row)
+        mujoco.mj_forward(model, data)
+        # That may have changed the warm start.
+        set_state(model, data, columns_of(state.dtype), row)
+        observe = getattr(self.environment.unwrapped, "_get_obs", None)
+        return observation if observe is None else observe()
 
     def _dm_generator(self) -> Any:
         from .dm_control_scenes import generator_of

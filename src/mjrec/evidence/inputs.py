@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from .. import json_text
 
 INPUTS_FILE: Final = "inputs.json"
-ACTIONS_FILE: Final = "actions.npz"
+ARRAYS_FILE: Final = "arrays.npz"
 
 # Of the options in a journal, with the types that they may have.
 OPTIONS: Final[Mapping[str, tuple[type, ...]]] = {
@@ -54,8 +54,11 @@ class EpisodeInputs:
         options: given to the reset.
         random_state: of the environment's generators just before the reset, as the
             archive has it. It is used only where no seed leads to it.
+        first_state: the name of the array with the state after the reset. It is used
+            only where neither a seed nor a random state leads there.
         steps: how many were taken.
-        actions: the name of the array of actions; None where they were not kept.
+        actions: the name of the array of actions, be they in it or irregular; None
+            where they were not kept.
         dtypes: from which step on they were given as which dtype.
         parts: name and shape of the arrays of a dictionary; None for plain arrays.
         irregular: `step`, `value` and, of an array, `dtype` of those that fit into no
@@ -77,6 +80,7 @@ class EpisodeInputs:
     seed: Any = None
     options: Any = None
     random_state: Any = None
+    first_state: str | None = None
     steps: int = 0
     actions: str | None = None
     dtypes: Sequence[tuple[int, str]] = ()
@@ -99,16 +103,20 @@ class RecordingInputs:
     Attributes:
         infix: what the names of its files have in the middle.
         env_id: the environment's name in the recordings.
+        sources: the name of the file with what the author's MJCF model was made from;
+            None of other environments.
         environment: `framework`, `id`, `kwargs`, `wrappers`, `wrapper_arguments` and
             `max_episode_steps`; None where the journal does not say.
         options: of the recorder, those that are not the default; see `OPTIONS`.
         schedule: the name of the schedule.
         rule: the name of the rule of `keep`; None where there is none.
         first_episode_id: the number of its first episode.
+        kept: the episodes that the rule has chosen in the end.
         clip_starts: the numbers of steps at which clips were begun by a trigger.
         episodes: in their order.
         evaluation_keep: what the choice among all recordings of an evaluation said.
         surroundings: the provenance, a statement; None where it was not known.
+        surroundings_after: how many episodes were completed when it became known.
         was_killed: another process has put the recording in order.
         is_closed: it was closed by its monitor.
     """
@@ -116,14 +124,17 @@ class RecordingInputs:
     infix: str
     env_id: str
     environment: Mapping[str, Any] | None
+    sources: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     schedule: str | None = None
     rule: str | None = None
     first_episode_id: int = 0
+    kept: Sequence[int] = ()
     clip_starts: Sequence[int] = ()
     episodes: Sequence[EpisodeInputs] = ()
     evaluation_keep: Mapping[str, Any] | None = None
     surroundings: Mapping[str, Any] | None = None
+    surroundings_after: int = 0
     was_killed: bool = False
     is_closed: bool = False
 
@@ -159,16 +170,16 @@ class Inputs:
         }
         return {name: said for name, said in {**found, "pack": packing}.items() if said}
 
-    def write(self, folder: Path, actions: Mapping[str, NDArray[Any]]) -> None:
+    def write(self, folder: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Write the inputs into a folder, for another process.
 
         Args:
             folder: an empty one.
-            actions: the arrays that the episodes name.
+            arrays: that the episodes name.
         """
         text = json_text.dumps(dataclasses.asdict(self))
         (folder / INPUTS_FILE).write_text(text)
-        np.savez(folder / ACTIONS_FILE, **actions)  # type: ignore[arg-type]  # its stub takes no mapping
+        np.savez(folder / ARRAYS_FILE, **arrays)  # type: ignore[arg-type]  # its stub takes no mapping
 
     @classmethod
     def read(cls, folder: Path) -> Inputs:

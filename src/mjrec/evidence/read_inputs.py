@@ -7,6 +7,7 @@ It is done in a sandbox: what is read are journals and HDF5 files.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from ..results.monitor_files import MonitorFiles, monitors_of
 from .inputs import OPTIONS, EpisodeInputs, Inputs, RecordingInputs
 from .layout import ENVIRONMENT, RECORDINGS
 
+_SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 _MOST_EPISODES = 1_000_000
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
@@ -42,10 +44,10 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
     Raises:
         NotReadable: a file is damaged, or says what cannot be.
     """
-    actions: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     try:
         recordings = [
-            _recording(files, actions) for files in monitors_of(data / RECORDINGS)
+            _recording(files, arrays) for files in monitors_of(data / RECORDINGS)
         ]
         packing = _packing(data / ENVIRONMENT)
     except UnreadableFile as error:
@@ -53,7 +55,7 @@ def read_inputs(data: Path) -> tuple[Inputs, dict[str, NDArray[Any]]]:
     except (TypeError, ValueError, KeyError) as error:
         raise NotReadable(str(error)) from error
     return Inputs(recordings=tuple(sorted(recordings, key=_begun)), packing=packing), (
-        actions
+        arrays
     )
 
 
@@ -70,9 +72,7 @@ def _packing(path: Path) -> Mapping[str, Any]:
     return said if isinstance(said, Mapping) else {}
 
 
-def _recording(
-    files: MonitorFiles, actions: dict[str, NDArray[Any]]
-) -> RecordingInputs:
+def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:
     if Infix.parse(files.infix) is None:
         raise NotReadable(f"{files.infix!r} is no name that a monitor has")
     journal = _Journal(files.journal)
@@ -83,14 +83,17 @@ def _recording(
         infix=files.infix,
         env_id=str(env_info.get("env_id")) if isinstance(env_info, Mapping) else "",
         environment=environment if isinstance(environment, Mapping) else None,
+        sources=_sources(files, environment),
         options=_options(run.get("options")),
         schedule=_text(run.get("schedule")),
         rule=_text(keep.get("rule")) if isinstance(keep, Mapping) else None,
         first_episode_id=_count(run.get("first_episode_id", 0)),
+        kept=journal.kept,
         clip_starts=tuple(sorted(journal.clip_starts())),
-        episodes=tuple(_episodes(files, journal, actions)),
+        episodes=tuple(_episodes(files, journal, arrays)),
         evaluation_keep=journal.evaluation_keep,
         surroundings=journal.surroundings,
+        surroundings_after=journal.surroundings_after,
         was_killed=journal.was_killed,
         is_closed=journal.is_closed,
     )
@@ -106,11 +109,13 @@ class _Journal:
     def __init__(self, path: Path | None) -> None:
         self.run: Mapping[str, Any] = {}
         self.surroundings: Mapping[str, Any] | None = None
+        self.surroundings_after = 0
         self.entries: dict[int, JournalEntry] = {}
         self.cuts: dict[int, Mapping[str, Any]] = {}
         self.irregular: dict[int, list[Mapping[str, Any]]] = {}
         self.clips: list[Mapping[str, Any]] = []
         self.evaluation_keep: Mapping[str, Any] | None = None
+        self.kept: tuple[int, ...] = ()
         self.was_killed = self.is_closed = False
         if path is None:
             return
@@ -133,6 +138,7 @@ class _Journal:
                 self.run = facts
             case "surroundings", dict():
                 self.surroundings = facts
+                self.surroundings_after = len(self.entries)
             case "cut", {"episode_id": int(number)}:
                 self.cuts[number] = facts
             case "action", {"episode_id": int(number), "step": int()}:
@@ -141,6 +147,8 @@ class _Journal:
                 self.clips.append(facts)
             case "keep", {"scope": "evaluation"}:
                 self.evaluation_keep = facts
+            case "keep", {"recorded": list(numbers)}:
+                self.kept = tuple(map(_count, numbers))
             case "recovered", _:
                 self.was_killed = True
             case "closed", _:
@@ -150,7 +158,7 @@ class _Journal:
 
 
 def _episodes(
-    files: MonitorFiles, journal: _Journal, actions: dict[str, NDArray[Any]]
+    files: MonitorFiles, journal: _Journal, arrays: dict[str, NDArray[Any]]
 ) -> Iterator[EpisodeInputs]:
     for number in sorted({*journal.entries, *journal.cuts}):
         entry, cut = journal.entries.get(number), journal.cuts.get(number)
@@ -161,7 +169,7 @@ def _episodes(
                 files.trajectories[number],
                 name=f"{files.infix}.{number}",
                 irregular=journal.irregular.get(number, []),
-                actions=actions,
+                arrays=arrays,
             )
         if entry is not None:
             episode = _with_entry(episode, entry)
@@ -203,13 +211,18 @@ def _with_trajectory(
     *,
     name: str,
     irregular: list[Mapping[str, Any]],
-    actions: dict[str, NDArray[Any]],
+    arrays: dict[str, NDArray[Any]],
 ) -> EpisodeInputs:
     with open_hdf5(path) as reader:
         facts, steps = reader.facts, reader.step_count
         given = reader.actions(0, steps)
+        first = None
+        if facts.get("seed") is None and facts.get("random_state") is None:
+            first = reader.read("state", 0, 1) if reader.kind("state") else None
     if given is not None:
-        actions[name] = given
+        arrays[name] = given
+    if first is not None:
+        arrays[f"{name}.state"] = first
     parts = facts.get("action_parts")
     exception = facts.get("exception")
     # Where no action fits into an array, each of them is in the journal.
@@ -220,6 +233,7 @@ def _with_trajectory(
         seed=facts.get("seed"),
         options=facts.get("options"),
         random_state=facts.get("random_state"),
+        first_state=None if first is None else f"{name}.state",
         steps=steps,
         actions=name if is_whole else None,
         dtypes=tuple(_dtypes(facts.get("action_dtypes"))),
@@ -230,6 +244,16 @@ def _with_trajectory(
         start_time=_time(facts.get("start_time")),
         end_time=_time(facts.get("end_time")),
     )
+
+
+def _sources(files: MonitorFiles, environment: Any) -> str | None:
+    is_mjcf = isinstance(environment, Mapping) and environment["framework"] == "mjcf"
+    if not is_mjcf or not files.trajectories:
+        return None
+    with open_hdf5(files.trajectories[min(files.trajectories)]) as reader:
+        model = reader.facts.get("model")
+    name = model.get("xml") if isinstance(model, Mapping) else None
+    return name if isinstance(name, str) and _SOURCES.fullmatch(name) else None
 
 
 def _options(said: Any) -> dict[str, Any]:

@@ -66,12 +66,14 @@ class Statements:
         infix: what the names of its files have in the middle; nobody has claimed it.
         first_episode_id: the number of its first episode.
         surroundings: its provenance; None where that was not known.
+        surroundings_after: how many episodes were completed before it was.
         clock: returns the time, in seconds since the epoch.
     """
 
     infix: Infix
     first_episode_id: int
     surroundings: Mapping[str, Any] | None
+    surroundings_after: int
     clock: Callable[[], float]
 
 

@@ -115,8 +115,9 @@ class RunJournal:
         self._writer.close()
 
     def _found(self, *, wait: bool) -> Mapping[str, Any] | None:
-        if self._statements is not None:
-            return self._statements.surroundings
+        if (stated := self._statements) is not None:
+            is_time = wait or self.run.count >= stated.surroundings_after
+            return stated.surroundings if is_time else None
         found = None if self._looking is None else self._looking.found(wait=wait)
         return None if found is None else {**found, **self._policy}
 
