@@ -17,7 +17,6 @@ The last part ends as an episode's trajectory does, with `complete`; those befor
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -188,7 +187,7 @@ class _Clip:
             part.end_frames(start.refusal)
             return
         coming = self._new_part(start)
-        part.note(continues=True, end_time=time.time())
+        part.note(continues=True, end_time=self._run.clock())
         part.end({})
         if part.broken_reason is None:
             self._part = coming
@@ -220,7 +219,7 @@ class _Clip:
             if self._part is not None:
                 known["last_episode_id"] = self._last_episode_id
                 # It may have been said before that it goes on.
-                self._part.note(**known, end_time=time.time())
+                self._part.note(**known, end_time=self._run.clock())
                 self._part.end({})
         finally:
             self._list()

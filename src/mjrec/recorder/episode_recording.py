@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -198,7 +197,9 @@ class EpisodeRecording:
         known = {**facts, "length": stats.steps, "reward": stats.rewards}
         try:
             if self._states is not None:
-                said = {"length": self._states.steps, "end_time": time.time()}
+                is_complete = facts["complete"]
+                ended = stats.timestamps[-1] if is_complete else self._run.clock()
+                said = {"length": self._states.steps, "end_time": ended}
                 verdict = self._verdict(standing, selection)
                 self._states.end({**known, **verdict, **said})
         finally:

@@ -143,6 +143,7 @@ class MonitoredRun:
         subject, options, stats, journal, finisher, trackers, selection: as given.
         directory: the monitor directory.
         infix: what its files have in the middle.
+        clock: returns the time, in seconds since the epoch.
         logs: of the episodes' rows.
         clip_logs: of the clips'.
         action, row_words: what the next recording may use again of the last one.
@@ -164,6 +165,7 @@ class MonitoredRun:
         self.infix: Infix = place.infix
         self.subject = subject
         self.options = options
+        self.clock = options.clock
         self.stats = stats
         self.journal = journal
         self.finisher = finisher

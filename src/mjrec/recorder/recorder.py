@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -121,6 +120,7 @@ class Recorder:
         self.fast: FastPath | None = None
         self.evaluation_facts: Callable[[], Mapping[str, Any] | None] = lambda: None
 
+        self._clock = options.clock
         selection = self._choice.selection
         keep = None if selection is None else selection.facts()
         self._place = open_directory(
@@ -134,7 +134,10 @@ class Recorder:
                 "keep": keep,
                 "versions": dict(versions()),
                 "views": [*subject.further_views],
+                "environment": subject.environment,
+                "options": {**options.recorded(), **subject.view},
             },
+            statements=options.statements,
         )
         infix = self._place.infix
         self._next_episode_id = self._place.first_episode_id
@@ -150,6 +153,7 @@ class Recorder:
             allow_early_reset=options.allow_early_reset,
         )
         self.stats_recorder.type = type_of_mode(options.mode)
+        self.stats_recorder.clock = self._clock
         self._journal = RunJournal(
             self.directory / journal_name(infix),
             facts=self._place.run,
@@ -247,10 +251,11 @@ class Recorder:
         """
         self.check_process()
         self.fast = None
-        self.stats_recorder.before_reset(after_error=self._ending is not None)
+        now = self._clock()
+        self.stats_recorder.before_reset(after_error=self._ending is not None, now=now)
         if not self._is_unbegun():
             self._take_last_frame()
-        self._reset_time = time.time()
+        self._reset_time = now
         self._random_state = None
         if self._choice.may_keep_trajectory(self.stats_recorder.type):
             self._random_state = self._subject.random_state()

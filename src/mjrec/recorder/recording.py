@@ -139,10 +139,14 @@ class Recording:
             return
         if self._span is None and action is not None:
             self._action = self._array_for(action)
-        if self._action is not None and not self._action.set(action):
+        if self._action is None and action is None:
+            # A clip's: what was done is in the episode's.
+            return
+        if self._action is None or not self._action.set(action):
             self._note_irregular("actions")
             where = {"episode_id": self._run.episode.episode_id, "step": self.steps}
-            self._run.journal.note("action", {**where, "value": action})
+            given = {"dtype": action.dtype.name} if hasattr(action, "dtype") else {}
+            self._run.journal.note("action", {**where, **given, "value": action})
 
     def step(
         self,

@@ -46,7 +46,8 @@ class RunJournal:
         # The running one.
         self._episode_id: int | None = None
         self._policy = _policy_facts(options)
-        self._surroundings = look_around()
+        self._statements = options.statements
+        self._looking = None if options.statements else look_around()
 
     def begin(self, episode_id: int) -> None:
         """Take note of an episode that begins: faults are its own from here on."""
@@ -79,9 +80,9 @@ class RunJournal:
             wait: wait for it a little.
         """
         if self.run.surroundings is None:
-            found = self._surroundings.found(wait=wait)
+            found = self._found(wait=wait)
             if found is not None:
-                self.note("surroundings", {**found, **self._policy})
+                self.note("surroundings", found)
 
     def tolerates(
         self, what: What, error: BaseException, *, of_episode: bool = True
@@ -112,6 +113,13 @@ class RunJournal:
     def close(self) -> None:
         """Let go of the file; idempotent."""
         self._writer.close()
+
+    def _found(self, *, wait: bool) -> Mapping[str, Any] | None:
+        if (stated := self._statements) is not None:
+            is_time = wait or self.run.count >= stated.surroundings_after
+            return stated.surroundings if is_time else None
+        found = None if self._looking is None else self._looking.found(wait=wait)
+        return None if found is None else {**found, **self._policy}
 
     def _write(self, write: Callable[[], None]) -> None:
         try:
