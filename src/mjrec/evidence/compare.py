@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
-from .. import json_text
 from ..atomic_files import file_sha256
 from ..errors import Error, UnreadableFile
 from ..formats.frame_hashes import frame_hash_path
@@ -43,10 +42,10 @@ from .differences import Aspect, Difference, Same, short
 from .excuses import Trial, believed, merged, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
 from .layout import CRATE, ENVIRONMENT, PAYLOAD, RECORDINGS, STATISTICS
+from .notes import read_notes
 from .videos_shown import read_metadata, remarks_on_video
 
-# Beside `data/` of a run that was made again.
-MAKER_NOTES: Final = "maker.json"
+# Beside `data/` of a run that was made again: the frames that were drawn.
 SAMPLED: Final = "sampled"
 
 _TAGS: Final = ("bagit.txt", "bag-info.txt")
@@ -122,7 +121,7 @@ class Comparison:
         self._sampled = made / SAMPLED if sampled else None
         self._allow = tuple(allow)
         self._on_progress = on_progress
-        self._notes = _read_notes(made / MAKER_NOTES)
+        self._notes = read_notes(made)
         self._decoded: dict[str, str] = {}
         self._renamed: dict[str, str] = {}
         self.excuses: tuple[Excuse, ...] = ()
@@ -410,10 +409,6 @@ class _Sums:
 
 def _size(finding: Finding) -> float:
     return float(finding.figures.get("maximum", 0.0))
-
-
-def _read_notes(path: Path) -> list[Mapping[str, Any]]:
-    return json_text.loads(path.read_bytes()) if path.is_file() else []
 
 
 def _order(file: str) -> tuple[int, str]:

@@ -24,7 +24,6 @@ _LONGEST_LINE: Final = 1 << 24
 _LONGEST_FILE: Final = 1 << 28
 _SOFTWARE: Final = "SoftwareApplication"
 _EPISODE: Final = re.compile(rb'\{"episode_id": (\d{1,15}),')
-_PROVENANCE: Final = b'{"surroundings": '
 _ABSENT: Final = object()
 
 
@@ -172,36 +171,26 @@ def compare_journals(
     Raises:
         UnreadableFile: one is damaged.
     """
-    floating: list[list[bytes]] = [[], []]
     with unreadable(given), open_regular(given) as one, open_regular(made) as other:
-        streams = [
-            _lines(each, aside)
-            for each, aside in zip((one, other), floating, strict=True)
-        ]
-        for number, (a, b) in enumerate(itertools.zip_longest(*streams), start=1):
+        pairs = itertools.zip_longest(_lines(one), _lines(other))
+        for number, (a, b) in enumerate(pairs, start=1):
             if a is None or b is None:
-                which = [
-                    "no more" if each is None else f"line {number}" for each in (a, b)
-                ]
+                said = ["no more" if each is None else "a line" for each in (a, b)]
                 yield Difference(
-                    topic=Topic.REWARDS, file=file, given=which[0], made=which[1]
+                    topic=Topic.REWARDS,
+                    file=file,
+                    where=f"line {number}",
+                    given=said[0],
+                    made=said[1],
                 )
                 return
             yield from _compare_lines(number, rules.translated(a), b, file, rules)
-        if floating[0] != floating[1]:
-            yield Difference(
-                topic=Topic.FILES,
-                file=file,
-                where="surroundings",
-                given="one text",
-                made="another",
-            )
 
 
 def same_journal(path: Path, file: str) -> Iterator[Same]:
     """Yield the episodes of a journal that is equal to the other, byte for byte."""
     with unreadable(path), open_regular(path) as journal:
-        for line in _lines(journal, []):
+        for line in _lines(journal):
             if begin := _EPISODE.match(line):
                 number = int(begin[1])
                 yield Same(
@@ -345,12 +334,8 @@ def _or_bytes(found: Any, file: str) -> Iterator[Same | Difference]:
         )
 
 
-def _lines(file: BinaryIO, aside: list[bytes]) -> Iterator[bytes]:
-    """Yield the lines; the provenance, which comes when it is found, goes `aside`."""
+def _lines(file: BinaryIO) -> Iterator[bytes]:
     while line := file.readline(_LONGEST_LINE):
         if len(line) >= _LONGEST_LINE:
             raise ValueError("a line is too long")
-        if line.startswith(_PROVENANCE):
-            aside.append(line)
-        else:
-            yield line
+        yield line

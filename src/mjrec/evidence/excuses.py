@@ -14,11 +14,12 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from ..errors import InvalidArgument
 from .differences import Aspect, Difference, Place, Same
 from .findings import Excuse, ExcuseKind, Finding, Outcome, Topic
+from .notes import Note
 from .picture_similarity import OTHER_ENCODER, OTHER_RENDERER, Limits, Similarity
 
 _Allowed: TypeAlias = Mapping[Aspect, float | Limits]
@@ -313,16 +314,12 @@ class Trial:
         return None
 
 
-def believed(note: Mapping[str, Any]) -> tuple[Excuse, Finding | None]:
+def believed(note: Note) -> tuple[Excuse, Finding | None]:
     """Return what a note of the maker is: an excuse, and what is believed for it.
 
-    Args:
-        note: `item`, `excuse` (its name) and `reason`.
-
-    Returns:
-        The finding is None where nothing is believed unless something differs.
+    The finding is None where nothing is believed unless something differs.
     """
-    name, item, reason = (str(note[key]) for key in ("excuse", "item", "reason"))
+    name, item, reason = note.excuse, note.item, note.reason
     rule = _BY_NAME.get(name)
     if rule is not None and not rule.is_fed:
         return excuse_of(name, reason, "", item), None
@@ -335,7 +332,8 @@ def believed(note: Mapping[str, Any]) -> tuple[Excuse, Finding | None]:
         outcome=Outcome.BELIEVED,
         reason=reason,
         excuse=name,
-        unit=item.partition(" ")[0],
+        count=note.count,
+        unit=note.unit,
     )
     return excuse, finding
 
