@@ -81,6 +81,7 @@ _TOPICS: Final = {
     "hashes": Topic.PICTURES,
     "text": Topic.PICTURES,
 }
+_OF_MANIFEST: Final = (Topic.SELECTION, Topic.IDENTITY)
 _MOST_FAILURES: Final = 100
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
 # Four numbers; the last is the version. A model of 1 GiB is beyond any.
@@ -238,7 +239,8 @@ class Comparison:
                     self._given / file, self._made / file, file
                 )
             case "manifest":
-                yield Same(topic=Topic.SELECTION, file=file, unit="recording")
+                for topic in _OF_MANIFEST:
+                    yield Same(topic=topic, file=file, unit="recording")
         yield Same(topic=Topic.FILES, file=file)
 
     def _compare_kind(self, given: Path, made: Path, file: str, kind: str) -> _Found:
@@ -261,9 +263,9 @@ class Comparison:
                 yield from compare_frame_hashes(given, made, file)
             case "model":
                 yield from _compare_models(given, made, file)
-            case "manifest" if self._level is not Level.PIXELS:
-                yield from self._compare_choices(given, made, file, rules)
-            case "manifest" | "statistics" | "metadata" | "text":
+            case "manifest":
+                yield from self._compare_manifests(given, made, file, rules)
+            case "statistics" | "metadata" | "text":
                 yield from compare_objects(given, made, file, rules)
             case _ if file == CRATE:
                 yield from compare_crates(given, made, file, rules)
@@ -279,26 +281,22 @@ class Comparison:
             case _:
                 yield Difference(topic=Topic.FILES, file=file, where="its bytes")
 
-    def _compare_choices(
+    def _compare_manifests(
         self, given: Path, made: Path, file: str, rules: Rules
     ) -> _Found:
-        """Compare manifests of which one was made without drawing."""
         compared = compare_objects(given, made, file, rules)
         found = [each for each in compared if isinstance(each, Difference)]
-        # That the lists of videos differ is none.
-        found = [each for each in found if each.aspect is not Aspect.STORED]
+        if self._level is not Level.PIXELS:
+            # What was not drawn has other lists of videos, and no more.
+            found = [each for each in found if each.aspect is not Aspect.STORED]
+            numbers = [_with_video(read_object(path)) for path in (given, made)]
+            if numbers[0] != numbers[1]:
+                found.append(_other_choice(*numbers, file))
         yield from found
-        numbers = [_with_video(read_object(path)) for path in (given, made)]
-        if numbers[0] != numbers[1]:
-            yield Difference(
-                topic=Topic.SELECTION,
-                file=file,
-                where="episodes with a video",
-                given=_listed(numbers[0] - numbers[1]) + " more",
-                made=_listed(numbers[1] - numbers[0]) + " more",
-            )
-        elif not any(each.aspect is Aspect.EXACT for each in found):
-            yield Same(topic=Topic.SELECTION, file=file, unit="recording")
+        for topic in _OF_MANIFEST:
+            exact = (each for each in found if each.aspect is not Aspect.CLAIM)
+            if not any(each.topic is topic for each in exact):
+                yield Same(topic=topic, file=file, unit="recording")
 
     def _rules(self, kind: str = "") -> Rules:
         left_out = _DRAWN_KEYS if self._level is not Level.PIXELS else frozenset()
@@ -486,6 +484,16 @@ def _with_video(manifest: Mapping[str, Any]) -> set[int]:
     numbers = {episode_of(name) for name in names}
     numbers |= {entry.get("episode_id") for entry in details.get("pending", ())}
     return {number for number in numbers if number is not None}
+
+
+def _other_choice(given: set[int], made: set[int], file: str) -> Difference:
+    return Difference(
+        topic=Topic.SELECTION,
+        file=file,
+        where="episodes with a video",
+        given=f"{_listed(given - made)} that nothing chose",
+        made=f"{_listed(made - given)} besides",
+    )
 
 
 def _listed(numbers: set[int]) -> str:
