@@ -40,6 +40,7 @@ def play_recording(
     arrays: Mapping[str, NDArray[Any]],
     trust: frozenset[str],
     mjcf: Path | None,
+    only_counted: bool,
     notes: Notes,
     on_steps: Callable[[int], object],
 ) -> None:
@@ -51,6 +52,8 @@ def play_recording(
         arrays: actions and first states by the names in the inputs.
         trust: ids of environments that may be made besides those of the registries.
         mjcf: the author's MJCF file, where it is one that was simulated.
+        only_counted: only rewards and ends are asked for: no states are kept but of
+            episodes with a video.
         notes: what could not be made again, and why.
         on_steps: called with a number of steps that were just taken.
 
@@ -67,7 +70,13 @@ def play_recording(
         mjcf=mjcf,
     )
     playing = _Playing(
-        recording, recreated, directory, arrays=arrays, notes=notes, on_steps=on_steps
+        recording,
+        recreated,
+        directory,
+        arrays=arrays,
+        only_counted=only_counted,
+        notes=notes,
+        on_steps=on_steps,
     )
     if not recording.was_killed:
         playing.run()
@@ -95,6 +104,7 @@ class _Playing:
         directory: Path,
         *,
         arrays: Mapping[str, NDArray[Any]],
+        only_counted: bool,
         notes: Notes,
         on_steps: Callable[[int], object],
     ) -> None:
@@ -107,8 +117,16 @@ class _Playing:
         self._now = 0.0
         # Of either framework.
         self._monitor: Any = monitor_again(
-            recording, recreated, directory, clock=lambda: self._now, notes=notes
+            recording,
+            recreated,
+            directory,
+            clock=self._clock,
+            only_counted=only_counted,
+            notes=notes,
         )
+
+    def _clock(self) -> float:
+        return self._now
 
     def run(self) -> None:
         """Play all episodes. Where the recording was killed, so is this process."""
