@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from .evaluation.comparing import compare as compare
     from .evaluation.evaluating import evaluate as evaluate
     from .evaluation.evaluation import Evaluation as Evaluation
-    from .evidence.packing import pack as pack
+    from .evidence.pack import pack as pack
     from .evidence.verification import Check as Check
     from .evidence.verification import Verification as Verification
     from .evidence.verifying import verify as verify
@@ -68,7 +68,7 @@ _NAMES = {
     "evaluation.comparing": "Comparison compare",
     "evaluation.evaluating": "evaluate",
     "evaluation.evaluation": "Evaluation",
-    "evidence.packing": "pack",
+    "evidence.pack": "pack",
     "evidence.verification": "Check Verification",
     "evidence.verifying": "verify",
     "formats.archive": "write_archive",

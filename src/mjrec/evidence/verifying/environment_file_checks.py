@@ -18,7 +18,7 @@ from .findings import Findings
 from .recorded_monitors import RecordedMonitor
 
 _OF_PICTURES = ("gl_vendor", "gl_renderer", "gl_version", "rendered_with")
-_PACKED_WITH = ("mjrec", "bagit", "python", "zlib")
+_PACKED_WITH = ("mjrec", "bagit", "python", "zlib", "options")
 _ABSENT = object()
 
 

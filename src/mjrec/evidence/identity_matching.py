@@ -5,7 +5,7 @@ What is matched how, in capitals or not:
 
 - URLs of repositories, addresses of mail and ORCIDs: anywhere.
 - Paths of homes and working directories: with everything that begins with them;
-  and whatever is called `/home/<name>` or `/Users/<name>`, whoever that is.
+  and all that is called `/home/<name>` or `/Users/<name>`.
 - Full names: their words in this order or with the last one first, joined by a space,
   a dot, a comma, a hyphen, an underline or nothing; the last word alone where it has
   six letters or more, between what is no letter.
@@ -14,20 +14,23 @@ What is matched how, in capitals or not:
   `CamelCase`.
 - Those with fewer, and those that are ordinary words here (`root`, `user`, `hopper`):
   only as a whole part of a path, before `@` of a name of a machine, or after it.
-  HalfCheetah has joints called `rootx`, and nobody is named by that.
+  HalfCheetah has joints called `rootx`, which are no account's.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import importlib.resources
 import re
 from collections.abc import Iterable, Iterator, Sequence
 
-import numpy as np
-
 from .identity import HOME_OF_ANYBODY, Identity
-from .ordinary_words import ORDINARY_WORDS
 
+_ORDINARY_WORDS = frozenset(
+    importlib.resources.files(__package__)
+    .joinpath("ordinary_words.txt")
+    .read_text("utf-8")
+    .split()
+)
 _SHORTEST_INSIDE_WORDS = 6
 _SHORTEST_WORD = 4
 _SHORTEST_PERSON_INSIDE_WORDS = 9
@@ -41,15 +44,13 @@ _MACHINE = r"[a-z0-9][\w.-]*"
 
 # Texts in what is no text: as long as what is believed there.
 _ASCII_RUN = re.compile(rb"[\x20-\x7e]{6,}")
-_UTF16_RUNS = (
-    (re.compile(rb"(?:[\x20-\x7e]\0){6,}"), "utf-16-le"),
-    (re.compile(rb"(?:\0[\x20-\x7e]){6,}"), "utf-16-be"),
-)
+_UTF16_RUNS = {
+    "utf-16-le": re.compile(rb"(?:[\x20-\x7e]\0){6,}"),
+    "utf-16-be": re.compile(rb"(?:\0[\x20-\x7e]){6,}"),
+}
 # In compressed data and in numbers any four letters occur by chance, in every few
 # hundred megabytes; inside so long a run of text they do not.
 _LONG_RUN = 12
-
-_PIECE = 1 << 22
 
 _ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
 
@@ -65,7 +66,13 @@ class IdentityMatcher:
         patterns = list(_patterns(identity))
         self._texts = _alternatives(patterns)
         self._names = _alternatives([*patterns, *_short_parts(identity)])
-        self._literals = _literals(identity)
+        self._literals = [
+            (text, text.encode(encoding, errors="replace"))
+            for texts in vars(identity).values()
+            for text in sorted(texts)
+            if not text.isascii() and len(text) > 1
+            for encoding in ("utf-8", *_UTF16_RUNS)
+        ]
 
     def replaced(self, text: str) -> str:
         """Return a text with placeholders: `<home>`, `<path>`, `<user>`, `<host>`."""
@@ -87,7 +94,7 @@ class IdentityMatcher:
         return _unique(match[0] for match in self._names.finditer(name))
 
     def found_in_bytes(self, content: bytes, *, by_chance: bool = False) -> list[str]:
-        r"""Return what is in bytes, be they a text, in UTF-8 or UTF-16, or hold some.
+        r"""Return what is in bytes, which are a text, in UTF-8 or UTF-16, or hold some.
 
         In what is no text, fewer than six letters count only in a line of a dozen
         characters and more: among numbers, and in what is compressed, they occur by
@@ -95,62 +102,33 @@ class IdentityMatcher:
 
         Args:
             content: anything.
-            by_chance: whether it is no text, even where it could be taken for one.
+            by_chance: whether it is compressed or numbers, which hold no UTF-16.
         """
-        found: list[str] = []
+        found = [text for text, data in self._literals if data in content]
         try:
             text = "" if by_chance else content.decode()
         except UnicodeDecodeError:
-            by_chance = True
-        if by_chance:
-            found += self._found_in_runs(_ASCII_RUN, content, "ascii")
+            text = ""
+        if text:
+            unescaped = _ESCAPED.sub(lambda match: chr(int(match[1], 16)), text)
+            found = [*self.found_in(text), *self.found_in(unescaped), *found]
         else:
-            found += self.found_in(text)
-            if "\\u" in text:
-                found += self.found_in(_ESCAPED.sub(_unescaped, text))
-        for runs, encoding in _UTF16_RUNS if _may_hold_utf16(content) else ():
+            found += self._found_in_runs(_ASCII_RUN, content, "ascii")
+        for encoding, runs in {} if by_chance else _UTF16_RUNS.items():
             found += self._found_in_runs(runs, content, encoding)
-        found += [literal for literal, data in self._literals if data in content]
         return _unique(found)
 
     def _found_in_runs(
         self, runs: re.Pattern[bytes], content: bytes, encoding: str
-    ) -> list[str]:
+    ) -> Iterator[str]:
         # In one text, because there are many.
         text = "\n".join(run.decode(encoding) for run in runs.findall(content))
-        return [
-            match[0]
-            for match in self._texts.finditer(text)
-            if len(match[0]) >= _SHORTEST_INSIDE_WORDS
-            or len(_line_of(match)) >= _LONG_RUN
-        ]
-
-
-def _may_hold_utf16(content: bytes) -> bool:
-    """Tell whether a few letters stand there with a null beside each.
-
-    Nearly no picture or number holds them, and this takes a tenth of the time of a
-    look for them one by one.
-    """
-    for start in range(0, len(content), _PIECE):
-        # Each piece reaches into the next one.
-        piece = np.frombuffer(content[start : start + _PIECE + 8], np.uint8)
-        is_null, is_letter = piece == 0, (piece >= 0x20) & (piece < 0x7F)
-        for first, second in ((is_letter, is_null), (is_null, is_letter)):
-            pair = first[:-1] & second[1:]
-            if (pair[:-4] & pair[2:-2] & pair[4:]).any():
-                return True
-    return False
-
-
-def _unescaped(match: re.Match[str]) -> str:
-    return chr(int(match[1], 16))
-
-
-def _line_of(match: re.Match[str]) -> str:
-    text = match.string
-    end = text.find("\n", match.end())
-    return text[text.rfind("\n", 0, match.start()) + 1 : end if end >= 0 else None]
+        for match in self._texts.finditer(text):
+            start = text.rfind("\n", 0, match.start()) + 1
+            end = text.find("\n", match.end())
+            run = (len(text) if end < 0 else end) - start
+            if len(match[0]) >= _SHORTEST_INSIDE_WORDS or run >= _LONG_RUN:
+                yield match[0]
 
 
 def _alternatives(patterns: Iterable[tuple[str, str]]) -> re.Pattern[str]:
@@ -172,23 +150,19 @@ def _patterns(identity: Identity) -> Iterator[tuple[str, str]]:
         yield "path", re.escape(remote)
     for address in _longest_first(identity.addresses):
         yield "user", rf"(?<!\w){re.escape(address)}(?!\w)"
-    kinds = dict.fromkeys(identity.homes, "home")
-    kinds.update((path, "path") for path in identity.directories if path not in kinds)
-    for path in _longest_first(kinds):
-        yield kinds[path], rf"(?<!\w){re.escape(path)}(?![\w-])"
+    for path in _longest_first(identity.homes | identity.directories):
+        kind = "home" if path in identity.homes else "path"
+        yield kind, rf"(?<!\w){re.escape(path)}(?![\w-])"
     yield "home", rf"(?<!\w){HOME_OF_ANYBODY}"
-    people = [
-        re.findall(r"[^\s._,-]+", name) for name in _longest_first(identity.people)
-    ]
-    people = [words for words in people if words]
-    for words in people:
+    people = [re.findall(r"[^\s._,-]+", n) for n in _longest_first(identity.people)]
+    for words in filter(None, people):
         yield "user", _of_person(words)
     for host in _longest_first(identity.hosts):
         yield "host", _of_name(host, rf"(?<=\w@){re.escape(host)}(?![\w-])")
     for user in _longest_first(identity.users):
         before_machine = rf"(?<![\w.+-]){re.escape(user)}(?=@{_MACHINE})"
         yield "user", _of_name(user, before_machine)
-    for *_, last in people:
+    for *_, last in filter(None, people):
         if _is_distinctive(last, _SHORTEST_INSIDE_WORDS):
             yield "user", f"{_NO_LETTER_BEFORE}{re.escape(last)}{_NO_LETTER_AFTER}"
 
@@ -220,31 +194,17 @@ def _short_parts(identity: Identity) -> Iterator[tuple[str, str]]:
     for placeholder, names in (("user", identity.users), ("host", identity.hosts)):
         for name in _longest_first(names):
             if _is_distinctive(name, 1):
-                escaped = re.escape(name)
-                yield placeholder, rf"(?<![^\W_]){escaped}(?![^\W_])"
+                yield placeholder, rf"(?<![^\W_]){re.escape(name)}(?![^\W_])"
 
 
 def _is_distinctive(name: str, length: int) -> bool:
     """Tell whether a name of at least `length` is no ordinary word, and no number."""
     has_letters = any(character.isalpha() for character in name)
-    return len(name) >= length and has_letters and name.lower() not in ORDINARY_WORDS
+    return len(name) >= length and has_letters and name.lower() not in _ORDINARY_WORDS
 
 
 def _longest_first(texts: Iterable[str]) -> list[str]:
     return sorted(texts, key=lambda text: (-len(text), text))
-
-
-def _literals(identity: Identity) -> list[tuple[str, bytes]]:
-    """Return what is not of ASCII, as bytes in every encoding."""
-    texts = (
-        text for f in dataclasses.fields(identity) for text in getattr(identity, f.name)
-    )
-    return [
-        (text, text.encode(encoding, errors="replace"))
-        for text in texts
-        if not text.isascii() and len(text) > 1
-        for encoding in ("utf-8", "utf-16-le", "utf-16-be")
-    ]
 
 
 def _unique(found: Iterable[str]) -> list[str]:
