@@ -39,7 +39,7 @@ def play_recording(
     *,
     arrays: Mapping[str, NDArray[Any]],
     trust: frozenset[str],
-    mjcf: Path | None,
+    mjcf: tuple[Path, Any] | None,
     only_counted: bool,
     notes: Notes,
     on_steps: Callable[[int], object],
@@ -51,7 +51,7 @@ def play_recording(
         directory: where others of the same run may be already.
         arrays: actions and first states by the names in the inputs.
         trust: ids of environments that may be made besides those of the registries.
-        mjcf: the author's MJCF file, where it is one that was simulated.
+        mjcf: the author's MJCF file and its model, where one was simulated.
         only_counted: only rewards and ends are asked for: no states are kept but of
             episodes with a video.
         notes: what could not be made again, and why.
