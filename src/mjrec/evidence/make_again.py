@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..environments.recreate import NotRecreated, Recreated, recreate
@@ -43,7 +44,7 @@ def play_recording(
     only_counted: bool,
     notes: Notes,
     on_steps: Callable[[int], object],
-) -> None:
+) -> Mapping[str, NDArray[np.float64]]:
     """Play a recording again into a monitor directory; its videos are pending then.
 
     Args:
@@ -56,6 +57,10 @@ def play_recording(
             episodes with a video.
         notes: what could not be made again, and why.
         on_steps: called with a number of steps that were just taken.
+
+    Returns:
+        The rewards of each episode that was played, by the name of its actions, where
+        only they are asked for.
 
     Raises:
         NotRecreated: its environment cannot be made here.
@@ -80,7 +85,7 @@ def play_recording(
     )
     if not recording.was_killed:
         playing.run()
-        return
+        return playing.rewards
     # What a kill leaves is left by a kill.
     child = os.fork()
     if child == 0:
@@ -92,6 +97,7 @@ def play_recording(
     if os.waitstatus_to_exitcode(status) != -signal.SIGKILL:
         raise NotRecreated("the recording that was killed could not be played")
     notes.all = list(read_notes(directory.parent))
+    return {}
 
 
 class _Playing:
@@ -114,7 +120,9 @@ class _Playing:
         self._arrays = arrays
         self._notes = notes
         self._on_steps = on_steps
+        self._only_counted = only_counted
         self._now = 0.0
+        self.rewards: dict[str, NDArray[np.float64]] = {}
         # Of either framework.
         self._monitor: Any = monitor_again(
             recording,
@@ -218,14 +226,18 @@ class _Playing:
     def _play(self, episode: EpisodeInputs) -> None:
         """Take the steps of an episode, until the environment ends it."""
         step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
-        counted = 0
+        counted, rewards = 0, []
         for action in given_actions(episode, self._arrays):
             result = step(action)
             counted += 1
+            if self._only_counted:
+                rewards.append(result.reward if is_dm_env else result[1])
             if counted % _STEPS_BETWEEN_COUNTS == 0:
                 self._on_steps(_STEPS_BETWEEN_COUNTS)
             if result.last() if is_dm_env else result[2] or result[3]:
                 break
+        if self._only_counted and episode.actions is not None:
+            self.rewards[episode.actions] = np.array(rewards, np.float64)
         self._on_steps(counted % _STEPS_BETWEEN_COUNTS)
 
     def _believe(self, episode: EpisodeInputs) -> None:

@@ -19,12 +19,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from numpy.typing import NDArray
+
 from ..errors import Error, UnreadableArchive
 from ..sandbox import enter
 from .findings import Level
 from .inputs import ARRAYS_FILE, Inputs
 from .layout import PAYLOAD, RECORDINGS
-from .notes import Notes
+from .notes import REWARDS_FILE, Notes
 
 MODULE: Final = "mjrec.evidence.stages"
 
@@ -120,6 +122,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     played.mkdir(parents=True)
     steps = sum(e.steps for each in inputs.recordings for e in each.episodes)
     taken = 0
+    rewards: dict[str, NDArray[Any]] = {}
 
     def count_steps(more: int) -> None:
         nonlocal taken
@@ -132,7 +135,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
                 mjcf = None
                 if recording.sources is not None:
                     mjcf = unpack_sources(folder / recording.sources, place)
-                play_recording(
+                rewards |= play_recording(
                     recording,
                     played,
                     arrays=arrays,
@@ -162,6 +165,8 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     if is_packed and any(played.iterdir()):
         pack_folder(played, made, packing_options(inputs.packing))
     (made / PAYLOAD / RECORDINGS).mkdir(parents=True, exist_ok=True)
+    if level is Level.STATS:
+        np.savez(made / REWARDS_FILE, **rewards)  # type: ignore[arg-type]  # its stub takes no mapping
     notes.write(made)
 
 
