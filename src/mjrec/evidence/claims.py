@@ -7,6 +7,9 @@ and where these differ is where a claim is.
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import glob
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -21,22 +24,25 @@ from .findings import Excuse
 from .layout import ENVIRONMENT, RECORDINGS
 
 _LONGEST_LINE: Final = 1 << 24
+_COMPILING: Final = ("mujoco", "machine")
 _GL: Final = ("gl_vendor", "gl_renderer", "gl_version")
 
 
 def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
     """Return the excuses that two runs claim; below both lie the recordings."""
     found: list[Excuse] = []
+    recordings = given / RECORDINGS
     # All trajectories of a recording come from one machine.
     looked_at = set()
-    for path in sorted((given / RECORDINGS).glob("openaigym.*")):
+    for path in sorted(recordings.glob("openaigym.*")):
         other = made / RECORDINGS / path.name
         infix = infix_of(path.name)
-        kind = infix, path.suffix == ".h5"
-        if infix is None or not other.is_file() or kind in looked_at:
+        if infix is None or not other.is_file():
             continue
         if path.suffix == ".h5":
-            looked_at.add(kind)
+            if infix in looked_at:
+                continue
+            looked_at.add(infix)
         try:
             found += _claims(path, other, f"recording {infix}")
         except (Error, OSError, ValueError):
@@ -46,7 +52,20 @@ def claimed_excuses(given: Path, made: Path) -> list[Excuse]:
     if all(path.is_file() for path in files):
         packed, here = (read_object(path).get("packed_with") for path in files)
         found += _versions(packed, here)
-    return found
+    return [_with_models(excuse, recordings) for excuse in found]
+
+
+def _with_models(excuse: Excuse, recordings: Path) -> Excuse:
+    """Return an excuse that reaches the compiled models of its recordings, too."""
+    if excuse.name not in _COMPILING:
+        return excuse
+    models: dict[str, None] = {}
+    for item in excuse.items:
+        infix = item.removeprefix("recording ")
+        for path in recordings.glob(f"openaigym.trajectory.{glob.escape(infix)}.*.h5"):
+            with contextlib.suppress(Error), open_trajectory(path) as reader:
+                models[str(_mapping(reader.facts.get("model")).get("mjb"))] = None
+    return dataclasses.replace(excuse, items=(*excuse.items, *models))
 
 
 def _claims(given: Path, made: Path, recording: str) -> Iterator[Excuse]:

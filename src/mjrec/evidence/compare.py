@@ -291,7 +291,7 @@ class Comparison:
             found = [each for each in found if each.aspect is not Aspect.STORED]
             numbers = [_with_video(read_object(path)) for path in (given, made)]
             if numbers[0] != numbers[1]:
-                found.append(_other_choice(*numbers, file))
+                found.append(_other_choice(numbers[0], numbers[1], file))
         yield from found
         for topic in _OF_MANIFEST:
             exact = (each for each in found if each.aspect is not Aspect.CLAIM)

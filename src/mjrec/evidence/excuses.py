@@ -234,8 +234,9 @@ class Trial:
         self._excuses = excuses
         self._scopes = [frozenset(excuse.items) for excuse in excuses]
         self._used: Counter[int] = Counter()
-        self._worst: dict[int, float] = {}
+        # By what is counted.
         self._equal: Counter[tuple[int, str]] = Counter()
+        self._other: Counter[tuple[int, str]] = Counter()
 
     def same(self, place: Same) -> bool:
         """Note what is equal; return whether that is no proof: it was fed in."""
@@ -253,9 +254,9 @@ class Trial:
             outcome = _outcome(excuse, found)
             if outcome is None:
                 continue
+            self._other[index, found.unit] += found.count
             if outcome is not Outcome.NOTED:
                 self._used[index] += found.count
-                self._worst[index] = max(self._worst.get(index, 0.0), found.size or 0.0)
             return _finding(found, outcome, excuse.name)
         return _finding(found, Outcome.DIFFERENT, None)
 
@@ -300,17 +301,16 @@ class Trial:
 
     def _refutation(self, index: int) -> str | None:
         """Return why the claimed difference is none; None where it may be one."""
-        excuse = self._excuses[index]
-        frames = self._equal[index, "frame"]
-        match excuse.name:
-            case "mujoco" if self._equal[index, "compiled model"]:
-                return "the compiled model was written by the same version"
-            case "gl" if _family(excuse.claimed) != _family(excuse.here) and frames:
-                if frames >= _MOST_EQUAL_FRAMES * (frames + self._used[index]):
-                    return f"{frames} frames are equal bit for bit"
-            case "ffmpeg" if self._used[index] and self._equal[index, "video"]:
-                equal = self._equal[index, "video"]
-                return f"{equal} videos are equal byte for byte, others are not"
+        excuse, equal = self._excuses[index], self._equal
+        frames, videos = equal[index, "frame"], equal[index, "video"]
+        if excuse.name == "mujoco" and equal[index, "compiled model"]:
+            return "the compiled model was written by the same version"
+        if excuse.name == "ffmpeg" and videos and self._other[index, "video"]:
+            return f"{videos} videos are equal byte for byte, others are not"
+        if excuse.name == "gl" and _family(excuse.claimed) != _family(excuse.here):
+            least = _MOST_EQUAL_FRAMES * (frames + self._other[index, "frame hash"])
+            if frames and frames >= least:
+                return f"{frames} frames are equal bit for bit"
         return None
 
 
