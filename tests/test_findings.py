@@ -6,9 +6,9 @@ from __future__ import annotations
 import json
 
 import pytest
+from verifications import excuse, finding, verification
 
 from mjrec.evidence.findings import Excuse, Finding, Level, Outcome, Topic, Verdict
-from verifications import excuse, finding, verification
 
 MADE, WITHIN = finding(), finding(Outcome.WITHIN_TOLERANCE, excuse="gl")
 BELIEVED = finding(Outcome.BELIEVED, reason="actions were not kept")

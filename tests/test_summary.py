@@ -7,11 +7,11 @@ import io
 
 import pytest
 import rich.console
+from verifications import HOSTILE, excuse, finding, verification
 
 from mjrec.commands.verification_screen import show_verification
 from mjrec.evidence import summary
 from mjrec.evidence.findings import Finding, Level, Outcome, Topic, Verification
-from verifications import HOSTILE, excuse, finding, verification
 
 
 def screen(made: Verification, **options: bool) -> str:

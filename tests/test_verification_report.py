@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from verifications import HOSTILE, excuse, finding, verification
 
 from mjrec.evidence.findings import Finding, Outcome, Topic
 from mjrec.evidence.verification_report import write_verification_report
-from verifications import HOSTILE, excuse, finding, verification
 
 
 def page(tmp_path: Path, *findings: Finding, **changes: Any) -> str:
