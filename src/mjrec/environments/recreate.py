@@ -166,7 +166,7 @@ def recreate(
     *,
     own_camera: int | str | None = None,
     trust: frozenset[str] = frozenset(),
-    mjcf: Path | None = None,
+    mjcf: tuple[Path, Any] | None = None,
 ) -> Recreated:
     """Return the environment of a recording.
 
@@ -176,7 +176,7 @@ def recreate(
             was made.
         trust: further ids that the reader has named, `Id` or `module:Id`. The module
             is the reader's word, never the recording's.
-        mjcf: the author's MJCF file, of an environment that is made from one.
+        mjcf: the author's MJCF file and its model, of an environment made from one.
 
     Raises:
         NotRecreated: the rule of trust forbids it, or it cannot be made here.
@@ -197,7 +197,7 @@ def recreate(
                 raise _wrappers_refused(said["wrappers"])
             return _dm_control(env_id, kwargs, limit)
         case "mjcf" if mjcf is not None:
-            env = _mjcf(mjcf, limit)
+            env = _mjcf(*mjcf, limit)
         case _:
             raise NotRecreated("what its model was made from is not in the archive")
     with _failures(env_id):
@@ -278,12 +278,12 @@ def _wrappers_refused(names: Any) -> NotRecreated:
     )
 
 
-def _mjcf(path: Path, limit: int | None) -> gymnasium.Env[Any, Any]:
+def _mjcf(path: Path, model: Any, limit: int | None) -> gymnasium.Env[Any, Any]:
     # It loads MuJoCo.
     from .mjcf_environments import MjcfEnvironment
 
     with _failures(path.stem):
-        env: gymnasium.Env[Any, Any] = MjcfEnvironment(path)
+        env: gymnasium.Env[Any, Any] = MjcfEnvironment(path, model=model)
         return env if limit is None else gymnasium.wrappers.TimeLimit(env, limit)
 
 

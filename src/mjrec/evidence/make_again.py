@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..environments.recreate import NotRecreated, Recreated, recreate
@@ -39,10 +40,11 @@ def play_recording(
     *,
     arrays: Mapping[str, NDArray[Any]],
     trust: frozenset[str],
-    mjcf: Path | None,
+    mjcf: tuple[Path, Any] | None,
+    only_counted: bool,
     notes: Notes,
     on_steps: Callable[[int], object],
-) -> None:
+) -> Mapping[str, NDArray[np.float64]]:
     """Play a recording again into a monitor directory; its videos are pending then.
 
     Args:
@@ -50,9 +52,15 @@ def play_recording(
         directory: where others of the same run may be already.
         arrays: actions and first states by the names in the inputs.
         trust: ids of environments that may be made besides those of the registries.
-        mjcf: the author's MJCF file, where it is one that was simulated.
+        mjcf: the author's MJCF file and its model, where one was simulated.
+        only_counted: only rewards and ends are asked for: no states are kept but of
+            episodes with a video.
         notes: what could not be made again, and why.
         on_steps: called with a number of steps that were just taken.
+
+    Returns:
+        The rewards of each episode that was played, by the name of its actions, where
+        only they are asked for.
 
     Raises:
         NotRecreated: its environment cannot be made here.
@@ -67,11 +75,17 @@ def play_recording(
         mjcf=mjcf,
     )
     playing = _Playing(
-        recording, recreated, directory, arrays=arrays, notes=notes, on_steps=on_steps
+        recording,
+        recreated,
+        directory,
+        arrays=arrays,
+        only_counted=only_counted,
+        notes=notes,
+        on_steps=on_steps,
     )
     if not recording.was_killed:
         playing.run()
-        return
+        return playing.rewards
     # What a kill leaves is left by a kill.
     child = os.fork()
     if child == 0:
@@ -83,6 +97,7 @@ def play_recording(
     if os.waitstatus_to_exitcode(status) != -signal.SIGKILL:
         raise NotRecreated("the recording that was killed could not be played")
     notes.all = list(read_notes(directory.parent))
+    return {}
 
 
 class _Playing:
@@ -95,6 +110,7 @@ class _Playing:
         directory: Path,
         *,
         arrays: Mapping[str, NDArray[Any]],
+        only_counted: bool,
         notes: Notes,
         on_steps: Callable[[int], object],
     ) -> None:
@@ -104,11 +120,21 @@ class _Playing:
         self._arrays = arrays
         self._notes = notes
         self._on_steps = on_steps
+        self._only_counted = only_counted
         self._now = 0.0
+        self.rewards: dict[str, NDArray[np.float64]] = {}
         # Of either framework.
         self._monitor: Any = monitor_again(
-            recording, recreated, directory, clock=lambda: self._now, notes=notes
+            recording,
+            recreated,
+            directory,
+            clock=self._clock,
+            only_counted=only_counted,
+            notes=notes,
         )
+
+    def _clock(self) -> float:
+        return self._now
 
     def run(self) -> None:
         """Play all episodes. Where the recording was killed, so is this process."""
@@ -200,14 +226,18 @@ class _Playing:
     def _play(self, episode: EpisodeInputs) -> None:
         """Take the steps of an episode, until the environment ends it."""
         step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
-        counted = 0
+        counted, rewards = 0, []
         for action in given_actions(episode, self._arrays):
             result = step(action)
             counted += 1
+            if self._only_counted:
+                rewards.append(result.reward if is_dm_env else result[1])
             if counted % _STEPS_BETWEEN_COUNTS == 0:
                 self._on_steps(_STEPS_BETWEEN_COUNTS)
             if result.last() if is_dm_env else result[2] or result[3]:
                 break
+        if self._only_counted and episode.actions is not None:
+            self.rewards[episode.actions] = np.array(rewards, np.float64)
         self._on_steps(counted % _STEPS_BETWEEN_COUNTS)
 
     def _believe(self, episode: EpisodeInputs) -> None:

@@ -14,6 +14,9 @@ from typing import Any, Final
 from .. import json_text
 
 NOTES_FILE: Final = "maker.json"
+# Beside it, where only rewards and ends were made again: the rewards of each step, by
+# "<infix>.<episode's number>".
+REWARDS_FILE: Final = "rewards.npz"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,8 @@ from ..formats.trajectory_hdf5 import open_hdf5
 from ..results.monitor_files import MonitorFiles, monitors_of
 from .inputs import OPTIONS, EpisodeInputs, Inputs, RecordingInputs
 from .layout import ENVIRONMENT, RECORDINGS
+from .packed_run import PackingOptions
+from .portable_names import portable_parts
 
 _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
 _MOST_EPISODES = 1_000_000
@@ -69,7 +71,24 @@ def _packing(path: Path) -> Mapping[str, Any]:
         return {}
     packed_with = read_object(path).get("packed_with")
     said = packed_with.get("options") if isinstance(packed_with, Mapping) else None
-    return said if isinstance(said, Mapping) else {}
+    if not isinstance(said, Mapping):
+        return {}
+    packing_options(said)
+    return said
+
+
+def packing_options(said: Mapping[str, Any]) -> PackingOptions:
+    """Return the options of packing that an archive says.
+
+    Raises:
+        ValueError, TypeError: they cannot be.
+    """
+    name, authors, episodes = said["name"], said["authors"], said["episodes"]
+    if not isinstance(name, str) or len(portable_parts(name)) != 1:
+        raise ValueError(f"an archive cannot be called {name!r:.80}")
+    if episodes is not None:
+        episodes = tuple(map(_count, episodes))
+    return PackingOptions(**{**said, "authors": tuple(authors), "episodes": episodes})
 
 
 def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> RecordingInputs:

@@ -36,6 +36,7 @@ def monitor_again(
     directory: Path,
     *,
     clock: Callable[[], float],
+    only_counted: bool,
     notes: Notes,
 ) -> EnvironmentMonitor:
     """Return a monitor that was asked for what the recording's was asked for.
@@ -45,6 +46,7 @@ def monitor_again(
         recreated: its environment.
         directory: where others of the same run may be already.
         clock: returns the time, in seconds since the epoch.
+        only_counted: only rewards and ends are asked for.
         notes: which choices were the author's, and are believed.
 
     Raises:
@@ -78,6 +80,7 @@ def monitor_again(
                 surroundings=recording.surroundings,
                 surroundings_after=recording.surroundings_after,
                 clock=clock,
+                only_counted=only_counted,
             ),
         )
         return _monitor_class(recreated)(

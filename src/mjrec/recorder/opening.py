@@ -68,6 +68,8 @@ class Statements:
         surroundings: its provenance; None where that was not known.
         surroundings_after: how many episodes were completed before it was.
         clock: returns the time, in seconds since the epoch.
+        only_counted: episodes without a video keep no trajectory: it is only asked
+            what rewards and ends there were.
     """
 
     infix: Infix
@@ -75,6 +77,7 @@ class Statements:
     surroundings: Mapping[str, Any] | None
     surroundings_after: int
     clock: Callable[[], float]
+    only_counted: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two trajectories, dataset by dataset and attribute by attribute.
+
+Rows are read in blocks, so that memory does not grow with an episode.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import UnreadableFile
+from ..formats.json_fields import json_object
+from ..formats.trajectory_hdf5 import open_hdf5
+from .compare_json import Rules, json_differences
+from .differences import Aspect, Difference, Same, short
+from .findings import Level, Topic
+
+_BLOCK_BYTES: Final = 1 << 22
+# `model_changes/<n>/<field>`.
+_DEEPEST: Final = 3
+
+# What the datasets tell about, and how their numbers may differ.
+_DATASETS: Final = {
+    "states": (Topic.PHYSICS, Aspect.STATE),
+    "snapshots": (Topic.PICTURES, Aspect.STATE),
+    "model_changes": (Topic.PHYSICS, Aspect.STATE),
+    "observations": (Topic.REWARDS, Aspect.DERIVED),
+    "rewards": (Topic.REWARDS, Aspect.DERIVED),
+    "terminated": (Topic.REWARDS, Aspect.EXACT),
+    "truncated": (Topic.REWARDS, Aspect.EXACT),
+    "frame_steps": (Topic.VIDEOS, Aspect.EXACT),
+    "actions": (Topic.PHYSICS, Aspect.EXACT),
+}
+_OF_PHYSICS: Final = ("states", "snapshots", "model_changes")
+_FACTS: Final = "facts"
+# It follows from the facts; reading a trajectory checks it.
+_CHECKSUM: Final = "crc32"
+
+
+def compare_trajectories(
+    given: Path, made: Path, file: str, rules: Rules, *, level: Level = Level.PIXELS
+) -> Iterator[Same | Difference]:
+    """Yield how two trajectories compare.
+
+    Args:
+        given: the archive's.
+        made: made again.
+        file: the name of both, below `data/`.
+        rules: of their facts.
+        level: below PHYSICS, states and what is drawn are not looked at.
+
+    Raises:
+        UnreadableFile: one is damaged.
+    """
+    differs = False
+    try:
+        # Whatever is no trajectory ends here.
+        open_hdf5(given).close()
+        with h5py.File(given, "r") as one, h5py.File(made, "r") as other:
+            for found in _compare_groups(one, other, file, rules, level):
+                differs |= isinstance(found, Difference)
+                yield found
+    except (AttributeError, LookupError, OSError, RuntimeError, ValueError) as error:
+        raise UnreadableFile(given, error) from error
+    if not differs and level.included[-1] is not Level.STATS:
+        yield Difference(
+            topic=Topic.FILES,
+            file=file,
+            aspect=Aspect.STORED,
+            where="its bytes",
+            given=_digest(given),
+            made=_digest(made),
+        )
+
+
+def same_trajectory(path: Path, file: str, level: Level) -> Iterator[Same]:
+    """Yield what a trajectory holds that is equal, byte for byte, to the other."""
+    with h5py.File(path, "r") as trajectory:
+        for name in trajectory:
+            if level is not Level.STATS or name not in _OF_PHYSICS:
+                yield from _same(name, trajectory[name], file)
+
+
+def _compare_groups(
+    one: h5py.File, other: h5py.File, file: str, rules: Rules, level: Level
+) -> Iterator[Same | Difference]:
+    named = [_objects(each) for each in (one, other)]
+    yield from _compare_attributes(one, other, file, rules)
+    for name in sorted(named[0] | named[1]):
+        dataset = name.partition("/")[0]
+        if level is Level.STATS and dataset in _OF_PHYSICS:
+            continue
+        topic, _ = _DATASETS.get(dataset, (Topic.FILES, Aspect.EXACT))
+        if name not in named[0] or name not in named[1]:
+            where = [f"{name} is there" if name in each else "none" for each in named]
+            # A model that another version or machine changes at other steps.
+            yield _difference(topic, file, name, *where)
+            continue
+        a, b = one[name], other[name]
+        yield from _compare_attributes(a, b, file, rules, name)
+        if isinstance(a, h5py.Dataset) and isinstance(b, h5py.Dataset):
+            yield from _compare_datasets(name, a, b, file)
+        elif type(a) is not type(b):
+            yield _difference(topic, file, name, type(a).__name__, type(b).__name__)
+
+
+def _objects(file: h5py.File) -> set[str]:
+    """Return the paths of all that is in a file, each a hard link of its own."""
+    found: set[str] = set()
+    open_groups = [""]
+    while open_groups:
+        path = open_groups.pop()
+        group = file[path] if path else file
+        for name in group:
+            inner = f"{path}/{name}" if path else name
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise ValueError(f"its {inner} leads elsewhere")
+            found.add(inner)
+            if group.get(name, getclass=True) is h5py.Group:
+                if inner.count("/") >= _DEEPEST:
+                    raise ValueError("its groups are nested too deeply")
+                open_groups.append(inner)
+    return found
+
+
+def _compare_attributes(
+    a: Any, b: Any, file: str, rules: Rules, name: str = ""
+) -> Iterator[Difference]:
+    where = f"{name}: attribute " if name else "attribute "
+    for key in sorted({*a.attrs, *b.attrs}):
+        if key not in a.attrs or key not in b.attrs:
+            values = ["one" if key in each.attrs else "none" for each in (a, b)]
+            yield _difference(Topic.FILES, file, f"{where}{key}", *values)
+            continue
+        left, right = (_raw_attribute(each, key) for each in (a, b))
+        if left == right or (key == _CHECKSUM and not name):
+            continue
+        if key == _FACTS and not name:
+            given = json_object(rules.translated(bytes(a.attrs[key])))
+            made = json_object(bytes(b.attrs[key]))
+            yield from json_differences(given, made, file, rules)
+        else:
+            yield _difference(
+                Topic.FILES, file, f"{where}{key}", short(left[-1]), short(right[-1])
+            )
+
+
+def _raw_attribute(owner: Any, key: str) -> tuple[Any, ...]:
+    identifier = owner.attrs.get_id(key)
+    if identifier.dtype.kind not in "Siuf":
+        raise ValueError(f"its attribute {key!r} is of another type")
+    value = np.asarray(owner.attrs[key])
+    return identifier.dtype.str, value.shape, value.tobytes()
+
+
+def _compare_datasets(
+    name: str, a: h5py.Dataset, b: h5py.Dataset, file: str
+) -> Iterator[Same | Difference]:
+    topic, aspect = _DATASETS.get(name.partition("/")[0], (Topic.FILES, Aspect.EXACT))
+    if a.is_virtual or a.external:
+        raise ValueError(f"its {name} is stored outside it")
+    kinds = [f"{each.dtype} of {each.shape}" for each in (a, b)]
+    if kinds[0] != kinds[1]:
+        yield _difference(topic, file, name, *map(short, kinds))
+        return
+    found = _Worst(name, topic, aspect, file)
+    rows = a.shape[0] if a.shape else 0
+    step = max(1, _BLOCK_BYTES // max(1, a.nbytes // rows)) if rows else 1
+    # A single value has no rows.
+    for start in range(0, max(rows, 1), step):
+        key = np.s_[start : start + step] if a.shape else ()
+        left, right = np.asarray(a[key]), np.asarray(b[key])
+        if left.tobytes() != right.tobytes():
+            found.add(start, left, right)
+    yield from found.differences(rows)
+    if not found.worst:
+        yield from _same(name, a, file)
+
+
+def _same(name: str, item: Any, file: str) -> Iterator[Same]:
+    """Yield what an equal dataset proves."""
+    if not isinstance(item, h5py.Dataset):
+        return
+    if name == "rewards":
+        yield Same(topic=Topic.REWARDS, file=file, unit="trajectory")
+    if name == "states" and item.shape[0] and item.dtype.names:
+        yield Same(topic=Topic.BEGINNING, file=file, unit="episode")
+        yield Same(topic=Topic.PHYSICS, file=file, count=item.shape[0] - 1, unit="step")
+
+
+class _Worst:
+    """The largest difference of each member of a dataset, the first row apart."""
+
+    def __init__(self, name: str, topic: Topic, aspect: Aspect, file: str) -> None:
+        self._name, self._topic, self._aspect, self._file = name, topic, aspect, file
+        self.worst: dict[tuple[str, bool], tuple[float, str, str, str, int]] = {}
+
+    def add(self, start: int, a: NDArray[Any], b: NDArray[Any]) -> None:
+        """Look at a block of rows that differs; its first row is number `start`."""
+        for member in a.dtype.names or ("",):
+            left, right = (each[member] if member else each for each in (a, b))
+            left, right = (
+                each.reshape(len(left) if a.ndim else 1, -1)
+                for each in (np.atleast_1d(left), np.atleast_1d(right))
+            )
+            is_other = _bits(left) != _bits(right)
+            for is_first in (True, False):
+                rows = slice(0, 1) if is_first else slice(1, None)
+                if start:
+                    rows = slice(None) if not is_first else slice(0, 0)
+                self._note(member, is_first, start, rows, left, right, is_other)
+
+    def _note(
+        self,
+        member: str,
+        is_first: bool,
+        start: int,
+        rows: slice,
+        left: NDArray[Any],
+        right: NDArray[Any],
+        is_other: NDArray[np.bool_],
+    ) -> None:
+        here = is_other[rows]
+        if not here.any():
+            return
+        errors = np.where(here, _errors(left[rows], right[rows]), -1.0)
+        row, column = map(int, np.unravel_index(np.argmax(errors), errors.shape))
+        size, count = float(errors[row, column]), int(here.any(axis=1).sum())
+        known = self.worst.get((member, is_first))
+        number = row + (rows.start or 0)
+        name = f"{self._name}[{start + number}]" + (f".{member}" if member else "")
+        values = short(left[number, column].item()), short(right[number, column].item())
+        if known is not None:
+            count += known[4]
+        if known is None or size > known[0]:
+            known = (size, name, *values, 0)
+        self.worst[member, is_first] = (*known[:4], count)
+
+    def differences(self, rows: int) -> Iterator[Difference]:
+        """Yield one for each member that differs."""
+        for (member, is_first), found in self.worst.items():
+            size, where, given, made, count = found
+            topic, aspect = self._topic, self._aspect
+            if is_first and self._name in ("states", "observations"):
+                topic = Topic.BEGINNING
+            if member == "warmstart":
+                aspect = Aspect.SOLVER
+            yield Difference(
+                topic=topic,
+                file=self._file,
+                count=count,
+                unit="step",
+                aspect=aspect if np.isfinite(size) else Aspect.EXACT,
+                where=where,
+                given=given,
+                made=made,
+                size=size if np.isfinite(size) else None,
+                figures={"rows": rows, "differing": count},
+            )
+
+
+def _errors(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.float64]:
+    """Return `abs(x - y) / (1 + abs(x))`; infinite for what is no matter of degree."""
+    if left.dtype.kind != "f":
+        return np.full(left.shape, np.inf)
+    with np.errstate(all="ignore"):
+        x, y = left.astype(np.float64), right.astype(np.float64)
+        errors = np.abs(x - y) / (1 + np.abs(x))
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def _bits(values: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}")
+
+
+def _difference(
+    topic: Topic, file: str, where: str, given: str, made: str
+) -> Difference:
+    return Difference(topic=topic, file=file, where=where, given=given, made=made)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return f"sha256 {hashlib.file_digest(file, 'sha256').hexdigest()[:16]}"
