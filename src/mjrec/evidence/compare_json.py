@@ -75,6 +75,7 @@ _BEGINNING: Final = Rule(Topic.BEGINNING)
 _SELECTION: Final = Rule(Topic.SELECTION)
 _IDENTITY: Final = Rule(Topic.IDENTITY)
 _VIDEO: Final = Rule(Topic.VIDEOS)
+_STATEMENT: Final = Rule(Topic.FILES, Aspect.STATEMENT)
 _GL: Final = Rule(Topic.PICTURES, Aspect.CLAIM, "gl")
 _FFMPEG: Final = Rule(Topic.VIDEOS, Aspect.CLAIM, "ffmpeg")
 _MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
@@ -92,7 +93,9 @@ KEYS: Final[Mapping[str, Rule]] = {
     **dict.fromkeys(("camera", "scene", "height", "width", "fps", "quality"), _VIDEO),
     **dict.fromkeys(("timestep", "playback_speed", "stride", "rate"), _VIDEO),
     **dict.fromkeys(("frame_count", "frame_steps", "recording", "video"), _VIDEO),
-    **dict.fromkeys(("gl_vendor", "gl_renderer", "gl_version", "gl_device"), _GL),
+    **dict.fromkeys(("gl_vendor", "gl_renderer", "gl_version"), _GL),
+    # Which of several alike; EGL numbers them, others do not.
+    "gl_device": _STATEMENT,
     **dict.fromkeys(("ffmpeg_sha256",), _FFMPEG),
     **dict.fromkeys(("start_time", "end_time", "timestamps"), _OF_FILES),
     **dict.fromkeys(("initial_reset_timestamp", "surroundings"), _OF_FILES),
@@ -248,6 +251,8 @@ def json_differences(
             own = rules.own.get(key)
             value = given.get(key, _ABSENT)
             if own is not None and key in made and own(_owner(given, file), value):
+                if value != made[key]:
+                    yield _leaf(value, made[key], file, inner, episode, _STATEMENT)
                 continue
             yield from json_differences(
                 value,
@@ -291,7 +296,7 @@ def _leaf(
         size = error if math.isfinite(error) else None
     aspect = rule.aspect
     is_gone = given is _ABSENT or made is _ABSENT
-    if (is_gone and aspect is not Aspect.CLAIM) or (
+    if (is_gone and aspect not in (Aspect.CLAIM, Aspect.STATEMENT)) or (
         aspect is Aspect.DERIVED and size is None
     ):
         # No version makes a number of what is none, nor leaves a key out. But a

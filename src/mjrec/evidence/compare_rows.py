@@ -20,7 +20,7 @@ from ..formats.json_fields import json_object
 from ..formats.trajectory_hdf5 import open_hdf5
 from .compare_json import Rules, json_differences
 from .differences import Aspect, Difference, Same, short
-from .findings import Level, Topic
+from .findings import Topic
 
 _BLOCK_BYTES: Final = 1 << 22
 # `model_changes/<n>/<field>`.
@@ -38,14 +38,13 @@ _DATASETS: Final = {
     "frame_steps": (Topic.VIDEOS, Aspect.EXACT),
     "actions": (Topic.PHYSICS, Aspect.EXACT),
 }
-_OF_PHYSICS: Final = ("states", "snapshots", "model_changes")
 _FACTS: Final = "facts"
 # It follows from the facts; reading a trajectory checks it.
 _CHECKSUM: Final = "crc32"
 
 
 def compare_trajectories(
-    given: Path, made: Path, file: str, rules: Rules, *, level: Level = Level.PIXELS
+    given: Path, made: Path, file: str, rules: Rules
 ) -> Iterator[Same | Difference]:
     """Yield how two trajectories compare.
 
@@ -54,7 +53,6 @@ def compare_trajectories(
         made: made again.
         file: the name of both, below `data/`.
         rules: of their facts.
-        level: below PHYSICS, states and what is drawn are not looked at.
 
     Raises:
         UnreadableFile: one is damaged.
@@ -64,12 +62,12 @@ def compare_trajectories(
         # Whatever is no trajectory ends here.
         open_hdf5(given).close()
         with h5py.File(given, "r") as one, h5py.File(made, "r") as other:
-            for found in _compare_groups(one, other, file, rules, level):
+            for found in _compare_groups(one, other, file, rules):
                 differs |= isinstance(found, Difference)
                 yield found
     except (AttributeError, LookupError, OSError, RuntimeError, ValueError) as error:
         raise UnreadableFile(given, error) from error
-    if not differs and level.included[-1] is not Level.STATS:
+    if not differs:
         yield Difference(
             topic=Topic.FILES,
             file=file,
@@ -80,27 +78,45 @@ def compare_trajectories(
         )
 
 
-def same_trajectory(path: Path, file: str, level: Level) -> Iterator[Same]:
+def same_trajectory(path: Path, file: str) -> Iterator[Same]:
     """Yield what a trajectory holds that is equal, byte for byte, to the other."""
     with h5py.File(path, "r") as trajectory:
         for name in trajectory:
-            if level is not Level.STATS or name not in _OF_PHYSICS:
-                yield from _same(name, trajectory[name], file)
+            yield from _same(name, trajectory[name], file)
+
+
+def compare_rewards(
+    given: Path, made: NDArray[np.float64], file: str
+) -> Iterator[Same | Difference]:
+    """Yield how the rewards of a trajectory compare with those made again.
+
+    Raises:
+        UnreadableFile: it is damaged.
+    """
+    with open_hdf5(given) as reader:
+        rewards = reader.rewards
+    if rewards.shape != made.shape:
+        counts = [f"{len(each)} steps" for each in (rewards, made)]
+        yield _difference(Topic.REWARDS, file, "rewards", *counts)
+        return
+    found = _Worst("rewards", *_DATASETS["rewards"], file)
+    if rewards.tobytes() != made.tobytes():
+        found.add(0, rewards, made)
+    yield from found.differences(len(rewards))
+    if not found.worst:
+        yield Same(topic=Topic.REWARDS, file=file, unit="trajectory")
 
 
 def _compare_groups(
-    one: h5py.File, other: h5py.File, file: str, rules: Rules, level: Level
+    one: h5py.File, other: h5py.File, file: str, rules: Rules
 ) -> Iterator[Same | Difference]:
     named = [_objects(each) for each in (one, other)]
     yield from _compare_attributes(one, other, file, rules)
     for name in sorted(named[0] | named[1]):
         dataset = name.partition("/")[0]
-        if level is Level.STATS and dataset in _OF_PHYSICS:
-            continue
         topic, _ = _DATASETS.get(dataset, (Topic.FILES, Aspect.EXACT))
         if name not in named[0] or name not in named[1]:
             where = [f"{name} is there" if name in each else "none" for each in named]
-            # A model that another version or machine changes at other steps.
             yield _difference(topic, file, name, *where)
             continue
         a, b = one[name], other[name]

@@ -247,8 +247,10 @@ class Trial:
             is_fed |= rule.is_fed and place.topic in rule.excludes
         return is_fed
 
-    def judge(self, found: Difference) -> Finding:
-        """Return what a difference comes to."""
+    def judge(self, found: Difference) -> Finding | None:
+        """Return what a difference comes to; None where nothing is to be said of it."""
+        if found.aspect is Aspect.STATEMENT:
+            return None
         for index in self._reaching(found):
             excuse = self._excuses[index]
             outcome = _outcome(excuse, found)

@@ -99,6 +99,14 @@ def inputs(verification: Verification) -> list[str]:
     ]
 
 
+def sampled(verification: Verification) -> str | None:
+    """Return how many frames were drawn, and what chose them; None where all were."""
+    count, seed = (verification.facts.get(key) for key in ("sample", "seed"))
+    if count is None:
+        return None
+    return f"{count} frames of each video were drawn, chosen by --seed {seed}"
+
+
 def counted(count: int, unit: str) -> str:
     """Return a number of things: "1 step", "12 steps", "2 frame hashes"."""
     if count == 1:
