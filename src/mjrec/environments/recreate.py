@@ -197,7 +197,7 @@ def recreate(
                 raise _wrappers_refused(said["wrappers"])
             return _dm_control(env_id, kwargs, limit)
         case "mjcf" if mjcf is not None:
-            env = _mjcf(*mjcf, limit)
+            env = _mjcf(*mjcf, kwargs or {}, limit)
         case _:
             raise NotRecreated("what its model was made from is not in the archive")
     with _failures(env_id):
@@ -278,12 +278,15 @@ def _wrappers_refused(names: Any) -> NotRecreated:
     )
 
 
-def _mjcf(path: Path, model: Any, limit: int | None) -> gymnasium.Env[Any, Any]:
+def _mjcf(
+    path: Path, model: Any, kwargs: Mapping[str, Any], limit: int | None
+) -> gymnasium.Env[Any, Any]:
     # It loads MuJoCo.
     from .mjcf_environments import MjcfEnvironment
 
     with _failures(path.stem):
-        env: gymnasium.Env[Any, Any] = MjcfEnvironment(path, model=model)
+        size = {name: kwargs[name] for name in ("height", "width") if name in kwargs}
+        env: gymnasium.Env[Any, Any] = MjcfEnvironment(path, model=model, **size)
         return env if limit is None else gymnasium.wrappers.TimeLimit(env, limit)
 
 

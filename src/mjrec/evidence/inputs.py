@@ -39,7 +39,7 @@ OPTIONS: Final[Mapping[str, tuple[type, ...]]] = {
     "height": (int,),
     "width": (int,),
     "own_camera": (str, int),
-    "env_index": (int,),
+    "seed": (int,),
 }
 
 

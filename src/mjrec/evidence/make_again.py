@@ -74,23 +74,27 @@ def play_recording(
         trust=trust,
         mjcf=mjcf,
     )
-    playing = _Playing(
-        recording,
-        recreated,
-        directory,
-        arrays=arrays,
-        only_counted=only_counted,
-        notes=notes,
-        on_steps=on_steps,
-    )
-    if not recording.was_killed:
+
+    def play() -> Mapping[str, NDArray[np.float64]]:
+        playing = _Playing(
+            recording,
+            recreated,
+            directory,
+            arrays=arrays,
+            only_counted=only_counted,
+            notes=notes,
+            on_steps=on_steps,
+        )
         playing.run()
         return playing.rewards
+
+    if not recording.was_killed:
+        return play()
     # What a kill leaves is left by a kill.
     child = os.fork()
     if child == 0:
         with contextlib.suppress(BaseException):
-            playing.run()
+            play()
         # It should not have come here.
         os._exit(1)
     _, status = os.waitpid(child, 0)

@@ -72,6 +72,7 @@ def monitor_again(
             step_trigger=_step_trigger(recording, notes),
             video_length=given.get("video_length"),
             name_prefix=given.get("name_prefix"),
+            seed=given.get("seed"),
             annotate=given.get("annotate", False),
             tiled=given.get("tiled", False),
             statements=Statements(
@@ -109,7 +110,7 @@ def _monitor_class(recreated: Recreated) -> Callable[..., EnvironmentMonitor]:
 
 def _schedule(recording: RecordingInputs, notes: Notes) -> Schedule | None:
     name = recording.schedule or ""
-    if recording.rule is not None:
+    if recording.rule is not None or "step_trigger" in recording.options:
         return None
     if name in _SCHEDULES or _SCHEDULE.fullmatch(name):
         return schedule_from_text(_SCHEDULES.get(name, name))
