@@ -29,7 +29,6 @@ from ..formats.trajectory_hdf5 import open_hdf5
 from .claims import claimed_excuses
 from .compare_json import (
     KEYS,
-    LISTED,
     Rule,
     Rules,
     compare_crates,
@@ -239,6 +238,7 @@ class Comparison:
                 yield Same(topic=Topic.IDENTITY, file=file, unit="compiled model")
             case "video":
                 yield Same(topic=Topic.VIDEOS, file=file, unit="video")
+                yield Same(topic=Topic.FILES, file=file, unit="encoding")
             case "hashes":
                 yield from compare_frame_hashes(
                     self._given / file, self._made / file, file
@@ -303,9 +303,8 @@ class Comparison:
 
     def _rules(self, kind: str = "") -> Rules:
         left_out = _DRAWN_KEYS if self._level is not Level.PIXELS else frozenset()
-        is_listed = kind == ""
         return Rules(
-            keys={**KEYS, **LISTED} if is_listed else KEYS,
+            keys=KEYS,
             usual=Rule(_TOPICS.get(kind, Topic.FILES)),
             own={
                 "file_sha256": lambda file, value: self._own_sha256(
@@ -370,6 +369,8 @@ class Comparison:
         return path.is_file() and file_sha256(path) == value
 
     def _own_size(self, file: str, value: Any) -> bool:
+        for name, again in self._renamed.items():
+            file = file.replace(again, name)
         path = self._given / file
         return path.is_file() and str(path.stat().st_size) == value
 

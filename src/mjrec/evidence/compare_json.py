@@ -103,8 +103,12 @@ KEYS: Final[Mapping[str, Rule]] = {
     "model": _MODEL,
 }
 # The program's name and version; what it was told is no claim.
-_ENCODER: Final = ("encoder_version.version", "encoder_version.cmdline[0]")
-# Those that drew, and that encoded, are listed in `environment.json`.
+_ENCODER: Final = (
+    *("encoder_version.version", "encoder_version.cmdline[0]"),
+    *("encoders[0].version",),
+)
+# What drew and what encoded is listed in `environment.json`, each once: the lists of
+# two machines have two entries, and one of them here.
 LISTED: Final[Mapping[str, Rule]] = {"pictures": _GL, "encoders": _FFMPEG}
 
 
@@ -263,6 +267,9 @@ def json_differences(
                 episode=episode,
                 rule=_rule(key, inner, rules, rule),
             )
+    elif _is_listed(given, made, where):
+        key = where.rpartition(".")[2]
+        yield _leaf(given, made, file, where, episode, LISTED[key])
     elif isinstance(given, list) and isinstance(made, list) and len(given) == len(made):
         for index, pair in enumerate(zip(given, made, strict=True)):
             inner = f"{where}[{index}]"
@@ -272,6 +279,12 @@ def json_differences(
             )
     else:
         yield _leaf(given, made, file, where, episode, rule or rules.usual)
+
+
+def _is_listed(given: Any, made: Any, where: str) -> bool:
+    """Tell whether two lists of what drew or encoded are not of one length."""
+    are_lists = isinstance(given, list) and isinstance(made, list)
+    return are_lists and len(given) != len(made) and where.endswith(tuple(LISTED))
 
 
 def _rule(key: str, where: str, rules: Rules, outer: Rule | None) -> Rule | None:
@@ -306,7 +319,7 @@ def _leaf(
     return Difference(
         topic=rule.topic,
         file=file,
-        unit="value",
+        unit="value" if episode is None else "episode",
         episode=episode,
         aspect=aspect,
         where=where,
