@@ -94,10 +94,10 @@ def _rule_of(
     episodes: Sequence[EpisodeInputs], given: Sequence[EpisodeInputs], seed: int | None
 ) -> str | None:
     first = episodes[0]
-    if len(given) == 1 and given[0] is first:
-        return f"one seed, {first.seed}, at the first reset"
     if all(each.evaluation is not None for each in episodes):
         return _rule_of_evaluation(episodes)
+    if len(given) == 1 and given[0] is first:
+        return f"one seed, {first.seed}, at the first reset"
     if seed is None or not 0 <= seed < 2**32:
         return None
     follows = all(
