@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 from forged_videos import forge, say
+from imageio.v3 import imwrite
 from packed_runs import edit_json, edit_trajectory, set_reward, the, unpacked
 
 import mjrec
@@ -28,7 +29,7 @@ from mjrec.evidence.findings import (
     Verdict,
     Verification,
 )
-from mjrec.evidence.notes import Notes
+from mjrec.evidence.notes import REWARDS_FILE, Notes
 
 Edit = Callable[[Path], object]
 
@@ -304,6 +305,49 @@ def test_less_deep_levels_compare_less(packed: Path, given: Path) -> None:
         (Topic.PICTURES, 14, "frame"),
     }
     assert compared(given, packed, level=Level.PHYSICS).verdict is Verdict.FAIL
+
+
+def test_rewards_alone_are_compared_with_trajectories(
+    packed: Path, given: Path
+) -> None:
+    """At the level of statistics no trajectory is made, only what it is to hold."""
+    made = shutil.copytree(packed, given.with_name("made"))
+    rewards = {}
+    for number in (0, 1):
+        path = the(made, f"*episode00000{number}.h5")
+        with h5py.File(path) as file:
+            rewards[f"0.u.{number}"] = file["rewards"][:]
+        path.unlink()
+    np.savez(made / REWARDS_FILE, **rewards)
+    assert compared(given, made, level=Level.STATS).verdict is Verdict.PARTLY
+    set_reward(the(given, "*episode000000.h5"), 2, 9.0)
+    [found] = compared(given, made, level=Level.STATS).failures
+    assert (found.topic, found.item) == (Topic.REWARDS, "episode 0 of 0.u")
+
+
+def test_some_frames_are_drawn_and_compared(packed: Path, given: Path) -> None:
+    """Each with its hash and with what the file shows."""
+    made = shutil.copytree(packed, given.with_name("made"))
+    name = the(given, "*video000000.mp4").name
+    folder = made / "sampled" / name
+    folder.mkdir(parents=True)
+    for number, frame in enumerate(mjrec.render(the(given, "*episode000000.h5"))):
+        if number in (1, 4):
+            imwrite(folder / f"{number}.png", frame)
+    verification = compared(given, made, sampled=True)
+    assert verification.verdict is Verdict.PARTLY
+    counts = {
+        f.outcome: f.count for f in verification.findings if f.topic is Topic.PICTURES
+    }
+    assert counts == {Outcome.MADE_AGAIN: 2, Outcome.BELIEVED: 5 + 7}
+    brighter(the(given, "*video000000.mp4"))
+    failed = compared(given, made, sampled=True).failures
+    assert {f.topic for f in failed} == {Topic.PICTURES}
+    # The hashes say what is drawn, the file shows something else.
+    hashes = the(given, "*video000000.framehash")
+    hashes.write_bytes(the(packed, "*video000000.framehash").read_bytes())
+    failed = compared(given, made, sampled=True).failures
+    assert {f.topic for f in failed} == {Topic.VIDEOS}
 
 
 def test_an_undrawn_run_has_the_same_videos_to_draw(packed: Path, given: Path) -> None:

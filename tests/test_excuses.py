@@ -91,13 +91,16 @@ def test_an_excuse_allows_what_it_states(
     name: str, found: Difference, outcome: Outcome
 ) -> None:
     """In its own items, up to its tolerance, and nothing else."""
-    assert Trial([excuse_of(*EXCUSES[name])]).judge(found).outcome is outcome
+    finding = Trial([excuse_of(*EXCUSES[name])]).judge(found)
+    assert finding is not None
+    assert finding.outcome is outcome
 
 
 def test_the_widest_excuse_decides() -> None:
     """Each is asked, whatever the order."""
     excuses = [excuse_of(*EXCUSES[name]) for name in ("numpy", "python", "mujoco")]
     finding = Trial(excuses).judge(difference(Aspect.STATE, 1e-7))
+    assert finding is not None
     assert (finding.outcome, finding.excuse) == (WITHIN, "mujoco")
 
 

@@ -44,6 +44,8 @@ def show_verification(
     _list(console, "Different", summary.failures(verification), most)
     _list(console, "Excuses", summary.excuses(verification), most)
     console.print(_table(verification))
+    if drawn := summary.sampled(verification):
+        console.print(f"  {drawn}")
     _list(console, "Asked for", summary.inputs(verification), most)
     if verbose:
         said = [_finding(each) for each in verification.findings]

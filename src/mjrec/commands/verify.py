@@ -5,32 +5,18 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 import rich.console
-import rich.markup
-import rich.table
 import tyro
 
 from .. import json_text
-from ..evidence import summary
-from ..evidence.findings import Outcome, Verdict, Verification
 from ..evidence.verify import VerificationProgress
 from ..evidence.verify import verify as verify_archive
 from ..monitors.progress import progress_bar
 from .help_text import flowing_help
-from .terminal import printable, result_console
-
-_MOST_FAILURES: Final = 20
-_STYLES: Final = {
-    str(Verdict.PASS): "bold green",
-    str(Verdict.PARTLY): "bold yellow",
-    str(Verdict.FAIL): "bold red",
-    str(Outcome.MADE_AGAIN): "green",
-    str(Outcome.WITHIN_TOLERANCE): "yellow",
-    str(Outcome.BELIEVED): "yellow",
-    str(Outcome.DIFFERENT): "red",
-}
+from .terminal import result_console
+from .verification_screen import show_verification
 
 
 @flowing_help
@@ -90,52 +76,5 @@ def verify(
     if as_json:
         sys.stdout.write(json_text.dumps(verification.as_json()) + "\n")
     else:
-        _show(verification, result_console(), verbose=verbose)
+        show_verification(verification, result_console(), verbose=verbose)
     return verification.verdict.exit_status
-
-
-def _show(
-    verification: Verification, console: rich.console.Console, *, verbose: bool
-) -> None:
-    def say(text: str) -> None:
-        console.print(text, highlight=False, soft_wrap=True)
-
-    verdict = str(verification.verdict)
-    say(f"[{_STYLES[verdict]}]{verdict}[/] {_plain(summary.headline(verification))}")
-    for remark in summary.remarks(verification):
-        say(f"  {_plain(remark)}")
-    failures = summary.failures(verification)
-    for failure in failures[:_MOST_FAILURES]:
-        say(f"  [red]different:[/] {_plain(failure)}")
-    if len(failures) > _MOST_FAILURES:
-        say(f"  ... and {len(failures) - _MOST_FAILURES} more (--json has all)")
-    for excuse in summary.excuses(verification):
-        say(f"  [yellow]excuse:[/] {_plain(excuse)}")
-    for said in summary.inputs(verification):
-        say(f"  inputs: {_plain(said)}")
-    if (sample := verification.facts.get("sample")) is not None:
-        seed = verification.facts.get("seed")
-        say(f"  {sample} frames of each video were drawn, chosen with --seed {seed}")
-    console.print(_table(verification))
-    if verbose:
-        for finding in verification.findings:
-            item = f"{finding.item}: " if finding.item else ""
-            say(
-                f"  {finding.topic}: {_plain(item)}{finding.outcome}, "
-                f"{summary.counted(finding.count, finding.unit)} "
-                f"{_plain(finding.reason)}"
-            )
-
-
-def _table(verification: Verification) -> rich.table.Table:
-    table = rich.table.Table(box=None, show_header=False, pad_edge=False)
-    for _ in range(3):
-        table.add_column(overflow="fold")
-    for line in summary.lines(verification):
-        style = _STYLES.get(line.outcome, "dim")
-        table.add_row(str(line.topic), f"[{style}]{line.outcome}[/]", _plain(line.text))
-    return table
-
-
-def _plain(text: str) -> str:
-    return rich.markup.escape(printable(text))

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from .scenes import (
     set_generator_state,
     simulation_below,
 )
+from .stand_ins import StandIn, stand_ins
 
 # Where the registry's entry points of what is trusted without asking lie.
 _TRUSTED = (
@@ -80,10 +81,12 @@ class Recreated:
     Attributes:
         environment: a `gymnasium.Env` or a `dm_env.Environment`.
         is_dm_env: it is the latter.
+        stand_in: takes recorded steps, where wrappers are not here; None else.
     """
 
     environment: Any
     is_dm_env: bool = False
+    stand_in: StandIn | None = None
 
     def random_state(self) -> Any:
         """Return the state of its random generators now, as a recording has it."""
@@ -118,6 +121,15 @@ class Recreated:
     def seed(self, seed: int) -> None:
         """Seed dm_control's generator; Gymnasium's is seeded by the reset."""
         self._dm_generator().seed(seed)
+
+    def warnings(self) -> dict[str, int]:
+        """Return how often MuJoCo has warned since its data was reset."""
+        simulated = simulation_below(self.environment)
+        if simulated is None:
+            return {}
+        from ..simulation.warnings import warning_counts  # It loads MuJoCo.
+
+        return warning_counts(simulated)
 
     def seed_behind(self, state: Any) -> int | None:
         """Return the seed that a generator was just made with; None for none.
@@ -197,13 +209,13 @@ def recreate(
                 raise _wrappers_refused(said["wrappers"])
             return _dm_control(env_id, kwargs, limit)
         case "mjcf" if mjcf is not None:
-            env = _mjcf(*mjcf, limit)
+            env = _mjcf(*mjcf, kwargs or {}, limit)
         case _:
             raise NotRecreated("what its model was made from is not in the archive")
     with _failures(env_id):
         if own_camera is not None:
             set_own_camera(env, own_camera)
-        return Recreated(environment=_wrapped(env, said))
+        return _wrapped(env, said)
 
 
 def is_installed_name(name: str) -> bool:
@@ -250,23 +262,33 @@ def _gymnasium(
         )
 
 
-def _wrapped(
-    env: gymnasium.Env[Any, Any], said: Mapping[str, Any]
-) -> gymnasium.Env[Any, Any]:
-    """Return an environment in the wrappers of a recording; the outermost is first."""
-    names = said.get("wrappers") or []
+def _wrapped(env: gymnasium.Env[Any, Any], said: Mapping[str, Any]) -> Recreated:
+    """Return an environment in the wrappers of a recording, or in stand-ins."""
+    names = [str(name) for name in said.get("wrappers") or ()]
     arguments = said.get("wrapper_arguments") or [None] * len(names)
-    for name, given in reversed(list(zip(names, arguments, strict=True))):
-        kind = getattr(gymnasium.wrappers, str(name).rpartition(".")[2], None)
-        if (
-            not isinstance(kind, type)
-            or class_name(kind) != name
-            or not isinstance(given, Mapping)
-            or not all(_is_plain_item(*item) for item in given.items())
-        ):
+    if len(arguments) != len(names):
+        raise _wrappers_refused(names)
+    kinds = [_known_wrapper(*each) for each in zip(names, arguments, strict=True)]
+    if None in kinds:
+        if simulation_below(env) is None:
             raise _wrappers_refused(names)
+        outermost, stand_in = stand_ins(env, names, arguments)
+        return Recreated(environment=outermost, stand_in=stand_in)
+    for kind, given in reversed(list(zip(kinds, arguments, strict=True))):
+        assert kind is not None
         env = kind(env, **given)
-    return env
+    return Recreated(environment=env)
+
+
+def _known_wrapper(name: str, given: Any) -> Callable[..., Any] | None:
+    """Return Gymnasium's own wrapper of a name, if its arguments are plain."""
+    kind = getattr(gymnasium.wrappers, name.rpartition(".")[2], None)
+    if not isinstance(kind, type) or class_name(kind) != name:
+        return None
+    is_plain = isinstance(given, Mapping) and all(
+        _is_plain_item(*item) for item in given.items()
+    )
+    return kind if is_plain else None
 
 
 def _wrappers_refused(names: Any) -> NotRecreated:
@@ -278,12 +300,15 @@ def _wrappers_refused(names: Any) -> NotRecreated:
     )
 
 
-def _mjcf(path: Path, model: Any, limit: int | None) -> gymnasium.Env[Any, Any]:
+def _mjcf(
+    path: Path, model: Any, kwargs: Mapping[str, Any], limit: int | None
+) -> gymnasium.Env[Any, Any]:
     # It loads MuJoCo.
     from .mjcf_environments import MjcfEnvironment
 
     with _failures(path.stem):
-        env: gymnasium.Env[Any, Any] = MjcfEnvironment(path, model=model)
+        size = {name: kwargs[name] for name in ("height", "width") if name in kwargs}
+        env: gymnasium.Env[Any, Any] = MjcfEnvironment(path, model=model, **size)
         return env if limit is None else gymnasium.wrappers.TimeLimit(env, limit)
 
 

@@ -18,16 +18,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
+import numpy as np
+
 from ..atomic_files import file_sha256
 from ..errors import Error, UnreadableFile
 from ..formats.frame_hashes import frame_hash_path
 from ..formats.json_fields import read_object
-from ..formats.monitor_directory import episode_of
+from ..formats.monitor_directory import episode_of, infix_of
 from ..formats.trajectory_hdf5 import open_hdf5
 from .claims import claimed_excuses
 from .compare_json import (
     KEYS,
-    LISTED,
     Rule,
     Rules,
     compare_crates,
@@ -35,14 +36,14 @@ from .compare_json import (
     compare_objects,
     same_journal,
 )
-from .compare_rows import compare_trajectories, same_trajectory
+from .compare_rows import compare_rewards, compare_trajectories, same_trajectory
 from .compare_text import compare_frame_hashes, compare_tables, compare_texts
 from .compare_video import compare_sampled, compare_videos
 from .differences import Aspect, Difference, Same, short
 from .excuses import Trial, believed, merged, with_allowed
 from .findings import Excuse, Finding, Level, Outcome, Topic
 from .layout import CRATE, ENVIRONMENT, PAYLOAD, RECORDINGS, STATISTICS
-from .notes import read_notes
+from .notes import REWARDS_FILE, read_notes
 from .videos_shown import read_metadata, remarks_on_video
 
 # Beside `data/` of a run that was made again: the frames that were drawn.
@@ -82,6 +83,7 @@ _TOPICS: Final = {
     "text": Topic.PICTURES,
 }
 _OF_MANIFEST: Final = (Topic.SELECTION, Topic.IDENTITY)
+_NO_DIFFERENCES: Final = (Aspect.CLAIM, Aspect.STATEMENT)
 _MOST_FAILURES: Final = 100
 _MODEL: Final = re.compile(r"openaigym\.model\.[0-9a-f]{16}")
 # Four numbers; the last is the version. A model of 1 GiB is beyond any.
@@ -143,6 +145,8 @@ class Comparison:
                 sums.add(found)
             elif isinstance(found, Difference):
                 finding = trial.judge(found)
+                if finding is None:
+                    continue
                 if finding.outcome is not Outcome.DIFFERENT:
                     sums.add(finding)
                 elif sums.fail(finding):
@@ -166,6 +170,8 @@ class Comparison:
                 yield from self._compare_file(file)
             done += names[0].get(file, 0)
             self._on_progress(done, total)
+        if self._level is Level.STATS:
+            yield from self._compare_rewards()
         if self._level is not Level.PIXELS:
             yield from self._not_compared()
 
@@ -176,9 +182,12 @@ class Comparison:
             for path in folder.rglob("*")
             if path.is_symlink() or not path.is_dir()
         }
-        if self._level is Level.PIXELS:
-            return found
-        return {f: size for f, size in found.items() if _kind(f) in _UNDRAWN}
+        kinds: tuple[str, ...] = tuple(_KINDS.values())
+        if self._level is not Level.PIXELS:
+            kinds = _UNDRAWN if self._level is Level.PHYSICS else _UNDRAWN[:-1]
+        elif (self._given.parent / _TAGS[0]).exists():
+            kinds = (*kinds, "")
+        return {f: size for f, size in found.items() if _kind(f) in kinds}
 
     def _compare_tags(self, tag: str) -> _Found:
         given, made = (folder.parent / tag for folder in (self._given, self._made))
@@ -215,12 +224,7 @@ class Comparison:
             else:
                 yield from self._compare_kind(given, made, file, kind)
         except Error as error:
-            yield Difference(
-                topic=_TOPICS.get(kind, Topic.FILES),
-                file=file,
-                given=str(error),
-                made="a whole file",
-            )
+            yield _damaged(file, error)
         if kind == "metadata" and self._level is Level.PIXELS:
             yield from remarks_on_video(given, file)
 
@@ -229,11 +233,12 @@ class Comparison:
             case "journal":
                 yield from same_journal(self._given / file, file)
             case "trajectory":
-                yield from same_trajectory(self._given / file, file, self._level)
+                yield from same_trajectory(self._given / file, file)
             case "model":
                 yield Same(topic=Topic.IDENTITY, file=file, unit="compiled model")
             case "video":
                 yield Same(topic=Topic.VIDEOS, file=file, unit="video")
+                yield Same(topic=Topic.FILES, file=file, unit="encoding")
             case "hashes":
                 yield from compare_frame_hashes(
                     self._given / file, self._made / file, file
@@ -249,9 +254,7 @@ class Comparison:
             case "journal":
                 yield from compare_journals(given, made, file, rules)
             case "trajectory":
-                yield from compare_trajectories(
-                    given, made, file, rules, level=self._level
-                )
+                yield from compare_trajectories(given, made, file, rules)
             case "video":
                 yield from compare_videos(
                     given,
@@ -294,15 +297,14 @@ class Comparison:
                 found.append(_other_choice(numbers[0], numbers[1], file))
         yield from found
         for topic in _OF_MANIFEST:
-            exact = (each for each in found if each.aspect is not Aspect.CLAIM)
+            exact = (each for each in found if each.aspect not in _NO_DIFFERENCES)
             if not any(each.topic is topic for each in exact):
                 yield Same(topic=topic, file=file, unit="recording")
 
     def _rules(self, kind: str = "") -> Rules:
         left_out = _DRAWN_KEYS if self._level is not Level.PIXELS else frozenset()
-        is_listed = kind == ""
         return Rules(
-            keys={**KEYS, **LISTED} if is_listed else KEYS,
+            keys=KEYS,
             usual=Rule(_TOPICS.get(kind, Topic.FILES)),
             own={
                 "file_sha256": lambda file, value: self._own_sha256(
@@ -317,31 +319,58 @@ class Comparison:
             renamed=self._renamed,
         )
 
+    def _compare_rewards(self) -> _Found:
+        """Compare what was made again instead of trajectories."""
+        path = self._made.parent / REWARDS_FILE
+        if not path.exists():
+            return
+        with np.load(path, allow_pickle=False) as rewards:
+            known = frozenset(rewards.files)
+            for given in sorted((self._given / RECORDINGS).glob("*.h5")):
+                name = f"{infix_of(given.name)}.{episode_of(given.name)}"
+                if name not in known:
+                    continue
+                file = f"{RECORDINGS}/{given.name}"
+                try:
+                    yield from compare_rewards(given, rewards[name], file)
+                except Error as error:
+                    yield _damaged(file, error)
+
     def _not_compared(self) -> Iterator[Same | Difference | Finding]:
         """Yield what this level leaves out; of sampled videos, what was drawn."""
-        folder = self._given / RECORDINGS
-        for path in sorted(folder.glob("*.mp4")):
-            file = f"{RECORDINGS}/{path.name}"
-            drawn = self._sampled / path.name if self._sampled else None
-            count = 0
-            if drawn is not None and drawn.is_dir():
-                count = sum(1 for _ in drawn.iterdir())
+        videos = sorted((self._given / RECORDINGS).glob("*.mp4"))
+        frames = drawn = 0
+        for path in videos:
+            frames += _frame_count(path)
+            folder = self._sampled / path.name if self._sampled else None
+            if folder is not None and folder.is_dir():
+                drawn += sum(1 for _ in folder.iterdir())
+                file = f"{RECORDINGS}/{path.name}"
                 try:
-                    yield from compare_sampled(path, frame_hash_path(path), drawn, file)
+                    hashes = frame_hash_path(path)
+                    yield from compare_sampled(path, hashes, folder, file)
                 except Error as error:
-                    yield Difference(
-                        topic=Topic.VIDEOS, file=file, given=str(error), made="a video"
-                    )
-            yield from _undrawn(path, file, count)
+                    yield _damaged(file, error)
+        if videos:
+            undone = "videos were not made again"
+            yield _believed(Topic.VIDEOS, undone, len(videos), "video")
+        if frames > drawn:
+            reason = "frames were not drawn again"
+            if drawn:
+                missed = f"{1 - drawn / frames:.0%}"
+                reason += f"; a single changed one is missed with a chance of {missed}"
+            yield _believed(Topic.PICTURES, reason, frames - drawn, "frame")
         if self._level is Level.STATS:
-            steps = "states were not compared (--level stats)"
-            yield _believed(Topic.PHYSICS, steps, unit="recording")
+            undone = "states were not compared (--level stats)"
+            yield _believed(Topic.PHYSICS, undone, 1, "recording")
 
     def _own_sha256(self, file: str, value: Any) -> bool:
         path = self._given / file
         return path.is_file() and file_sha256(path) == value
 
     def _own_size(self, file: str, value: Any) -> bool:
+        for name, again in self._renamed.items():
+            file = file.replace(again, name)
         path = self._given / file
         return path.is_file() and str(path.stat().st_size) == value
 
@@ -461,6 +490,11 @@ def _compare_models(given: Path, made: Path, file: str) -> _Found:
         yield Difference(topic=Topic.FILES, file=file, aspect=Aspect.STORED)
 
 
+def _damaged(file: str, error: Error) -> Difference:
+    topic = _TOPICS.get(_kind(file), Topic.FILES)
+    return Difference(topic=topic, file=file, given=str(error), made="a whole file")
+
+
 def _recompiled(file: str) -> Difference:
     return Difference(
         topic=Topic.IDENTITY,
@@ -500,26 +534,15 @@ def _listed(numbers: set[int]) -> str:
     return short(", ".join(map(str, sorted(numbers))) or "none")
 
 
-def _undrawn(video: Path, file: str, drawn: int) -> Iterator[Finding]:
-    yield _believed(Topic.VIDEOS, "videos were not made again", unit="video", file=file)
-    metadata = read_metadata(video)
-    total = metadata.get("frame_count")
-    if not isinstance(total, int) or total <= drawn:
-        return
-    reason = "frames were not drawn again"
-    if drawn:
-        reason += f"; of a single changed frame, {drawn / total:.0%} are found"
-    yield _believed(
-        Topic.PICTURES, reason, unit="frame", count=total - drawn, file=file
-    )
+def _frame_count(video: Path) -> int:
+    count = read_metadata(video).get("frame_count")
+    return count if isinstance(count, int) else 0
 
 
-def _believed(
-    topic: Topic, reason: str, *, unit: str, count: int = 1, file: str = ""
-) -> Finding:
+def _believed(topic: Topic, reason: str, count: int, unit: str) -> Finding:
     return Finding(
         topic=topic,
-        item=file,
+        item="",
         outcome=Outcome.BELIEVED,
         reason=reason,
         count=count,

@@ -75,6 +75,7 @@ _BEGINNING: Final = Rule(Topic.BEGINNING)
 _SELECTION: Final = Rule(Topic.SELECTION)
 _IDENTITY: Final = Rule(Topic.IDENTITY)
 _VIDEO: Final = Rule(Topic.VIDEOS)
+_STATEMENT: Final = Rule(Topic.FILES, Aspect.STATEMENT)
 _GL: Final = Rule(Topic.PICTURES, Aspect.CLAIM, "gl")
 _FFMPEG: Final = Rule(Topic.VIDEOS, Aspect.CLAIM, "ffmpeg")
 _MODEL: Final = Rule(Topic.IDENTITY, Aspect.MODEL)
@@ -92,7 +93,9 @@ KEYS: Final[Mapping[str, Rule]] = {
     **dict.fromkeys(("camera", "scene", "height", "width", "fps", "quality"), _VIDEO),
     **dict.fromkeys(("timestep", "playback_speed", "stride", "rate"), _VIDEO),
     **dict.fromkeys(("frame_count", "frame_steps", "recording", "video"), _VIDEO),
-    **dict.fromkeys(("gl_vendor", "gl_renderer", "gl_version", "gl_device"), _GL),
+    **dict.fromkeys(("gl_vendor", "gl_renderer", "gl_version"), _GL),
+    # Which of several alike; EGL numbers them, others do not.
+    "gl_device": _STATEMENT,
     **dict.fromkeys(("ffmpeg_sha256",), _FFMPEG),
     **dict.fromkeys(("start_time", "end_time", "timestamps"), _OF_FILES),
     **dict.fromkeys(("initial_reset_timestamp", "surroundings"), _OF_FILES),
@@ -100,8 +103,12 @@ KEYS: Final[Mapping[str, Rule]] = {
     "model": _MODEL,
 }
 # The program's name and version; what it was told is no claim.
-_ENCODER: Final = ("encoder_version.version", "encoder_version.cmdline[0]")
-# Those that drew, and that encoded, are listed in `environment.json`.
+_ENCODER: Final = (
+    *("encoder_version.version", "encoder_version.cmdline[0]"),
+    *("encoders[0].version",),
+)
+# What drew and what encoded is listed in `environment.json`, each once: the lists of
+# two machines have two entries, and one of them here.
 LISTED: Final[Mapping[str, Rule]] = {"pictures": _GL, "encoders": _FFMPEG}
 
 
@@ -248,6 +255,8 @@ def json_differences(
             own = rules.own.get(key)
             value = given.get(key, _ABSENT)
             if own is not None and key in made and own(_owner(given, file), value):
+                if value != made[key]:
+                    yield _leaf(value, made[key], file, inner, episode, _STATEMENT)
                 continue
             yield from json_differences(
                 value,
@@ -258,6 +267,9 @@ def json_differences(
                 episode=episode,
                 rule=_rule(key, inner, rules, rule),
             )
+    elif _is_listed(given, made, where):
+        key = where.rpartition(".")[2]
+        yield _leaf(given, made, file, where, episode, LISTED[key])
     elif isinstance(given, list) and isinstance(made, list) and len(given) == len(made):
         for index, pair in enumerate(zip(given, made, strict=True)):
             inner = f"{where}[{index}]"
@@ -267,6 +279,12 @@ def json_differences(
             )
     else:
         yield _leaf(given, made, file, where, episode, rule or rules.usual)
+
+
+def _is_listed(given: Any, made: Any, where: str) -> bool:
+    """Tell whether two lists of what drew or encoded are not of one length."""
+    are_lists = isinstance(given, list) and isinstance(made, list)
+    return are_lists and len(given) != len(made) and where.endswith(tuple(LISTED))
 
 
 def _rule(key: str, where: str, rules: Rules, outer: Rule | None) -> Rule | None:
@@ -291,7 +309,7 @@ def _leaf(
         size = error if math.isfinite(error) else None
     aspect = rule.aspect
     is_gone = given is _ABSENT or made is _ABSENT
-    if (is_gone and aspect is not Aspect.CLAIM) or (
+    if (is_gone and aspect not in (Aspect.CLAIM, Aspect.STATEMENT)) or (
         aspect is Aspect.DERIVED and size is None
     ):
         # No version makes a number of what is none, nor leaves a key out. But a
@@ -301,7 +319,7 @@ def _leaf(
     return Difference(
         topic=rule.topic,
         file=file,
-        unit="value",
+        unit="value" if episode is None else "episode",
         episode=episode,
         aspect=aspect,
         where=where,

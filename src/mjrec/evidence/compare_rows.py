@@ -7,7 +7,9 @@ Rows are read in blocks, so that memory does not grow with an episode.
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +22,7 @@ from ..formats.json_fields import json_object
 from ..formats.trajectory_hdf5 import open_hdf5
 from .compare_json import Rules, json_differences
 from .differences import Aspect, Difference, Same, short
-from .findings import Level, Topic
+from .findings import Topic
 
 _BLOCK_BYTES: Final = 1 << 22
 # `model_changes/<n>/<field>`.
@@ -38,14 +40,14 @@ _DATASETS: Final = {
     "frame_steps": (Topic.VIDEOS, Aspect.EXACT),
     "actions": (Topic.PHYSICS, Aspect.EXACT),
 }
-_OF_PHYSICS: Final = ("states", "snapshots", "model_changes")
+_UNITS: Final = {"snapshots": "snapshot", "model_changes": "change"}
 _FACTS: Final = "facts"
 # It follows from the facts; reading a trajectory checks it.
 _CHECKSUM: Final = "crc32"
 
 
 def compare_trajectories(
-    given: Path, made: Path, file: str, rules: Rules, *, level: Level = Level.PIXELS
+    given: Path, made: Path, file: str, rules: Rules
 ) -> Iterator[Same | Difference]:
     """Yield how two trajectories compare.
 
@@ -54,7 +56,6 @@ def compare_trajectories(
         made: made again.
         file: the name of both, below `data/`.
         rules: of their facts.
-        level: below PHYSICS, states and what is drawn are not looked at.
 
     Raises:
         UnreadableFile: one is damaged.
@@ -64,12 +65,12 @@ def compare_trajectories(
         # Whatever is no trajectory ends here.
         open_hdf5(given).close()
         with h5py.File(given, "r") as one, h5py.File(made, "r") as other:
-            for found in _compare_groups(one, other, file, rules, level):
+            for found in _compare_groups(one, other, file, rules):
                 differs |= isinstance(found, Difference)
                 yield found
     except (AttributeError, LookupError, OSError, RuntimeError, ValueError) as error:
         raise UnreadableFile(given, error) from error
-    if not differs and level.included[-1] is not Level.STATS:
+    if not differs:
         yield Difference(
             topic=Topic.FILES,
             file=file,
@@ -80,27 +81,45 @@ def compare_trajectories(
         )
 
 
-def same_trajectory(path: Path, file: str, level: Level) -> Iterator[Same]:
+def same_trajectory(path: Path, file: str) -> Iterator[Same]:
     """Yield what a trajectory holds that is equal, byte for byte, to the other."""
     with h5py.File(path, "r") as trajectory:
         for name in trajectory:
-            if level is not Level.STATS or name not in _OF_PHYSICS:
-                yield from _same(name, trajectory[name], file)
+            yield from _same(name, trajectory[name], file)
+
+
+def compare_rewards(
+    given: Path, made: NDArray[np.float64], file: str
+) -> Iterator[Same | Difference]:
+    """Yield how the rewards of a trajectory compare with those made again.
+
+    Raises:
+        UnreadableFile: it is damaged.
+    """
+    with open_hdf5(given) as reader:
+        rewards = reader.rewards
+    if rewards.shape != made.shape:
+        counts = [f"{len(each)} steps" for each in (rewards, made)]
+        yield _difference(Topic.REWARDS, file, "rewards", *counts)
+        return
+    found = _Rows("rewards", *_DATASETS["rewards"], file)
+    if rewards.tobytes() != made.tobytes():
+        found.add(0, rewards, made)
+    yield from found.differences()
+    if not found.any:
+        yield Same(topic=Topic.REWARDS, file=file, unit="trajectory")
 
 
 def _compare_groups(
-    one: h5py.File, other: h5py.File, file: str, rules: Rules, level: Level
+    one: h5py.File, other: h5py.File, file: str, rules: Rules
 ) -> Iterator[Same | Difference]:
     named = [_objects(each) for each in (one, other)]
     yield from _compare_attributes(one, other, file, rules)
     for name in sorted(named[0] | named[1]):
         dataset = name.partition("/")[0]
-        if level is Level.STATS and dataset in _OF_PHYSICS:
-            continue
         topic, _ = _DATASETS.get(dataset, (Topic.FILES, Aspect.EXACT))
         if name not in named[0] or name not in named[1]:
             where = [f"{name} is there" if name in each else "none" for each in named]
-            # A model that another version or machine changes at other steps.
             yield _difference(topic, file, name, *where)
             continue
         a, b = one[name], other[name]
@@ -170,7 +189,7 @@ def _compare_datasets(
     if kinds[0] != kinds[1]:
         yield _difference(topic, file, name, *map(short, kinds))
         return
-    found = _Worst(name, topic, aspect, file)
+    found = _Rows(name, topic, aspect, file)
     rows = a.shape[0] if a.shape else 0
     step = max(1, _BLOCK_BYTES // max(1, a.nbytes // rows)) if rows else 1
     # A single value has no rows.
@@ -179,91 +198,118 @@ def _compare_datasets(
         left, right = np.asarray(a[key]), np.asarray(b[key])
         if left.tobytes() != right.tobytes():
             found.add(start, left, right)
-    yield from found.differences(rows)
-    if not found.worst:
-        yield from _same(name, a, file)
+    yield from found.differences()
+    yield from _same(name, a, file, found)
 
 
-def _same(name: str, item: Any, file: str) -> Iterator[Same]:
-    """Yield what an equal dataset proves."""
+def _same(
+    name: str, item: Any, file: str, differing: _Rows | None = None
+) -> Iterator[Same]:
+    """Yield what a dataset proves, so far as it is equal."""
     if not isinstance(item, h5py.Dataset):
         return
-    if name == "rewards":
+    is_equal = differing is None or not differing.any
+    if name == "rewards" and is_equal:
         yield Same(topic=Topic.REWARDS, file=file, unit="trajectory")
     if name == "states" and item.shape[0] and item.dtype.names:
-        yield Same(topic=Topic.BEGINNING, file=file, unit="episode")
-        yield Same(topic=Topic.PHYSICS, file=file, count=item.shape[0] - 1, unit="step")
+        if differing is None or not differing.is_first_other:
+            yield Same(topic=Topic.BEGINNING, file=file, unit="episode")
+        if is_equal:
+            count = item.shape[0] - 1
+            yield Same(topic=Topic.PHYSICS, file=file, count=count, unit="step")
 
 
-class _Worst:
-    """The largest difference of each member of a dataset, the first row apart."""
+class _Rows:
+    """The rows of a dataset that differ: how many, and by how much at most.
+
+    Those of one aspect count together; the first state, which is a beginning, apart.
+
+    Args:
+        name: of the dataset.
+        topic: what it tells about.
+        aspect: of its numbers.
+        file: the trajectory's name, below `data/`.
+    """
 
     def __init__(self, name: str, topic: Topic, aspect: Aspect, file: str) -> None:
         self._name, self._topic, self._aspect, self._file = name, topic, aspect, file
-        self.worst: dict[tuple[str, bool], tuple[float, str, str, str, int]] = {}
+        self._counts: Counter[tuple[Topic, Aspect]] = Counter()
+        self._worst: dict[tuple[Topic, Aspect], Difference] = {}
+
+    @property
+    def any(self) -> bool:
+        """Whether any differ."""
+        return bool(self._worst)
+
+    @property
+    def is_first_other(self) -> bool:
+        """Whether a beginning differs."""
+        return any(topic is Topic.BEGINNING for topic, _ in self._worst)
 
     def add(self, start: int, a: NDArray[Any], b: NDArray[Any]) -> None:
         """Look at a block of rows that differs; its first row is number `start`."""
+        is_beginning = start == 0 and self._name in ("states", "observations")
+        differing: dict[tuple[Topic, Aspect], NDArray[np.bool_]] = {}
         for member in a.dtype.names or ("",):
-            left, right = (each[member] if member else each for each in (a, b))
-            left, right = (
-                each.reshape(len(left) if a.ndim else 1, -1)
-                for each in (np.atleast_1d(left), np.atleast_1d(right))
-            )
+            left, right = (_table(each[member] if member else each) for each in (a, b))
             is_other = _bits(left) != _bits(right)
-            for is_first in (True, False):
-                rows = slice(0, 1) if is_first else slice(1, None)
-                if start:
-                    rows = slice(None) if not is_first else slice(0, 0)
-                self._note(member, is_first, start, rows, left, right, is_other)
+            aspect = Aspect.SOLVER if member == "warmstart" else self._aspect
+            parts = [(self._topic, slice(None))]
+            if is_beginning:
+                parts = [(Topic.BEGINNING, np.s_[:1]), (self._topic, np.s_[1:])]
+            for topic, rows in parts:
+                here = is_other[rows]
+                if not here.any():
+                    continue
+                known = differing.setdefault((topic, aspect), here.any(axis=1))
+                known |= here.any(axis=1)
+                first = start + (rows.start or 0)
+                self._note(topic, aspect, member, first, left[rows], right[rows], here)
+        for key, rows_of_key in differing.items():
+            self._counts[key] += int(rows_of_key.sum())
 
     def _note(
         self,
+        topic: Topic,
+        aspect: Aspect,
         member: str,
-        is_first: bool,
-        start: int,
-        rows: slice,
+        first: int,
         left: NDArray[Any],
         right: NDArray[Any],
         is_other: NDArray[np.bool_],
     ) -> None:
-        here = is_other[rows]
-        if not here.any():
-            return
-        errors = np.where(here, _errors(left[rows], right[rows]), -1.0)
+        errors = np.where(is_other, _errors(left, right), -1.0)
         row, column = map(int, np.unravel_index(np.argmax(errors), errors.shape))
-        size, count = float(errors[row, column]), int(here.any(axis=1).sum())
-        known = self.worst.get((member, is_first))
-        number = row + (rows.start or 0)
-        name = f"{self._name}[{start + number}]" + (f".{member}" if member else "")
-        values = short(left[number, column].item()), short(right[number, column].item())
-        if known is not None:
-            count += known[4]
-        if known is None or size > known[0]:
-            known = (size, name, *values, 0)
-        self.worst[member, is_first] = (*known[:4], count)
+        size = float(errors[row, column])
+        known = self._worst.get((topic, aspect))
+        if known is not None and size <= (np.inf if known.size is None else known.size):
+            return
+        is_finite, unit = np.isfinite(size), _UNITS.get(self._name, "step")
+        if topic is Topic.BEGINNING:
+            unit = "episode"
+        if aspect is Aspect.SOLVER:
+            unit = "warm start"
+        self._worst[topic, aspect] = Difference(
+            topic=topic,
+            file=self._file,
+            unit=unit,
+            aspect=aspect if is_finite else Aspect.EXACT,
+            where=f"{self._name}[{first + row}]" + (f".{member}" if member else ""),
+            given=short(left[row, column].item()),
+            made=short(right[row, column].item()),
+            size=size if is_finite else None,
+        )
 
-    def differences(self, rows: int) -> Iterator[Difference]:
-        """Yield one for each member that differs."""
-        for (member, is_first), found in self.worst.items():
-            size, where, given, made, count = found
-            topic, aspect = self._topic, self._aspect
-            if is_first and self._name in ("states", "observations"):
-                topic = Topic.BEGINNING
-            if member == "warmstart":
-                aspect = Aspect.SOLVER
-            yield Difference(
-                topic=topic,
-                file=self._file,
-                count=count,
-                unit="step",
-                aspect=aspect if np.isfinite(size) else Aspect.EXACT,
-                where=where,
-                given=given,
-                made=made,
-                size=size if np.isfinite(size) else None,
-                figures={"rows": rows, "differing": count},
-            )
+    def differences(self) -> Iterator[Difference]:
+        """Yield the worst of each kind, with the number of rows that it stands for."""
+        for key, worst in self._worst.items():
+            yield replace(worst, count=self._counts[key])
+
+
+def _table(values: NDArray[Any]) -> NDArray[Any]:
+    """Return values as rows of numbers."""
+    rows = np.atleast_1d(values)
+    return rows.reshape(len(rows), -1)
 
 
 def _errors(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.float64]:

@@ -60,7 +60,7 @@ def compare_videos(
         UnreadableFile, EncoderError: one is damaged.
     """
     boxes, again = read_boxes(given), read_boxes(made)
-    yield from _compare_boxes(boxes, again, file)
+    found = list(_compare_boxes(boxes, again, file))
     with unreadable(given):
         times = [shown_times(each) for each in (boxes, again)]
     if times[0] != times[1]:
@@ -68,8 +68,21 @@ def compare_videos(
             each if isinstance(each, str) else f"{each[0]} frames of {each[1]} s"
             for each in times
         ]
-        yield _differs(file, "times", *said)
-    yield from _compare_frames(given, made, file, on_decoded)
+        found.append(_differs(file, "times", *said))
+    yield from found
+    yield Difference(
+        topic=Topic.FILES,
+        file=file,
+        unit="encoding",
+        aspect=Aspect.ENCODED,
+        where="its bytes",
+        given="one encoding",
+        made="another",
+    )
+    frames = list(_compare_frames(given, made, file, on_decoded))
+    yield from frames
+    if not found and not any(each.topic is Topic.VIDEOS for each in frames):
+        yield Same(topic=Topic.VIDEOS, file=file, unit="video")
 
 
 def _compare_boxes(
@@ -85,15 +98,6 @@ def _compare_boxes(
     for one, other in zip(*kept, strict=True):
         if one.name not in _ENCODED and one.content != other.content:
             yield _differs(file, one.path, one.content.hex(), other.content.hex())
-    yield Difference(
-        topic=Topic.VIDEOS,
-        file=file,
-        unit="video",
-        aspect=Aspect.ENCODED,
-        where="its bytes",
-        given="one encoding",
-        made="another",
-    )
 
 
 def _compare_frames(

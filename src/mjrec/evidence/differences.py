@@ -35,6 +35,8 @@ class Aspect(enum.Enum):
         ENCODED: bytes of the encoder that show nothing by themselves.
         STORED: all contents are equal, the bytes that store them are not.
         CLAIM: a version, or a name of hardware.
+        STATEMENT: what nothing can make again; or what follows from a file of the
+            archive itself, and is right for that. Nothing is to be said of it.
     """
 
     EXACT = "exact"
@@ -47,6 +49,7 @@ class Aspect(enum.Enum):
     ENCODED = "encoded"
     STORED = "stored"
     CLAIM = "claim"
+    STATEMENT = "statement"
 
 
 @dataclass(frozen=True, kw_only=True)

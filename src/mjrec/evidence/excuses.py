@@ -101,8 +101,9 @@ _BY_NAME: Final[Mapping[str, _Rule]] = {
     ),
     "wrappers": _Rule(
         kind=ExcuseKind.CODE,
-        costs="beginnings, steps and rewards that differ without it are believed",
-        excludes=(Topic.REWARDS, Topic.BEGINNING, Topic.PHYSICS),
+        costs="rewards and ends that differ without it are believed",
+        excludes=(Topic.REWARDS,),
+        is_fed=True,
     ),
     **dict.fromkeys(
         ("schedule", "rule", "step_trigger"),
@@ -148,6 +149,12 @@ _OUTCOMES: Final = {
     Aspect.STATE: Outcome.WITHIN_TOLERANCE,
     Aspect.DERIVED: Outcome.WITHIN_TOLERANCE,
     Aspect.PICTURE: Outcome.WITHIN_TOLERANCE,
+}
+# Why no tolerance says anything of it.
+_BELIEVED: Final = {
+    Aspect.SOLVER: "from there the solver begins, and comes to the same end",
+    Aspect.MODEL: "it was compiled elsewhere",
+    Aspect.HASH: "they were drawn elsewhere",
 }
 # Half of the frames of another rasteriser are not equal bit for bit.
 _MOST_EQUAL_FRAMES: Final = 0.5
@@ -247,8 +254,10 @@ class Trial:
             is_fed |= rule.is_fed and place.topic in rule.excludes
         return is_fed
 
-    def judge(self, found: Difference) -> Finding:
-        """Return what a difference comes to."""
+    def judge(self, found: Difference) -> Finding | None:
+        """Return what a difference comes to; None where nothing is to be said of it."""
+        if found.aspect is Aspect.STATEMENT:
+            return None
         for index in self._reaching(found):
             excuse = self._excuses[index]
             outcome = _outcome(excuse, found)
@@ -257,7 +266,7 @@ class Trial:
             self._other[index, found.unit] += found.count
             if outcome is not Outcome.NOTED:
                 self._used[index] += found.count
-            return _finding(found, outcome, excuse.name)
+            return _finding(found, outcome, excuse)
         return _finding(found, Outcome.DIFFERENT, None)
 
     def use(self, name: str) -> None:
@@ -302,10 +311,10 @@ class Trial:
     def _refutation(self, index: int) -> str | None:
         """Return why the claimed difference is none; None where it may be one."""
         excuse, equal = self._excuses[index], self._equal
-        frames, videos = equal[index, "frame"], equal[index, "video"]
+        frames, videos = equal[index, "frame"], equal[index, "encoding"]
         if excuse.name == "mujoco" and equal[index, "compiled model"]:
             return "the compiled model was written by the same version"
-        if excuse.name == "ffmpeg" and videos and self._other[index, "video"]:
+        if excuse.name == "ffmpeg" and videos and self._other[index, "encoding"]:
             return f"{videos} videos are equal byte for byte, others are not"
         if excuse.name == "gl" and _family(excuse.claimed) != _family(excuse.here):
             least = _MOST_EQUAL_FRAMES * (frames + self._other[index, "frame hash"])
@@ -375,16 +384,19 @@ def _is_alike(figures: Mapping[str, float], limits: Limits) -> bool:
     return limits.strain(Similarity(*(figures[name] for name in names))) <= 1
 
 
-def _finding(found: Difference, outcome: Outcome, excuse: str | None) -> Finding:
+def _finding(found: Difference, outcome: Outcome, excuse: Excuse | None) -> Finding:
     figures = dict(found.figures)
-    if found.size is not None:
+    reason, is_believed = found.reason, outcome is Outcome.BELIEVED
+    if excuse is not None and is_believed:
+        reason = _BELIEVED.get(found.aspect, excuse.costs)
+    if found.size is not None and not is_believed:
         figures["maximum"] = found.size
     return Finding(
         topic=found.topic,
         item=found.item,
         outcome=outcome,
-        reason=found.reason,
-        excuse=excuse,
+        reason=reason,
+        excuse=excuse.name if excuse else None,
         count=found.count,
         unit=found.unit,
         figures=figures,

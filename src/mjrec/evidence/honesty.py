@@ -20,8 +20,6 @@ from .findings import Finding, Outcome, Topic
 from .inputs import EpisodeInputs, Inputs, RecordingInputs
 
 _MOST_SHOWN = 5
-# The seeds that an author states: small numbers first.
-_STATED_SEEDS = range(1000)
 
 
 def remarks(inputs: Inputs, arrays: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
@@ -81,7 +79,7 @@ def _seeds(recording: RecordingInputs) -> Iterator[Finding]:
     given = [each for each in recording.episodes if each.seed is not None]
     if not given:
         return
-    rule = _rule_of(recording.episodes, given)
+    rule = _rule_of(recording.episodes, given, recording.options.get("seed"))
     yield Finding(
         topic=Topic.BEGINNING,
         item=recording.name,
@@ -93,23 +91,20 @@ def _seeds(recording: RecordingInputs) -> Iterator[Finding]:
 
 
 def _rule_of(
-    episodes: Sequence[EpisodeInputs], given: Sequence[EpisodeInputs]
+    episodes: Sequence[EpisodeInputs], given: Sequence[EpisodeInputs], seed: int | None
 ) -> str | None:
     first = episodes[0]
-    if len(given) == 1 and given[0] is first:
-        return f"one seed, {first.seed}, at the first reset"
     if all(each.evaluation is not None for each in episodes):
         return _rule_of_evaluation(episodes)
-    if len(given) != len(episodes):
+    if len(given) == 1 and given[0] is first:
+        return f"one seed, {first.seed}, at the first reset"
+    if seed is None or not 0 <= seed < 2**32:
         return None
-    for seed in _STATED_SEEDS:
-        if first.seed == episode_seeds(seed, 0).environment:
-            follows = all(
-                each.seed == episode_seeds(seed, number).environment
-                for number, each in enumerate(episodes)
-            )
-            return f"SeedSequence([{seed}, i]) for episode i" if follows else None
-    return None
+    follows = all(
+        each.seed == episode_seeds(seed, each.episode_id).environment
+        for each in episodes
+    )
+    return f"SeedSequence([{seed}, i]) for episode i" if follows else None
 
 
 def _rule_of_evaluation(episodes: Sequence[EpisodeInputs]) -> str | None:

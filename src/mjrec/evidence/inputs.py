@@ -39,7 +39,7 @@ OPTIONS: Final[Mapping[str, tuple[type, ...]]] = {
     "height": (int,),
     "width": (int,),
     "own_camera": (str, int),
-    "env_index": (int,),
+    "seed": (int,),
 }
 
 
@@ -59,6 +59,8 @@ class EpisodeInputs:
         steps: how many were taken.
         actions: the name of the array of actions, be they in it or irregular; None
             where they were not kept.
+        steps_taken: the name of the arrays `<name>.<part>` of `RecordedSteps`, where
+            wrappers are not here; None else.
         dtypes: from which step on they were given as which dtype.
         parts: name and shape of the arrays of a dictionary; None for plain arrays.
         irregular: `step`, `value` and, of an array, `dtype` of those that fit into no
@@ -73,6 +75,7 @@ class EpisodeInputs:
         believed: `reward`, `terminated`, `truncated` and `success` of a complete
             episode. They are used only where actions were not kept.
         evaluation: `seed` and `episode` of an evaluation that it belongs to; None else.
+        selection: what its video says of the choice among an evaluation's episodes.
     """
 
     episode_id: int
@@ -83,6 +86,7 @@ class EpisodeInputs:
     first_state: str | None = None
     steps: int = 0
     actions: str | None = None
+    steps_taken: str | None = None
     dtypes: Sequence[tuple[int, str]] = ()
     parts: Sequence[tuple[str, Sequence[int]]] | None = None
     irregular: Sequence[Mapping[str, Any]] = ()
@@ -94,6 +98,7 @@ class EpisodeInputs:
     end_time: float | None = None
     believed: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Mapping[str, Any] | None = None
+    selection: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +120,8 @@ class RecordingInputs:
         clip_starts: the numbers of steps at which clips were begun by a trigger.
         episodes: in their order.
         evaluation_keep: what the choice among all recordings of an evaluation said.
+        monitor_csv_start: the time in Stable-Baselines3's file, a statement; None where
+            that was not asked for.
         surroundings: the provenance, a statement; None where it was not known.
         surroundings_after: how many episodes were completed when it became known.
         was_killed: another process has put the recording in order.
@@ -133,6 +140,7 @@ class RecordingInputs:
     clip_starts: Sequence[int] = ()
     episodes: Sequence[EpisodeInputs] = ()
     evaluation_keep: Mapping[str, Any] | None = None
+    monitor_csv_start: float | None = None
     surroundings: Mapping[str, Any] | None = None
     surroundings_after: int = 0
     was_killed: bool = False

@@ -10,6 +10,7 @@ noted, with the excuse for it.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import os
 import signal
@@ -21,8 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..environments.recreate import NotRecreated, Recreated, recreate
+from ..environments.stand_ins import RecordedSteps
 from ..formats.journal import KILLED
 from ..recorder.ending_reasons import EXCEPTION, INTERRUPT
+from .evaluation_choice import choose_for_evaluation
 from .inputs import EpisodeInputs, RecordingInputs
 from .notes import Notes, read_notes
 from .play_actions import given_actions
@@ -74,23 +77,27 @@ def play_recording(
         trust=trust,
         mjcf=mjcf,
     )
-    playing = _Playing(
-        recording,
-        recreated,
-        directory,
-        arrays=arrays,
-        only_counted=only_counted,
-        notes=notes,
-        on_steps=on_steps,
-    )
-    if not recording.was_killed:
+
+    def play() -> Mapping[str, NDArray[np.float64]]:
+        playing = _Playing(
+            recording,
+            recreated,
+            directory,
+            arrays=arrays,
+            only_counted=only_counted,
+            notes=notes,
+            on_steps=on_steps,
+        )
         playing.run()
         return playing.rewards
+
+    if not recording.was_killed:
+        return play()
     # What a kill leaves is left by a kill.
     child = os.fork()
     if child == 0:
         with contextlib.suppress(BaseException):
-            playing.run()
+            play()
         # It should not have come here.
         os._exit(1)
     _, status = os.waitpid(child, 0)
@@ -122,6 +129,7 @@ class _Playing:
         self._on_steps = on_steps
         self._only_counted = only_counted
         self._now = 0.0
+        self._warned: Mapping[str, int] = {}
         self.rewards: dict[str, NDArray[np.float64]] = {}
         # Of either framework.
         self._monitor: Any = monitor_again(
@@ -142,8 +150,12 @@ class _Playing:
         for episode in self._recording.episodes:
             if episode.evaluation is not None:
                 self._monitor.forget_pictures()
-                recorder.evaluation_facts = functools.partial(dict, episode.evaluation)
+                recorder.note_event("begun", dict(episode.evaluation))
+                recorder.evaluation_facts = functools.partial(
+                    self._evaluation_facts, episode.evaluation
+                )
             self._begin(episode)
+            self._warned = self._recreated.warnings()
             if episode.actions is not None:
                 self._play(episode)
             elif episode.cut is None or episode.steps:
@@ -155,6 +167,15 @@ class _Playing:
             self._notes.write(self._directory.parent)
             os.kill(os.getpid(), signal.SIGKILL)
         self._monitor.close()
+        if self._recording.evaluation_keep is not None:
+            choose_for_evaluation(self._recording, self._directory, self._notes)
+
+    def _evaluation_facts(self, said: Mapping[str, Any]) -> Mapping[str, Any]:
+        before, after = self._warned, self._recreated.warnings()
+        # An unstable simulation may be set back, and its counts with it.
+        counts = {name: n - before.get(name, 0) for name, n in after.items()}
+        counts = {name: n if n >= 0 else after[name] for name, n in counts.items()}
+        return {**said, "warnings": {name: n for name, n in counts.items() if n}}
 
     def _begin(self, episode: EpisodeInputs) -> None:
         """Reset the environment, with the random state that leads to the beginning."""
@@ -226,6 +247,7 @@ class _Playing:
     def _play(self, episode: EpisodeInputs) -> None:
         """Take the steps of an episode, until the environment ends it."""
         step, is_dm_env = self._monitor.step, self._recreated.is_dm_env
+        self._begin_stand_in(episode)
         counted, rewards = 0, []
         for action in given_actions(episode, self._arrays):
             result = step(action)
@@ -236,9 +258,34 @@ class _Playing:
                 self._on_steps(_STEPS_BETWEEN_COUNTS)
             if result.last() if is_dm_env else result[2] or result[3]:
                 break
+        self._note_stand_in(episode)
         if self._only_counted and episode.actions is not None:
             self.rewards[episode.actions] = np.array(rewards, np.float64)
         self._on_steps(counted % _STEPS_BETWEEN_COUNTS)
+
+    def _begin_stand_in(self, episode: EpisodeInputs) -> None:
+        stand_in, name = self._recreated.stand_in, episode.steps_taken
+        if stand_in is None:
+            return
+        if name is None:
+            raise NotRecreated(
+                "wrappers are not here, and what they made of actions is not recorded",
+                excuse="wrappers",
+            )
+        fields = (each.name for each in dataclasses.fields(RecordedSteps))
+        parts = {part: self._arrays[f"{name}.{part}"] for part in fields}
+        stand_in.begin(RecordedSteps(**parts))
+
+    def _note_stand_in(self, episode: EpisodeInputs) -> None:
+        stand_in = self._recreated.stand_in
+        if stand_in is not None and stand_in.differing:
+            names = (self._recording.environment or {}).get("wrappers") or ()
+            self._note(
+                episode,
+                "wrappers",
+                f"without {', '.join(map(str, names)):.300} the rewards or the end of "
+                f"{stand_in.differing} of its steps are others: they are believed",
+            )
 
     def _believe(self, episode: EpisodeInputs) -> None:
         """Tell the recorder what the archive says of an episode without actions."""

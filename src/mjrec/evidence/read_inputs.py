@@ -14,18 +14,23 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from .. import json_text
 from ..errors import UnreadableFile
 from ..formats.journal import JournalEntry, JournalReader
 from ..formats.json_fields import read_object
-from ..formats.monitor_directory import Infix
+from ..formats.monitor_directory import FILE_PREFIX, Infix
+from ..formats.regular_files import open_regular
+from ..formats.trajectory import TrajectoryReader
 from ..formats.trajectory_hdf5 import open_hdf5
 from ..results.monitor_files import MonitorFiles, monitors_of
+from ..results.run import EVALUATION
 from .inputs import OPTIONS, EpisodeInputs, Inputs, RecordingInputs
 from .layout import ENVIRONMENT, RECORDINGS
 from .packed_run import PackingOptions
 from .portable_names import portable_parts
 
 _SOURCES = re.compile(r"openaigym\.model\.[0-9a-f]{16}\.zip", re.ASCII)
+_LONGEST_HEADER = 10_000
 _MOST_EPISODES = 1_000_000
 _DTYPES = frozenset(
     f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)
@@ -111,11 +116,21 @@ def _recording(files: MonitorFiles, arrays: dict[str, NDArray[Any]]) -> Recordin
         clip_starts=tuple(sorted(journal.clip_starts())),
         episodes=tuple(_episodes(files, journal, arrays)),
         evaluation_keep=journal.evaluation_keep,
+        monitor_csv_start=_monitor_csv_start(files),
         surroundings=journal.surroundings,
         surroundings_after=journal.surroundings_after,
         was_killed=journal.was_killed,
         is_closed=journal.is_closed,
     )
+
+
+def _monitor_csv_start(files: MonitorFiles) -> float | None:
+    name = f"{FILE_PREFIX}.results.{files.infix}.monitor.csv"
+    if files.journal is None or not (path := files.journal.with_name(name)).is_file():
+        return None
+    with open_regular(path) as file:
+        header = file.readline(_LONGEST_HEADER).decode()
+    return _time(json_text.loads(header.removeprefix("#")).get("t_start"))
 
 
 class _Journal:
@@ -188,6 +203,7 @@ def _episodes(
                 files.trajectories[number],
                 name=f"{files.infix}.{number}",
                 irregular=journal.irregular.get(number, []),
+                is_wrapped=bool((journal.run.get("environment") or {}).get("wrappers")),
                 arrays=arrays,
             )
         if entry is not None:
@@ -230,6 +246,7 @@ def _with_trajectory(
     *,
     name: str,
     irregular: list[Mapping[str, Any]],
+    is_wrapped: bool,
     arrays: dict[str, NDArray[Any]],
 ) -> EpisodeInputs:
     with open_hdf5(path) as reader:
@@ -238,6 +255,8 @@ def _with_trajectory(
         first = None
         if facts.get("seed") is None and facts.get("random_state") is None:
             first = reader.read("state", 0, 1) if reader.kind("state") else None
+        taken = _steps_taken(reader) if is_wrapped else {}
+    arrays.update({f"{name}.{part}": values for part, values in taken.items()})
     if given is not None:
         arrays[name] = given
     if first is not None:
@@ -254,15 +273,36 @@ def _with_trajectory(
         random_state=facts.get("random_state"),
         first_state=None if first is None else f"{name}.state",
         steps=steps,
+        steps_taken=name if taken else None,
         actions=name if is_whole else None,
         dtypes=tuple(_dtypes(facts.get("action_dtypes"))),
         parts=None if parts is None else tuple(_parts(parts)),
         irregular=tuple(irregular),
         exception=exception if isinstance(exception, Mapping) else None,
+        selection=_selection(facts.get("video")),
         has_trajectory=facts.get("kept") is not False,
         start_time=_time(facts.get("start_time")),
         end_time=_time(facts.get("end_time")),
     )
+
+
+def _steps_taken(reader: TrajectoryReader) -> dict[str, NDArray[Any]]:
+    """Return the parts of `RecordedSteps`; nothing where controls are not recorded."""
+    kind = reader.kind("state")
+    if kind is None or "ctrl" not in (kind.names or ()):
+        return {}
+    return {
+        "controls": reader.read("state", 1, reader.row_count)["ctrl"],
+        "rewards": reader.rewards,
+        "terminated": reader.terminated,
+        "truncated": reader.truncated,
+    }
+
+
+def _selection(video: Any) -> Mapping[str, Any] | None:
+    said = video.get("selection") if isinstance(video, Mapping) else None
+    is_evaluation = isinstance(said, Mapping) and said.get("scope") == EVALUATION
+    return said if is_evaluation else None
 
 
 def _sources(files: MonitorFiles, environment: Any) -> str | None:

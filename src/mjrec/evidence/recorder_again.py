@@ -15,8 +15,9 @@ from ..formats.monitor_directory import Infix
 from ..monitors.base import EnvironmentMonitor
 from ..recorder.opening import JOIN, Statements
 from ..recorder.options import RecorderOptions
-from ..recorder.tracking import FinishedEpisode
+from ..recorder.tracking import FinishedEpisode, Tracker
 from ..schedules import Schedule, schedule_from_text
+from ..trackers.monitor_csv import MonitorCsvTracker
 from .inputs import RecordingInputs
 from .notes import Notes
 
@@ -72,8 +73,10 @@ def monitor_again(
             step_trigger=_step_trigger(recording, notes),
             video_length=given.get("video_length"),
             name_prefix=given.get("name_prefix"),
+            seed=given.get("seed"),
             annotate=given.get("annotate", False),
             tiled=given.get("tiled", False),
+            trackers=_trackers(recording),
             statements=Statements(
                 infix=infix,
                 first_episode_id=recording.first_episode_id,
@@ -109,7 +112,7 @@ def _monitor_class(recreated: Recreated) -> Callable[..., EnvironmentMonitor]:
 
 def _schedule(recording: RecordingInputs, notes: Notes) -> Schedule | None:
     name = recording.schedule or ""
-    if recording.rule is not None:
+    if recording.rule is not None or "step_trigger" in recording.options:
         return None
     if name in _SCHEDULES or _SCHEDULE.fullmatch(name):
         return schedule_from_text(_SCHEDULES.get(name, name))
@@ -166,6 +169,11 @@ def _step_trigger(
         unit="clip",
     )
     return _named(name, set(recording.clip_starts).__contains__)
+
+
+def _trackers(recording: RecordingInputs) -> Sequence[Tracker]:
+    start = recording.monitor_csv_start
+    return () if start is None else [MonitorCsvTracker(clock=lambda: start)]
 
 
 def _named(name: str, function: Callable[[Any], Any]) -> Callable[[Any], Any]:

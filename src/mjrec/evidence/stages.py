@@ -151,7 +151,9 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
     if any(recording.was_killed for recording in inputs.recordings):
         recover(played)
     say(phase="drawing")
-    if level is Level.PIXELS and request["sample"] is None:
+    if not any(played.iterdir()):
+        is_packed = False
+    elif level is Level.PIXELS and request["sample"] is None:
         draw_all(played, counter)
     elif level is Level.PIXELS:
         sampled = made / SAMPLED
@@ -162,7 +164,7 @@ def _make(request: Mapping[str, Any], say: _Say) -> None:
             seed=request["seed"],
             on_progress=counter,
         )
-    if is_packed and any(played.iterdir()):
+    if is_packed:
         pack_folder(played, made, packing_options(inputs.packing))
     (made / PAYLOAD / RECORDINGS).mkdir(parents=True, exist_ok=True)
     if level is Level.STATS:

@@ -99,6 +99,14 @@ def inputs(verification: Verification) -> list[str]:
     ]
 
 
+def sampled(verification: Verification) -> str | None:
+    """Return how many frames were drawn, and what chose them; None where all were."""
+    count, seed = (verification.facts.get(key) for key in ("sample", "seed"))
+    if count is None:
+        return None
+    return f"{count} frames of each video were drawn, chosen by --seed {seed}"
+
+
 def counted(count: int, unit: str) -> str:
     """Return a number of things: "1 step", "12 steps", "2 frame hashes"."""
     if count == 1:
@@ -128,6 +136,9 @@ def _counts(topic: Topic, found: Iterable[Finding]) -> str:
         counts[finding.unit] += finding.count
     if (unit := _UNITS.get(topic)) in counts:
         counts = Counter({str(unit): counts[str(unit)]})
+    if len(counts) > 1:
+        # Single values of files say little beside them.
+        del counts["value"]
     return ", ".join(counted(count, unit) for unit, count in counts.items())
 
 
@@ -155,10 +166,11 @@ def _excuse(excuse: Excuse, verification: Verification) -> str:
     claimed = f" {excuse.claimed}{here}" if excuse.claimed else ""
     if excuse.refuted:
         return f"{excuse.name}:{claimed}. Refuted: what it claims would show"
+    found = [each for each in verification.findings if each.excuse == excuse.name]
     costs = [
         f"{counted(each.count, each.unit)} {each.outcome}{_worst(each)}"
-        for each in verification.findings
-        if each.excuse == excuse.name and each.outcome is not Outcome.NOTED
+        for each in found
+        if each.outcome is not Outcome.NOTED and each.unit != "value"
     ]
     of = "" if not excuse.items else f" ({_some(excuse.items)})"
     allowed = ", allowed" if excuse.allowed else ""

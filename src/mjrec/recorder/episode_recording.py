@@ -181,6 +181,8 @@ class EpisodeRecording:
         facts: Mapping[str, Any],
         standing: Standing,
         selection: Mapping[str, Any],
+        *,
+        end_time: float,
     ) -> None:
         """Finish the trajectory and the videos. Idempotent.
 
@@ -188,6 +190,7 @@ class EpisodeRecording:
             facts: of the episode's end.
             standing: whether the video is kept.
             selection: what is said of the choice, where it is chosen by now.
+            end_time: in seconds since the epoch.
         """
         if standing is Standing.DROPPED:
             self._discard_live()
@@ -197,9 +200,7 @@ class EpisodeRecording:
         known = {**facts, "length": stats.steps, "reward": stats.rewards}
         try:
             if self._states is not None:
-                is_complete = facts["complete"]
-                ended = stats.timestamps[-1] if is_complete else self._run.clock()
-                said = {"length": self._states.steps, "end_time": ended}
+                said = {"length": self._states.steps, "end_time": end_time}
                 verdict = self._verdict(standing, selection)
                 self._states.end({**known, **verdict, **said})
         finally:

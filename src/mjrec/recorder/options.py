@@ -68,6 +68,8 @@ class RecorderOptions:
     policy_file: str | os.PathLike[str] | None = None
     # Of a row log; vector environments share a budget.
     tail_bytes: int = TAIL_BYTES
+    # From which the seeds of episodes follow, where they do.
+    seed: int | None = None
     # Of a run that is made again.
     statements: Statements | None = None
 
@@ -216,6 +218,7 @@ class RecorderOptions:
             "step_trigger": None if trigger is None else schedule_name(trigger),
             "video_length": None if length is None else int(length),
             "name_prefix": self.name_prefix,
+            "seed": self.seed,
             **{name: getattr(self, name) or None for name in _SWITCHES},
         }
         return {name: value for name, value in said.items() if value is not None}

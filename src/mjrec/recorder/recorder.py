@@ -520,7 +520,8 @@ class Recorder:
             self._journal_end(otherwise)
         with failures:
             chosen = {} if kept is None else kept.chosen_facts()
-            recording.end(end.facts, end.standing, chosen)
+            ended = self._end_time(end, otherwise)
+            recording.end(end.facts, end.standing, chosen, end_time=ended)
             if kept is not None and end.standing is Standing.CANDIDATE:
                 kept.hold(recording)
             else:
@@ -544,6 +545,11 @@ class Recorder:
                 standing = self._kept.judge(self.run.episode.episode_id, episode)
             self._end = _End(facts, standing, episode)
         return self._end
+
+    def _end_time(self, end: _End, otherwise: str) -> float:
+        if end.episode is not None:
+            return end.episode.end_time
+        return self._reset_time if otherwise == RESET else self._clock()
 
     def _finished_episode(self) -> FinishedEpisode:
         stats, episode = self.stats_recorder, self.run.episode
