@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import subprocess
+import zipfile
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -91,17 +92,27 @@ class ForgedRun:
             ),
         )
 
+    def rewrite_zip(self, path: Path, change: Callable[[bytes], bytes]) -> None:
+        """Change what the sources of a model hold."""
+        with zipfile.ZipFile(path) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in members.items():
+                archive.writestr(name, change(content))
+
     def edit_rows(self, episode: int, **arrays: Any) -> None:
         """Write a trajectory anew, with other arrays and facts.
 
         Args:
             episode: its number.
             arrays: fields of `TrajectoryContent`, or functions that change a copy of
-                one in place; `facts`, which are added to its own; and `action`,
+                one in place; `facts`, which are added to its own or to
+                `all_facts`; and `action`,
                 `state`, `snapshot` and `observation`, their dtypes.
         """
         path, content = self.trajectory(episode), self.content(episode)
-        facts = {**content.facts, **arrays.pop("facts", {})}
+        facts = arrays.pop("all_facts", content.facts)
+        facts = {**facts, **arrays.pop("facts", {})}
         kinds = {name: content.dtype[name] for name in content.dtype.names[4:]}
         kinds |= {name: arrays.pop(name) for name in PARTS if name in arrays}
         known = {name: kind for name, kind in kinds.items() if kind is not None}
@@ -183,13 +194,21 @@ class ForgedRun:
         padded = {f"padded_{name}": side + side % 2 for name, side in size.items()}
         self._note(path, {**said, **size, **padded, **metadata})
 
-    def mux(self, episode: int, *arguments: str, inputs: tuple[Path, ...] = ()) -> None:
+    def mux(
+        self,
+        episode: int,
+        *arguments: str,
+        inputs: tuple[Path, ...] = (),
+        metadata: str = "-1",
+    ) -> None:
         """Pass a video through ffmpeg, whose frames stay what they are."""
         path = self.video(episode)
         changed = path.with_suffix(".changed.mp4")
         sources = [each for one in (path, *inputs) for each in ("-i", str(one))]
         command = [ffmpeg_executable(), "-v", "error", *sources, *arguments]
-        subprocess.run([*command, str(changed)], check=True)
+        # As mjrec does, so that nothing else differs.
+        alike = ("-fflags", "+bitexact", "-movflags", "+faststart", "-map_metadata")
+        subprocess.run([*command, *alike, metadata, str(changed)], check=True)
         changed.replace(path)
         self.rehash(episode)
 

@@ -45,12 +45,12 @@ def play(
     kind: type = np.float32,
 ) -> None:
     """Play episodes with random actions, and close the environment."""
-    generator = np.random.default_rng(5)
+    generator, space = np.random.default_rng(5), env.action_space
     with contextlib.closing(env):
         for episode in range(episodes):
             env.reset(seed=seed(episode))
             for _ in range(most):
-                action = generator.uniform(-0.9, 0.9, env.action_space.shape)
+                action = 0.9 * generator.uniform(space.low, space.high)
                 _, _, terminated, truncated, _ = env.step(action.astype(kind))
                 if terminated or truncated:
                     break

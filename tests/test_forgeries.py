@@ -7,11 +7,9 @@ hashes of files and frames, metadata, the table, the crate and the bag.
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import shutil
-import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -93,7 +91,14 @@ def call_actions_irregular(run: ForgedRun) -> None:
         actions = run.content(episode).actions
         run.edit_rows(episode, action=None)
         lines = [
-            {"action": {"episode_id": episode, "step": n + 1, "value": a.tolist()}}
+            {
+                "action": {
+                    "episode_id": episode,
+                    "step": n,
+                    "dtype": "float32",
+                    "value": a.tolist(),
+                }
+            }
             for n, a in enumerate(actions)
         ]
         run.edit_journal(lambda all_, lines=lines: all_.__setitem__(slice(1, 1), lines))
@@ -134,14 +139,21 @@ def cut_by_reset(run: ForgedRun) -> None:
 
     def edit(lines: list[Any]) -> None:
         index = next(n for n, line in enumerate(lines) if line.get("episode_id") == 1)
-        facts = {k: lines[index][k] for k in ("episode_id", "chosen", "recording")}
-        lines[index] = {"cut": {**facts, "reason": "reset"}}
+        known = {k: lines[index][k] for k in ("episode_id", "chosen", "recording")}
+        lines[index] = {"cut": {**known, "reason": "reset"}}
 
     run.edit_journal(edit)
-    run.edit_rows(1, facts={"complete": False, "reason": "reset"})
-    run.edit_json(
-        "*000001.meta.json", lambda m: m.update(complete=False, reason="reset")
-    )
+    facts = {**run.content(1).facts, "complete": False, "reason": "reset"}
+    for name in ("terminated", "truncated"):
+        del facts[name]
+    run.edit_rows(1, all_facts=facts)
+
+    def change(said: dict[str, Any]) -> None:
+        said.update(complete=False, reason="reset")
+        for name in ("terminated", "truncated"):
+            said.pop(name, None)
+
+    run.edit_json("*000001.meta.json", change)
 
 
 def hide_the_fall(run: ForgedRun) -> None:
@@ -176,18 +188,25 @@ def swap_episodes(run: ForgedRun) -> None:
     """Tell two episodes in the other order, each with its own seed and video."""
     for old, new in ((0, 9), (1, 0), (9, 1)):
         run.renumber(old, new)
-    run.edit_journal(
-        lambda lines: lines.sort(key=lambda line: line.get("episode_id", -1))
-    )
+
+    def sort(lines: list[Any]) -> None:
+        places = [n for n, line in enumerate(lines) if "length" in line]
+        ordered = sorted((lines[n] for n in places), key=lambda e: e["episode_id"])
+        for place, line in zip(places, ordered, strict=True):
+            lines[place] = line
+
+    run.edit_journal(sort)
 
 
-def show_one_as_two(run: ForgedRun) -> None:
-    """The best episode's rows, video and numbers again, with a new seed."""
+def show_one_as_two(run: ForgedRun, seed: int | None = 99) -> None:
+    """The best episode's rows and numbers again, with a new seed or its own."""
+    facts = run.content(3).facts
+    own = ("episode_id", "start_time", "end_time", "possible_video")
     shutil.copy(run.trajectory(2), str(run.trajectory(3)))
-    run.edit_rows(3, facts={"episode_id": 3, "seed": 99})
+    run.edit_rows(3, facts={name: facts[name] for name in own if name in facts})
     [told] = [line for line in _lines(run) if line.get("episode_id") == 2]
-    same = ("length", "reward", "terminated", "truncated")
-    run.say(3, **{key: told[key] for key in same}, seed=99)
+    same = {k: told[k] for k in ("length", "reward", "terminated", "truncated")}
+    run.say(3, **same, seed=told["seed"] if seed is None else seed)
 
 
 def leave_the_worst_out(run: ForgedRun) -> None:
@@ -228,6 +247,10 @@ def one_pixel(run: ForgedRun) -> None:
     frames = [frame.copy() for frame in run.frames(1)]
     frames[2][20, 10] ^= 64
     run.film(1, frames)
+
+
+def negative(episode: int) -> Lie:
+    return lambda run: run.film(episode, [255 - f for f in run.frames(episode)])
 
 
 def double_a_frame(run: ForgedRun) -> None:
@@ -315,7 +338,8 @@ def sound(run: ForgedRun) -> None:
 
 
 def title(run: ForgedRun) -> None:
-    run.mux(1, "-c", "copy", "-metadata", "title=Success rate 100 %")
+    said = ("-metadata", "title=Success rate 100 %")
+    run.mux(1, "-c", "copy", *said, metadata="0")
 
 
 def rotation(run: ForgedRun) -> None:
@@ -460,16 +484,10 @@ def pretend_to_be_gym(run: ForgedRun) -> None:
 
 def swap_the_model(run: ForgedRun) -> None:
     """Sources of a lighter robot."""
-    path = run.the("*.model.*.zip")
-    members = {}
-    with zipfile.ZipFile(path) as archive:
-        for name in archive.namelist():
-            members[name] = archive.read(name).replace(b'size=".05"', b'size=".04"')
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    path.write_bytes(packed.getvalue())
+    run.rewrite_zip(
+        run.the("*.model.*.zip"),
+        lambda content: content.replace(b'size=".05"', b'size=".04"'),
+    )
 
 
 def call_it_trained(run: ForgedRun) -> None:
@@ -717,6 +735,24 @@ FORGERIES = (
     Forgery("a beginning of one's own, its seed forgotten", forget_the_seed),
     Forgery("two episodes in the other order", swap_episodes),
     Forgery("one episode shown as two", show_one_as_two),
+    Forgery(
+        "one episode shown as two, with its seed",
+        lambda run: show_one_as_two(run, seed=None),
+        "same episode",
+        verdict=PARTLY,
+    ),
+    Forgery(
+        "rewards doubled, of episodes that were not chosen for packing",
+        double_rewards,
+        "reward",
+        packing={"episodes": [0]},
+    ),
+    Forgery(
+        "rewards doubled, anonymously",
+        double_rewards,
+        "reward",
+        packing={"anonymous": True},
+    ),
     Forgery("the worst left out, the others renumbered", leave_the_worst_out),
     Forgery("the first left out", leave_the_first_out, verdict=PARTLY),
     Forgery("one recording shown as two", copy_the_recording, "same", verdict=PARTLY),
@@ -745,6 +781,19 @@ FORGERIES = (
     Forgery("wide pixels", wide_pixels),
     Forgery("a video cropped", cropped),
     Forgery("bytes at the end of a video", hidden_bytes),
+    *(
+        Forgery(f"{lie.__name__}, with another ffmpeg claimed", both(lie, claim_ffmpeg))
+        for lie in (
+            *(swift, swift_in_real_time, slow_start, second_track, sound, title),
+            *(rotation, wide_pixels, cropped, hidden_bytes, double_a_frame),
+        )
+    ),
+    Forgery(
+        "negatives of all videos, with another GPU claimed",
+        both(*(negative(episode) for episode in (0, 1)), claim_gpu),
+        "",
+    ),
+    Forgery("videos swapped, with another GPU claimed", both(swap_videos, claim_gpu)),
     Forgery("small frames called large", small_called_large),
     Forgery("draft called full", draft_called_full),
     Forgery("a close-up added", add_a_close_up, quick=True),
